@@ -1,0 +1,1 @@
+"""Benchmarks of the environment and of training, as commands anybody can run."""

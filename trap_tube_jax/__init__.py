@@ -1,0 +1,51 @@
+"""The trap-tube task of tool use as a functional, vectorised JAX gridworld."""
+
+from trap_tube_jax.environment import (
+    ArraySpec,
+    Environment,
+    action_from_index,
+    action_to_index,
+)
+from trap_tube_jax.objects import base_palette
+from trap_tube_jax.observation import observe, render_ascii, visible_objects
+from trap_tube_jax.registry import (
+    PAPER_TASK_SETS,
+    TaskSet,
+    make,
+    register,
+    registered_ids,
+    task_set,
+)
+from trap_tube_jax.state import State, TimeStep, base_state, validate
+from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
+from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "PAPER_TASK_SETS",
+    "ArraySpec",
+    "AutoReset",
+    "Environment",
+    "EpisodeStatistics",
+    "State",
+    "TaskSet",
+    "TimeStep",
+    "Transfer",
+    "action_from_index",
+    "action_to_index",
+    "base_palette",
+    "base_state",
+    "compose",
+    "make",
+    "observe",
+    "perceptual",
+    "register",
+    "registered_ids",
+    "render_ascii",
+    "structural",
+    "symbolic",
+    "task_set",
+    "validate",
+    "visible_objects",
+]

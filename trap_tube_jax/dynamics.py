@@ -1,0 +1,68 @@
+"""The rules of one step: food, tool, agent, task, in that order.
+
+Source: specification section 3.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from trap_tube_jax.geometry import bar_covers, unit_vector
+from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND
+from trap_tube_jax.state import State
+
+
+def step(state: State, action: jax.Array) -> State:
+    """Moves food, tool and agent by one action and marks success.
+
+    Pure, deterministic and total: defined for every state, also for one with the
+    agent on the tool. A state that is done stays as it is. Counting steps against a
+    limit is the environment's business, not the dynamics'.
+
+    Args:
+      state: one unbatched state.
+      action: i32[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Any other
+        number is no direction: that grasp holds nothing, that move goes nowhere.
+
+    Returns:
+      The state after the step; `terminated` is set when agent and food share a cell.
+    """
+    board, agent, food, tool = state.board, state.agent, state.food, state.tool
+    extent = state.tool_extent
+    on_tool = functools.partial(bar_covers, tool, extent)
+    grasp = unit_vector(action[0])
+    move = unit_vector(action[1]) * ~(state.terminated | state.truncated)
+
+    grasped = on_tool(agent + grasp) & ~on_tool(agent)
+    agent_free = static_object(board, agent + move) == GROUND
+    food_ahead = on_tool(food - move) & ~on_tool(food)
+    beyond_food = static_object(board, food + move)
+    food_free = ((beyond_food == GROUND) | (beyond_food == EXIT)) & ~on_tool(food + move)
+
+    food_moves = grasped & agent_free & food_ahead & food_free
+    new_food = food + move * food_moves
+
+    tool_fits = jnp.all((tool + move >= 0) & (tool + extent + move <= BOARD_SIZE))
+    tool_moves = grasped & agent_free & (~food_ahead | food_moves) & tool_fits
+    new_tool = tool + move * tool_moves
+
+    held = grasped & ~tool_moves
+    reaches_food = jnp.all(agent + move == new_food)
+    blocked_by_tool = bar_covers(new_tool, extent, agent + move)
+    agent_moves = ~held & ~blocked_by_tool & (agent_free | reaches_food)
+    new_agent = agent + move * agent_moves
+
+    return state.replace(
+        agent=new_agent,
+        tool=new_tool,
+        food=new_food,
+        terminated=state.terminated | jnp.all(new_agent == new_food),
+    )
+
+
+def static_object(board: jax.Array, cell: jax.Array) -> jax.Array:
+    """i32[]: the static object's code at `cell` i32[2], -1 off the board u8[12, 12]."""
+    on_board = jnp.all((cell >= 0) & (cell < BOARD_SIZE))
+    row, column = jnp.clip(cell, 0, BOARD_SIZE - 1)
+    return jnp.where(on_board, board[row, column].astype(jnp.int32), -1)

@@ -1,0 +1,73 @@
+"""The vocabulary of the trap-tube gridworld: objects, colours, directions.
+
+Glossary
+    board: the static objects (ground, trap, exit, tubes), one code per cell.
+    cell: a (row, column) pair; row 0 is the top, column 0 the left.
+    extent: the tool's size as (rows, columns).
+    palette: one row of features (RGB by default) per object code.
+    role: what an object code does, whatever it looks like.
+
+Source: specification sections 1 and 2; paper section "Environments".
+"""
+
+from typing import Final
+
+import numpy as np
+
+BOARD_SIZE: Final = 12
+MAX_TOOL_LENGTH: Final = 4
+MAX_STEPS: Final = 50
+
+# Codes are in drawing order: a later object hides an earlier one.
+GROUND, TRAP, EXIT, TUBE1, TUBE2, FOOD, TOOL, AGENT = range(8)
+OBJECT_NAMES: Final = ("ground", "trap", "exit", "tube1", "tube2", "food", "tool", "agent")
+OBJECT_CHARS: Final = ".xe12FTA"
+NUM_OBJECTS: Final = len(OBJECT_NAMES)
+STATIC_OBJECTS: Final = (GROUND, TRAP, EXIT, TUBE1, TUBE2)
+
+BASE_COLORS: Final = np.array(
+    [
+        [72, 65, 17],  # ground
+        [208, 113, 57],  # trap
+        [208, 189, 57],  # exit
+        [57, 152, 208],  # tube1
+        [57, 152, 208],  # tube2
+        [208, 57, 77],  # food
+        [152, 208, 57],  # tool
+        [113, 57, 208],  # agent
+    ],
+    np.uint8,
+)
+
+UP, DOWN, LEFT, RIGHT = range(4)
+DIRECTION_NAMES: Final = ("up", "down", "left", "right")
+DIRECTIONS: Final = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.int32)
+NUM_DIRECTIONS: Final = len(DIRECTION_NAMES)
+NUM_ACTIONS: Final = NUM_DIRECTIONS**2
+
+
+def base_palette(num_features: int = 3) -> np.ndarray:
+    """Features of every object before any transfer.
+
+    Three features are the RGB colours of specification section 1. Two are its red
+    and green channels; more than three repeat red, green, blue cyclically; a single
+    one is the colour's luma (ITU-R BT.601), rounded. For every N the objects differ
+    from each other, except the two tubes, which always look alike.
+
+    Args:
+      num_features: N >= 1, the number of feature channels.
+
+    Returns:
+      u8[8, N], one row per object code.
+
+    Raises:
+      ValueError: `num_features` is not an integer >= 1.
+    """
+    if isinstance(num_features, bool) or not isinstance(num_features, int | np.integer):
+        raise ValueError(f"num_features must be an integer >= 1, got {num_features!r}")
+    if num_features < 1:
+        raise ValueError(f"num_features must be >= 1, got {num_features}")
+    if num_features == 1:
+        luma = BASE_COLORS @ np.array([0.299, 0.587, 0.114])
+        return np.rint(luma).astype(np.uint8)[:, None]
+    return BASE_COLORS[:, np.arange(num_features) % 3]

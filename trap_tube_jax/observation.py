@@ -1,0 +1,41 @@
+"""What the agent sees, and pictures for people.
+
+Source: specification section 1.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from trap_tube_jax.geometry import CELLS, bar_cells
+from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS, OBJECT_CHARS, TOOL
+from trap_tube_jax.state import State
+
+
+def visible_objects(state: State) -> jax.Array:
+    """The topmost object of every cell: u8[12, 12] of object codes 0 to 7."""
+    tool = bar_cells(state.tool, state.tool_extent)
+    objects = jnp.where(_at(state.food), jnp.uint8(FOOD), state.board)
+    objects = jnp.where(tool, jnp.uint8(TOOL), objects)
+    return jnp.where(_at(state.agent), jnp.uint8(AGENT), objects)
+
+
+def observe(state: State) -> jax.Array:
+    """The observation u8[12, 12, N]: the features of the topmost object of every cell."""
+    objects = visible_objects(state)[..., None]
+    # A chain of selects vectorises on a CPU, where a gather runs element by element.
+    features = jnp.broadcast_to(state.palette[0], (BOARD_SIZE, BOARD_SIZE, state.palette.shape[1]))
+    for code in range(1, NUM_OBJECTS):
+        features = jnp.where(objects == code, state.palette[code], features)
+    return features
+
+
+def render_ascii(state: State) -> str:
+    """The picture that `State.from_ascii` reads, topmost objects only. Host side."""
+    objects = np.asarray(visible_objects(state))
+    return "\n".join("".join(OBJECT_CHARS[code] for code in row) for row in objects)
+
+
+def _at(cell: jax.Array) -> jax.Array:
+    """bool[12, 12]: true at `cell` i32[2]."""
+    return jnp.all(cell == CELLS, axis=-1)
