@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.objects import (
@@ -187,7 +188,7 @@ def _check_action(action: Any) -> jax.Array:
             f"an action is integer[2] = (grasp, move), got {action.dtype}{list(action.shape)}; "
             "action_from_index converts 4 * grasp + move, and jax.vmap steps several"
         )
-    if not isinstance(action, jax.core.Tracer):
+    if not isinstance(action, Tracer):
         grasp, move = np.asarray(action).tolist()
         if not (0 <= grasp < NUM_DIRECTIONS and 0 <= move < NUM_DIRECTIONS):
             allowed = ", ".join(f"{code} {name}" for code, name in enumerate(DIRECTION_NAMES))

@@ -7,7 +7,7 @@ import numpy as np
 from trap_tube_jax.objects import BOARD_SIZE, DOWN, LEFT, RIGHT, UP
 
 # i32[12, 12, 2]: every cell's own (row, column).
-CELLS = np.stack(np.indices((BOARD_SIZE, BOARD_SIZE), np.int32), axis=-1)
+CELLS = np.moveaxis(np.indices((BOARD_SIZE, BOARD_SIZE), np.int32), 0, -1)
 
 
 def unit_vector(direction: jax.Array) -> jax.Array:

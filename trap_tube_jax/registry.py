@@ -29,7 +29,7 @@ class TaskSet:
     @property
     def label(self) -> str:
         """The set in the paper's notation, as in "{P, St}"; "base" for no transfers."""
-        symbols = {perceptual: "P", structural: "St", symbolic: "Sy"}
+        symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
         names = (
             symbols.get(transfer, getattr(transfer, "__name__", "?")) for transfer in self.transfers
         )

@@ -28,8 +28,7 @@ from trap_tube_jax.objects import (
 BOARD_SHAPE = (BOARD_SIZE, BOARD_SIZE)
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """One task at one time: everything the dynamics and the observation depend on.
 
     Attributes:
@@ -81,7 +80,7 @@ class State:
         Raises:
           ValueError: naming the value and what is allowed.
         """
-        state = cls(
+        fields: dict[str, Any] = dict(
             board=_integers("board", board, BOARD_SHAPE, np.uint8),
             palette=_integers(
                 "palette",
@@ -97,7 +96,7 @@ class State:
             terminated=np.zeros((), np.bool_),
             truncated=np.zeros((), np.bool_),
         )
-        return jax.device_put(validate(state))
+        return jax.device_put(validate(cls(**fields)))
 
     @classmethod
     def from_ascii(
@@ -145,8 +144,7 @@ class State:
         )
 
 
-@struct.dataclass
-class TimeStep:
+class TimeStep(struct.PyTreeNode):
     """What the environment tells the agent after a reset or a step.
 
     Attributes:
@@ -267,7 +265,7 @@ def _field_specs(num_features: int) -> dict[str, tuple[tuple[int, ...], type]]:
     }
 
 
-def _integers(name: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> np.ndarray:
+def _integers(name: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> Any:
     """Converts `value` to `dtype` after checking kind, shape (None: any >= 1) and range."""
     try:
         array = np.asarray(value)

@@ -152,8 +152,7 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
     )
 
 
-@struct.dataclass
-class _Outline:
+class _Outline(struct.PyTreeNode):
     """The tube's bounding box.
 
     Attributes:
@@ -197,7 +196,9 @@ def _sample_board(key: jax.Array, outline: _Outline) -> jax.Array:
 def _sample_tool(key: jax.Array, outline: _Outline) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The tool's corner i32[2] and extent i32[2], and its candidate corners bool[12, 12]."""
     direction_key, corner_key = jax.random.split(key)
-    along = jnp.where(jax.random.bernoulli(direction_key), np.int32([1, 0]), np.int32([0, 1]))
+    along = jnp.where(
+        jax.random.bernoulli(direction_key), np.array([1, 0], np.int32), np.array([0, 1], np.int32)
+    )
     length = jnp.sum(outline.size * along)
     # Along itself the bar must end before the last row or column, and start `length` before
     # the tube or behind it; across, it keeps two cells away.

@@ -21,8 +21,7 @@ class EnvironmentLike(Protocol):
         ...
 
 
-@struct.dataclass
-class AutoResetState:
+class AutoResetState(struct.PyTreeNode):
     """The state of an environment that starts over by itself.
 
     Attributes:
@@ -34,7 +33,6 @@ class AutoResetState:
     key: jax.Array
 
 
-@struct.dataclass
 class AutoResetTimeStep(TimeStep):
     """A timestep whose observation already belongs to the next episode if this one ended.
 
@@ -78,8 +76,7 @@ class AutoReset:
         return next_state, _auto_reset_timestep(timestep, observation)
 
 
-@struct.dataclass
-class EpisodeStatisticsState:
+class EpisodeStatisticsState(struct.PyTreeNode):
     """The state of an environment that keeps count of its episodes.
 
     Attributes:
