@@ -80,22 +80,22 @@ class State(struct.PyTreeNode):
         Raises:
           ValueError: naming the value and what is allowed.
         """
-        fields: dict[str, Any] = dict(
-            board=_integers("board", board, BOARD_SHAPE, np.uint8),
-            palette=_integers(
+        fields: dict[str, Any] = {
+            "board": _integers("board", board, BOARD_SHAPE, np.uint8),
+            "palette": _integers(
                 "palette",
                 base_palette() if palette is None else palette,
                 (NUM_OBJECTS, None),
                 np.uint8,
             ),
-            agent=_integers("agent", agent, (2,), np.int32),
-            tool=_integers("tool", tool, (2,), np.int32),
-            tool_extent=_integers("tool_extent", tool_extent, (2,), np.int32),
-            food=_integers("food", food, (2,), np.int32),
-            time=np.zeros((), np.int32),
-            terminated=np.zeros((), np.bool_),
-            truncated=np.zeros((), np.bool_),
-        )
+            "agent": _integers("agent", agent, (2,), np.int32),
+            "tool": _integers("tool", tool, (2,), np.int32),
+            "tool_extent": _integers("tool_extent", tool_extent, (2,), np.int32),
+            "food": _integers("food", food, (2,), np.int32),
+            "time": np.zeros((), np.int32),
+            "terminated": np.zeros((), np.bool_),
+            "truncated": np.zeros((), np.bool_),
+        }
         return jax.device_put(validate(cls(**fields)))
 
     @classmethod
