@@ -16,6 +16,7 @@ from trap_tube_jax.registry import (
     registered_ids,
     task_set,
 )
+from trap_tube_jax.rendering import render, save_gif
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
 from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
@@ -42,7 +43,9 @@ __all__ = [
     "perceptual",
     "register",
     "registered_ids",
+    "render",
     "render_ascii",
+    "save_gif",
     "structural",
     "symbolic",
     "task_set",

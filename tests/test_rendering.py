@@ -1,0 +1,162 @@
+"""Pictures: exact colours, signs that tell objects apart, GIF files."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import trap_tube_jax as tt
+from trap_tube_jax import objects, rendering
+
+CELL = 16
+
+
+def cells(picture, size=CELL):
+    """[12, 12, s, s, 3]: the picture of every cell."""
+    return np.asarray(picture).reshape(12, size, 12, size, 3).swapaxes(1, 2)
+
+
+def test_one_pixel_per_cell_is_the_observation():
+    state = tt.base_state()
+    np.testing.assert_array_equal(tt.render(state, 1, grasp=0), tt.observe(state))
+
+
+@pytest.mark.parametrize(
+    ("features", "channels"), [(1, [0, 0, 0]), (2, [0, 1, None]), (5, [0, 1, 2])]
+)
+def test_feature_channels_become_rgb(features, channels):
+    palette = np.arange(8 * features, dtype=np.uint8).reshape(8, features) + 50
+    state = tt.base_state(features).replace(palette=palette)
+    observation = np.asarray(tt.observe(state))
+    zeros = np.zeros((12, 12), np.uint8)
+    expected = np.stack([zeros if c is None else observation[..., c] for c in channels], -1)
+    np.testing.assert_array_equal(tt.render(state, 1), expected)
+
+
+@pytest.mark.parametrize("size", [3, 7, 19])
+def test_every_cell_keeps_its_exact_color_at_any_size(size):
+    palette = np.random.default_rng(0).integers(0, 256, (8, 3))
+    state = tt.base_state().replace(palette=palette.astype(np.uint8))
+    picture = tt.render(state, size, grid=False)
+    assert picture.shape == (12 * size, 12 * size, 3)
+    assert picture.dtype == jnp.uint8
+    observation = np.asarray(tt.observe(state))
+    same = (cells(picture, size) == observation[:, :, None, None]).all(-1)
+    assert (same.mean((2, 3)) > 0.3).all()
+
+
+def test_signs_tell_objects_apart_when_all_colors_collide():
+    state = tt.base_state().replace(palette=np.full((8, 3), 90, np.uint8))
+    tiles = cells(tt.render(state, CELL))
+    codes = np.asarray(tt.visible_objects(state))
+    inner = tiles[:, :, 2:-2, 2:-2]
+    tile_of = {code: inner[tuple(np.argwhere(codes == code)[0])] for code in range(8)}
+    for one, other in itertools.combinations(range(8), 2):
+        differs = (tile_of[one] != tile_of[other]).any(-1)
+        assert differs.mean() > 0.05, (objects.OBJECT_NAMES[one], objects.OBJECT_NAMES[other])
+
+
+@pytest.mark.parametrize(("color", "ink"), [(20, 255), (235, 0)])
+def test_signs_stand_out_from_their_color(color, ink):
+    state = tt.base_state().replace(palette=np.full((8, 3), color, np.uint8))
+    trap = cells(tt.render(state, CELL, grid=False))[5, 4]
+    assert abs(trap[CELL // 2, CELL // 2].astype(int) - ink).max() < 60
+    assert (trap[0, 0] == color).all()
+
+
+def test_the_tool_is_one_bar_and_hidden_below_the_agent():
+    state = tt.base_state().replace(agent=jnp.array([5, 1], jnp.int32))
+    tiles = cells(tt.render(state, CELL, grid=False))
+    alone = cells(tt.render(tt.base_state(), CELL, grid=False))
+    ink = alone[5, 1, :, CELL // 2]
+    assert (ink == ink[0]).all()
+    assert (ink[0] != objects.BASE_COLORS[objects.TOOL]).any()
+    np.testing.assert_array_equal(tiles[5, 1], alone[9, 1])
+    np.testing.assert_array_equal(tiles[4, 1], alone[4, 1])
+
+
+def test_grid_lines_surround_the_cells():
+    state = tt.base_state()
+    changed = np.asarray(tt.render(state, 8) != tt.render(state, 8, grid=False)).any(-1)
+    rows = np.flatnonzero(changed.all(axis=-1))
+    np.testing.assert_array_equal(rows, [*range(0, 96, 8), 95])
+    np.testing.assert_array_equal(changed, changed.T)
+
+
+def test_grasp_draws_a_hand_on_the_agents_border():
+    state = tt.base_state().replace(agent=jnp.array([8, 1], jnp.int32))
+    plain = tt.render(state, CELL)
+    holds, empty, none = (tt.render(state, CELL, grasp=direction) for direction in (0, 3, 4))
+    np.testing.assert_array_equal(none, plain)
+    rows, columns = np.nonzero(np.asarray(holds != plain).any(-1))
+    assert rows.min() > 7 * CELL
+    assert rows.max() < 9 * CELL
+    assert (columns // CELL == 1).all()
+    assert (np.asarray(holds)[8 * CELL, CELL + CELL // 2] == 255).all()
+    assert (np.asarray(empty)[8 * CELL + CELL // 2, 2 * CELL] < 255).any()
+
+
+def test_render_maps_over_batches():
+    base = tt.base_state()
+    moved = base.replace(agent=jnp.array([3, 2]), tool=jnp.array([7, 8]))
+    states = jax.tree.map(lambda *x: jnp.stack(x), base, moved)
+    batch = jax.vmap(lambda state, grasp: tt.render(state, CELL, grasp=grasp))(
+        states, jnp.array([0, 3])
+    )
+    np.testing.assert_array_equal(batch[0], tt.render(base, CELL, grasp=0))
+    np.testing.assert_array_equal(batch[1], tt.render(moved, CELL, grasp=3))
+
+
+def test_legend_tiles_match_the_board():
+    tiles = cells(tt.render(tt.base_state(), CELL, grid=False))
+    for code, cell in ((objects.TRAP, (5, 4)), (objects.EXIT, (5, 7)), (objects.AGENT, (9, 1))):
+        np.testing.assert_array_equal(rendering.render_object(code, CELL), tiles[cell])
+    assert rendering.render_object(objects.TOOL, 3).shape == (3, 3, 3)
+
+
+@pytest.mark.parametrize("size", [0, -1, 2.5, True, "8"])
+def test_render_refuses_other_cell_sizes(size):
+    with pytest.raises(ValueError, match="cell_size must be"):
+        tt.render(tt.base_state(), size)
+    with pytest.raises(ValueError, match="cell_size must be"):
+        rendering.render_object(0, size)
+
+
+def test_render_object_refuses_unknown_codes():
+    with pytest.raises(ValueError, match="from 0 to 7, got 8"):
+        rendering.render_object(8)
+
+
+def test_gif_holds_the_frames(tmp_path):
+    state = tt.base_state()
+    agents = jnp.array([[9, 1], [9, 2], [9, 3]])
+    frames = [np.asarray(tt.render(state.replace(agent=agent), 8)) for agent in agents]
+    path = tmp_path / "episode.gif"
+    tt.save_gif(frames, path, fps=10, hold=0.5)
+    with Image.open(path) as gif:
+        assert gif.info["loop"] == 0
+        durations = []
+        for index, frame in enumerate(frames):
+            gif.seek(index)
+            durations.append(gif.info["duration"])
+            written = np.asarray(gif.convert("RGB")).astype(int)
+            assert abs(written - frame).mean() < 2
+    assert durations == [100, 100, 600]
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "message"),
+    [
+        (np.zeros((2, 4, 4, 3), np.float32), {}, "got float32"),
+        (np.zeros((4, 4, 3), np.uint8), {}, r"got uint8\[4, 4, 3\]"),
+        (np.zeros((0, 4, 4, 3), np.uint8), {}, "at least one"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 0}, "at most 50, got 0"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"hold": -1}, "got -1"),
+    ],
+)
+def test_gif_refuses(frames, options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        tt.save_gif(frames, tmp_path / "none.gif", **options)

@@ -1,0 +1,278 @@
+"""Pictures for people: the board with a sign on every object, and animated GIFs.
+
+The agent sees plain colours (`trap_tube_jax.observation`), which may collide under the
+structural transfer. A picture therefore marks every object with a sign in black or
+white, whichever stands out from the object's colour:
+
+    trap: a cross            exit: a ring            ground: nothing
+    tube1, tube2: hatching that rises to the right, to the left
+    food: an apple           tool: a bar along it    agent: a face
+"""
+
+import functools
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from trap_tube_jax.geometry import bar_covers, unit_vector
+from trap_tube_jax.objects import (
+    AGENT,
+    BASE_COLORS,
+    BOARD_SIZE,
+    EXIT,
+    FOOD,
+    NUM_DIRECTIONS,
+    NUM_OBJECTS,
+    TOOL,
+    TRAP,
+    TUBE1,
+    TUBE2,
+)
+from trap_tube_jax.observation import observe, visible_objects
+from trap_tube_jax.state import State
+
+SMALLEST_SIGN = 7  # pixels per cell from which on a sign can be read
+SMALLEST_GRID = 4  # pixels per cell from which on lines leave room for colour
+SIGN_OPACITY = 0.8
+GRID_OPACITY = 0.22
+TOOL_BAR_RADIUS = 0.16
+HAND_RADIUS = 0.2
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
+MAX_FPS = 50  # browsers slow down GIFs with shorter frames
+
+
+def render(
+    state: State,
+    cell_size: int = 32,
+    *,
+    grid: bool = True,
+    grasp: jax.Array | int | None = None,
+) -> jax.Array:
+    """The board as an RGB picture. Pure, jit- and vmap-able.
+
+    One feature channel is shown as grey, two as red and green, of three and more the
+    first three as red, green and blue. Cells below 7 pixels carry no signs and no hand,
+    below 4 no lines: one pixel per cell is the observation itself, in RGB.
+
+    Args:
+      state: one unbatched state.
+      cell_size: s >= 1, pixels per cell and side.
+      grid: whether to draw lines between the cells.
+      grasp: i32[], a direction (0 up, 1 down, 2 left, 3 right) to draw the agent's hand
+        in: a disc where it holds the tool, a ring where it is empty. None and any other
+        number draw no hand.
+
+    Returns:
+      u8[12 s, 12 s, 3].
+
+    Raises:
+      ValueError: `cell_size` is not an integer >= 1.
+    """
+    _check_cell_size(cell_size)
+    return _render(state, grasp, cell_size=int(cell_size), grid=bool(grid))
+
+
+def render_object(code: int, cell_size: int = 32) -> np.ndarray:
+    """An object in its base colour with its sign, for legends. Host side.
+
+    Args:
+      code: the object's code, 0 to 7.
+      cell_size: s >= 1, pixels per side.
+
+    Returns:
+      u8[s, s, 3].
+
+    Raises:
+      ValueError: naming the value and what is allowed.
+    """
+    _check_cell_size(cell_size)
+    if code not in range(NUM_OBJECTS):
+        raise ValueError(f"code must be an object code from 0 to {NUM_OBJECTS - 1}, got {code!r}")
+    color = np.broadcast_to(BASE_COLORS[code], (cell_size, cell_size, 3)).astype(np.float32)
+    sign = _signs(int(cell_size))[code]
+    return np.asarray(_to_pixels(_blend(color, _ink(color), sign * SIGN_OPACITY)))
+
+
+def save_gif(
+    frames: Any, path: str | os.PathLike[str], fps: float = 8, *, hold: float = 1.0
+) -> None:
+    """Writes an endlessly looping GIF. Host side.
+
+    Args:
+      frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1.
+      path: the file to write.
+      fps: frames per second, over 0 and at most 50.
+      hold: seconds by which the last frame stays longer.
+
+    Raises:
+      ValueError: naming the value and what is allowed.
+    """
+    pictures = np.asarray(frames)
+    if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[-1] != 3:
+        raise ValueError(
+            f"frames must be uint8[T, height, width, 3], got {pictures.dtype}{list(pictures.shape)}"
+        )
+    if not len(pictures):
+        raise ValueError("frames must hold at least one picture, got none")
+    if not 0 < fps <= MAX_FPS:
+        raise ValueError(f"fps must be over 0 and at most {MAX_FPS}, got {fps}")
+    if not 0 <= hold < np.inf:
+        raise ValueError(f"hold must be a number of seconds >= 0, got {hold}")
+    durations = [round(1000 / fps)] * len(pictures)
+    durations[-1] += round(1000 * hold)
+    # Dithering would speckle plain colours and double the size of the file.
+    first, *rest = (
+        Image.fromarray(picture).quantize(dither=Image.Dither.NONE) for picture in pictures
+    )
+    options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
+    first.save(path, format="GIF", duration=durations, loop=0, **options)
+
+
+@functools.partial(jax.jit, static_argnames=("cell_size", "grid"))
+def _render(
+    state: State, grasp: jax.Array | int | None, *, cell_size: int, grid: bool
+) -> jax.Array:
+    objects = visible_objects(state)
+    image = _enlarge(_rgb(observe(state)), cell_size).astype(jnp.float32)
+    ink = _ink(image)
+    if cell_size >= SMALLEST_SIGN:
+        is_tool = _enlarge(objects, cell_size) == TOOL
+        sign = jnp.where(is_tool, _tool_bar(state, cell_size), _arrange(_signs(cell_size), objects))
+        image = _blend(image, ink, sign * SIGN_OPACITY)
+    if grid and cell_size >= SMALLEST_GRID:
+        image = _blend(image, ink, _grid_lines(cell_size) * GRID_OPACITY)
+    if grasp is not None and cell_size >= SMALLEST_SIGN:
+        image = _draw_hand(image, state, jnp.asarray(grasp), cell_size)
+    return _to_pixels(image)
+
+
+def _rgb(observation: jax.Array) -> jax.Array:
+    """u8[12, 12, 3] of features u8[12, 12, N]."""
+    num_features = observation.shape[-1]
+    if num_features == 1:
+        return jnp.repeat(observation, 3, axis=-1)
+    if num_features == 2:
+        return jnp.pad(observation, [(0, 0), (0, 0), (0, 1)])
+    return observation[..., :3]
+
+
+def _enlarge(cells: jax.Array, cell_size: int) -> jax.Array:
+    """[12 s, 12 s, ...]: every cell of [12, 12, ...] repeated s times down and across."""
+    return jnp.repeat(jnp.repeat(cells, cell_size, axis=0), cell_size, axis=1)
+
+
+def _arrange(tiles: np.ndarray, objects: jax.Array) -> jax.Array:
+    """[12 s, 12 s]: of tiles [8, s, s], the one of each cell's object u8[12, 12]."""
+    size = BOARD_SIZE * tiles.shape[-1]
+    return jnp.asarray(tiles)[objects].transpose(0, 2, 1, 3).reshape(size, size)
+
+
+def _ink(color: Any) -> Any:
+    """f32[h, w, 1]: black or white, whichever stands out from f32[h, w, 3]."""
+    return (color @ LUMA < 128)[..., None] * np.float32(255)
+
+
+def _blend(image: Any, ink: Any, opacity: Any) -> Any:
+    """f32[h, w, 3]: `ink` over `image`, with opacity f32[h, w] from 0 to 1."""
+    return image + (ink - image) * opacity[..., None]
+
+
+def _to_pixels(image: Any) -> jax.Array:
+    return jnp.round(image).astype(jnp.uint8)
+
+
+# A sign is a signed distance field over pixel centres, in units of a cell: negative
+# inside the shape. A ramp of one pixel at its edge keeps it smooth at every size.
+
+
+@functools.cache
+def _signs(cell_size: int) -> np.ndarray:
+    """f32[8, s, s]: how far each object's sign covers each pixel of its cell, 0 to 1."""
+    y, x = _offsets((0.5, 0.5), 1, cell_size)
+    distance = np.full((NUM_OBJECTS, cell_size, cell_size), np.inf, np.float32)
+    if cell_size >= SMALLEST_SIGN:
+        distance[TRAP] = _cross(y, x)
+        distance[EXIT] = abs(np.hypot(y, x) - 0.24) - 0.07
+        distance[TUBE1] = _hatching(x + y)
+        distance[TUBE2] = _hatching(x - y)
+        distance[FOOD] = _apple(y, x)
+        distance[TOOL] = np.hypot(np.maximum(abs(y) - 0.2, 0), x) - TOOL_BAR_RADIUS
+        distance[AGENT] = _face(y, x)
+    return _coverage(distance, cell_size)
+
+
+def _cross(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    to_diagonals = np.minimum(abs(x - y), abs(x + y)) / np.sqrt(2)
+    return np.maximum(to_diagonals - 0.07, np.maximum(abs(x), abs(y)) - 0.29)
+
+
+def _hatching(across: np.ndarray) -> np.ndarray:
+    """Two diagonals per cell, which meet those of the neighbouring cells."""
+    return abs(2 * across % 1 - 0.5) / np.sqrt(8) - 0.035
+
+
+def _apple(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    halves = np.hypot(abs(x) - 0.09, y - 0.06) - 0.19
+    stem = np.hypot(x - 0.02, np.maximum(abs(y + 0.22) - 0.08, 0)) - 0.035
+    return np.minimum(halves, stem)
+
+
+def _face(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    eyes = np.hypot(abs(x) - 0.15, y + 0.1) - 0.08
+    mouth = np.maximum(abs(np.hypot(x, y) - 0.26) - 0.045, 0.1 - y)
+    return np.minimum(eyes, mouth)
+
+
+def _tool_bar(state: State, cell_size: int) -> jax.Array:
+    """f32[12 s, 12 s]: a bar with round ends through the centres of the tool's cells."""
+    half = (state.tool_extent - 1) / 2
+    y, x = _offsets(state.tool + 0.5 + half, BOARD_SIZE, cell_size)
+    outside = [jnp.maximum(abs(y) - half[0], 0), jnp.maximum(abs(x) - half[1], 0)]
+    return _coverage(jnp.hypot(*outside) - TOOL_BAR_RADIUS, cell_size)
+
+
+def _draw_hand(image: jax.Array, state: State, grasp: jax.Array, cell_size: int) -> jax.Array:
+    """Draws a white hand with a black outline on the agent's border in the grasp direction."""
+    direction = unit_vector(grasp)
+    on_tool = functools.partial(bar_covers, state.tool, state.tool_extent)
+    holds = on_tool(state.agent + direction) & ~on_tool(state.agent)
+    y, x = _offsets(state.agent + 0.5 + 0.5 * direction, BOARD_SIZE, cell_size)
+    disc = jnp.hypot(y, x) - HAND_RADIUS
+    hand = jnp.where(holds, disc, jnp.abs(disc + 0.07) - 0.07)
+    is_shown = (grasp >= 0) & (grasp < NUM_DIRECTIONS)
+    outline = _coverage(hand - 0.05, cell_size) * is_shown
+    image = _blend(image, 0.0, outline)
+    return _blend(image, 255.0, _coverage(hand, cell_size) * is_shown)
+
+
+def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:
+    """f32[n s, 1] and f32[1, n s]: how far every pixel lies below and right of `center`.
+
+    Both `center`, (y, x), and the result are in units of a cell.
+    """
+    along = (np.arange(num_cells * cell_size, dtype=np.float32) + 0.5) / cell_size
+    return (along - center[0])[:, None], (along - center[1])[None, :]
+
+
+def _coverage(distance: Any, cell_size: int) -> Any:
+    """The part of each pixel that lies inside the shape, 0 to 1, as f32."""
+    return (0.5 - distance * cell_size).clip(0, 1)
+
+
+def _grid_lines(cell_size: int) -> np.ndarray:
+    """f32[12 s, 12 s]: 1 on the lines around the cells, 0 elsewhere."""
+    width = max(1, cell_size // 32)
+    pixels = np.arange(BOARD_SIZE * cell_size)
+    on_line = (pixels % cell_size < width) | (pixels >= len(pixels) - width)
+    return (on_line[:, None] | on_line).astype(np.float32)
+
+
+def _check_cell_size(cell_size: Any) -> None:
+    if isinstance(cell_size, bool) or not isinstance(cell_size, int | np.integer):
+        raise ValueError(f"cell_size must be an integer >= 1, got {cell_size!r}")
+    if cell_size < 1:
+        raise ValueError(f"cell_size must be >= 1, got {cell_size}")
