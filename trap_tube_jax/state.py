@@ -96,7 +96,9 @@ class State(struct.PyTreeNode):
             "terminated": np.zeros((), np.bool_),
             "truncated": np.zeros((), np.bool_),
         }
-        return jax.device_put(validate(cls(**fields)))
+        # A layout is concrete also where it is built inside a traced function.
+        with jax.ensure_compile_time_eval():
+            return jax.device_put(validate(cls(**fields)))
 
     @classmethod
     def from_ascii(
