@@ -78,6 +78,11 @@ def is_in(cell: Cell, cells: list[Cell]) -> np.ndarray:
     return functools.reduce(np.logical_or, [cell.same(other) for other in cells])
 
 
+def choose(condition: np.ndarray, then: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """`np.where` of booleans, which NumPy does several times slower."""
+    return (condition & then) | (~condition & otherwise)
+
+
 def on_board(cell: Cell) -> np.ndarray:
     return (cell.row >= 0) & (cell.row < SIZE) & (cell.column >= 0) & (cell.column < SIZE)
 
@@ -94,23 +99,20 @@ def step(layouts: Layouts, agent: Cell, tool: Cell, food: Cell, action: tuple) -
     food_ahead = is_in(food.shifted(d, -1), bar) & ~is_in(food, bar)
     food_free = np.isin(layouts.static_object(pushed), (GROUND, EXIT)) & ~is_in(pushed, bar)
 
-    food_moves = grasped & agent_free & food_ahead & food_free
+    # Small tables first, [agent, tool] or [tool, food]: fewer operations on all three.
+    food_moves = (grasped & agent_free) & (food_ahead & food_free)
 
     stays_on_board = np.all([on_board(cell) for cell in moved_bar], axis=0)
-    unobstructed = ~food_ahead | food_moves
-    tool_moves = grasped & agent_free & unobstructed & stays_on_board
+    tool_moves = (grasped & agent_free & stays_on_board) & (~food_ahead | food_moves)
     held = grasped & ~tool_moves
 
-    covered = np.where(tool_moves, is_in(ahead, moved_bar), is_in(ahead, bar))
-    onto_food = np.where(food_moves, ahead.same(pushed), ahead.same(food))
-    agent_moves = ~held & on_board(ahead) & ~covered & (agent_free | onto_food)
+    covered = choose(tool_moves, is_in(ahead, moved_bar), is_in(ahead, bar))
+    onto_food = choose(food_moves, ahead.same(pushed), ahead.same(food))
+    can_enter = on_board(ahead) & (agent_free | onto_food)
+    agent_moves = can_enter & ~(held | covered)
 
-    apart_by = [
-        (agent_moves == food_moves, agent.same(food)),
-        (agent_moves & ~food_moves, ahead.same(food)),
-        (food_moves & ~agent_moves, agent.same(pushed)),
-    ]
-    solved = functools.reduce(np.logical_or, [case & meet for case, meet in apart_by])
+    meet_if_agent_stays = choose(food_moves, agent.same(pushed), agent.same(food))
+    solved = choose(agent_moves, onto_food, meet_if_agent_stays)
     return Moved(food_moves, tool_moves, agent_moves, solved)
 
 
