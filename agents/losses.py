@@ -1,0 +1,59 @@
+"""The terms of the loss: functions of arrays, one number per step.
+
+`masked_mean` reduces them as the published baseline does: the masked sum over the
+number of all steps, padded ones included.
+
+Source: agent specification "PPO" and "ICM".
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """The sum of `x` f32[...] where `mask` is 1, over the number of all elements."""
+    chex.assert_equal_shape([x, mask])
+    return jnp.mean(x * mask)
+
+
+def log_prob(logits: jax.Array, choice: jax.Array) -> jax.Array:
+    """The log-probability f32[...] of `choice` i32[...] under `logits` f32[..., K]."""
+    chex.assert_equal_shape_prefix([logits, choice[..., None]], choice.ndim)
+    log_probs = jax.nn.log_softmax(logits)
+    return jnp.take_along_axis(log_probs, choice[..., None], axis=-1)[..., 0]
+
+
+def entropy(logits: jax.Array) -> jax.Array:
+    """The entropy f32[...], in nats, of the distribution with `logits` f32[..., K]."""
+    log_probs = jax.nn.log_softmax(logits)
+    return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
+
+
+def clipped_surrogate(
+    log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float
+) -> jax.Array:
+    """PPO's clipped policy loss (Schulman et al., 2017, equation 7), negated to minimise.
+
+      ratio = exp(log_prob - old_log_prob)
+      loss = -min(ratio * A, clip(ratio, 1 - clip, 1 + clip) * A)
+
+    Args:
+      log_prob: f32[...], of the actions taken, under the present parameters.
+      old_log_prob: f32[...], under the parameters that acted.
+      advantage: f32[...].
+      clip: half-width of the interval of ratios.
+
+    Returns:
+      f32[...].
+    """
+    chex.assert_equal_shape([log_prob, old_log_prob, advantage])
+    ratio = jnp.exp(log_prob - old_log_prob)
+    clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
+    return -jnp.minimum(ratio * advantage, clipped * advantage)
+
+
+def squared_error(prediction: jax.Array, target: jax.Array) -> jax.Array:
+    """(prediction - target)^2, f32[...]."""
+    chex.assert_equal_shape([prediction, target])
+    return jnp.square(prediction - target)

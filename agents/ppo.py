@@ -1,0 +1,339 @@
+"""PPO with curiosity: one iteration of training as one pure function.
+
+Source: agent specification "PPO" and "ICM"; paper section "Results".
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+import trap_tube_jax as tt
+from agents import distinct, losses, returns
+from agents.agent import Agent, Params
+from agents.config import Config
+from agents.curiosity import Prediction, forward_loss, intrinsic_reward
+from agents.optimizer import adam
+from agents.rollout import Trajectory, action_log_prob, place, rollout, sample_action
+from trap_tube_jax.environment import Environment
+
+Metrics = dict[str, jax.Array]
+
+
+class TrainState(NamedTuple):
+    """Everything that training carries from one iteration to the next.
+
+    Attributes:
+      params: the network's parameters.
+      opt_state: the optimiser's state.
+      extrinsic: moments of the extrinsic reward.
+      intrinsic: moments of the intrinsic reward.
+      key: PRNG key of all iterations to come.
+      iteration: i32[], iterations done.
+      episodes: i32[], episodes played.
+      transitions: f32[], environment steps taken.
+    """
+
+    params: Params
+    opt_state: Any
+    extrinsic: returns.Moments
+    intrinsic: returns.Moments
+    key: jax.Array
+    iteration: jax.Array
+    episodes: jax.Array
+    transitions: jax.Array
+
+
+class Batch(NamedTuple):
+    """What one gradient step sees of its episodes, [T, B, ...] each.
+
+    Attributes:
+      observation_id: i32[T + 1, B], equal only for equal observations.
+      layout: B states; `cells`: u8[T + 1, B, 3, 2]; together the observations.
+      cells: see `layout`.
+      action: i32[T, B, 2].
+      reward: f32[T, B], extrinsic, as the network sees it.
+      mask: f32[T, B].
+      log_prob: f32[T, B], under the acting parameters.
+      advantage: f32[T, B].
+      value_target: f32[T, B].
+    """
+
+    observation_id: jax.Array
+    layout: tt.State
+    cells: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    mask: jax.Array
+    log_prob: jax.Array
+    advantage: jax.Array
+    value_target: jax.Array
+
+    def take(self, episodes: jax.Array) -> "Batch":
+        """The batch of these episodes, i32[M]."""
+        rest = self._replace(layout=None)
+        taken = jax.tree.map(lambda x: x[:, episodes], rest)
+        return taken._replace(layout=jax.tree.map(lambda x: x[episodes], self.layout))
+
+
+class Train(NamedTuple):
+    """Training as two pure functions; jit them, and vmap them over seeds.
+
+    Attributes:
+      init: PRNG key to the first `TrainState`.
+      iterate: a `TrainState` to the next one and its metrics, f32[] each.
+      agent: the network's functions.
+      env: the environment.
+      config: the settings.
+    """
+
+    init: Callable[[jax.Array], TrainState]
+    iterate: Callable[[TrainState], tuple[TrainState, Metrics]]
+    agent: Agent
+    env: Environment
+    config: Config
+
+
+def make_train(config: Config, env: Environment | None = None) -> Train:
+    """Builds training from its settings.
+
+    Args:
+      config: the settings.
+      env: an environment of your own; that of `config.env_id` if absent.
+
+    Raises:
+      ValueError: `env` contradicts `config`.
+    """
+    env = _environment(config, env)
+    agent = Agent(config)
+    optimizer = make_optimizer(config)
+
+    def init(key: jax.Array) -> TrainState:
+        params_key, key = jax.random.split(key)
+        params = agent.init(params_key)
+        zero = jnp.zeros((), jnp.int32)
+        return TrainState(
+            params=params,
+            opt_state=optimizer.init(params),
+            extrinsic=returns.Moments.zero(),
+            intrinsic=returns.Moments.zero(),
+            key=key,
+            iteration=zero,
+            episodes=zero,
+            transitions=jnp.zeros((), jnp.float32),
+        )
+
+    def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
+        reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
+        reset_keys = jax.random.split(reset_key, config.episodes)
+        initial, _ = jax.vmap(env.reset)(reset_keys)
+        trajectory = rollout(
+            agent,
+            state.params,
+            env,
+            initial,
+            action_key,
+            choose=sample_action,
+            chunk=config.chunk,
+        )
+        batch, moments, play_metrics = prepare(agent, config, state, trajectory)
+        params, opt_state, loss_metrics = optimize(
+            agent, config, optimizer, (state.params, state.opt_state), batch, update_key
+        )
+        extrinsic, intrinsic = moments
+        state = TrainState(
+            params=params,
+            opt_state=opt_state,
+            extrinsic=extrinsic,
+            intrinsic=intrinsic,
+            key=key,
+            iteration=state.iteration + 1,
+            episodes=state.episodes + config.episodes,
+            transitions=state.transitions + jnp.sum(trajectory.mask),
+        )
+        return state, {**play_metrics, **loss_metrics}
+
+    return Train(init, iterate, agent, env, config)
+
+
+def make_optimizer(config: Config) -> optax.GradientTransformation:
+    """Adam behind a clip of the gradients' global norm."""
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_gradient_norm),
+        adam(config.learning_rate, epsilon=config.adam_epsilon),
+    )
+
+
+def prepare(
+    agent: Agent, config: Config, state: TrainState, trajectory: Trajectory
+) -> tuple[Batch, tuple[returns.Moments, returns.Moments], Metrics]:
+    """Turns episodes into what the gradient steps learn from, under the acting parameters.
+
+    Returns:
+      The batch of all episodes, the moments of both rewards, and metrics of play.
+    """
+    mask = trajectory.mask
+    observation_id = observation_ids(trajectory)
+    extrinsic = state.extrinsic.update(trajectory.reward, mask, config.reward_rate)
+    reward = trajectory.reward / extrinsic.deviation
+    curiosity, intrinsic = jnp.zeros_like(mask), state.intrinsic
+    if agent.curiosity is not None:
+        curiosity = mask * _curiosity_reward(agent, state.params, trajectory)
+        if config.episodic_novelty:
+            curiosity = curiosity * first_visits(observation_id)[1:]
+        intrinsic = intrinsic.update(curiosity, mask, config.reward_rate)
+        reward = reward + config.intrinsic_scale * curiosity / intrinsic.deviation
+
+    discount, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
+    advantage = jax.vmap(
+        returns.generalized_advantages, in_axes=(1, 1, 0, 1, None, None), out_axes=1
+    )(reward, trajectory.value, trajectory.value[-1], mask, discount, lambda_)
+    value_target = jax.vmap(returns.discounted_returns, in_axes=(1, None), out_axes=1)(
+        reward, discount
+    )
+    batch = Batch(
+        observation_id=observation_id,
+        layout=trajectory.layout,
+        cells=trajectory.cells,
+        action=trajectory.action,
+        reward=trajectory.reward,
+        mask=mask,
+        log_prob=trajectory.log_prob,
+        advantage=returns.normalize(advantage, mask),
+        value_target=value_target,
+    )
+    metrics = {
+        "success": jnp.mean(trajectory.solved.astype(jnp.float32)),
+        "episode_length": jnp.mean(trajectory.length.astype(jnp.float32)),
+        "intrinsic_reward": jnp.sum(curiosity) / jnp.sum(mask),
+        "distinct_observations": jnp.max(observation_id) + 1,
+    }
+    return batch, (extrinsic, intrinsic), metrics
+
+
+def optimize(
+    agent: Agent,
+    config: Config,
+    optimizer: optax.GradientTransformation,
+    start: tuple[Params, Any],
+    batch: Batch,
+    key: jax.Array,
+) -> tuple[Params, Any, Metrics]:
+    """All epochs of gradient steps on minibatches of whole episodes, shuffled anew in each."""
+
+    def update(
+        carry: tuple[Params, Any], episodes: jax.Array
+    ) -> tuple[tuple[Params, Any], Metrics]:
+        params, opt_state = carry
+        gradient, metrics = jax.grad(loss, has_aux=True)(
+            params, agent, config, batch.take(episodes)
+        )
+        updates, opt_state = optimizer.update(gradient, opt_state, params)
+        metrics["gradient_norm"] = optax.tree.norm(gradient)
+        params: Any = optax.apply_updates(params, updates)
+        return (params, opt_state), metrics
+
+    def permute(epoch_key: jax.Array) -> jax.Array:
+        order = jax.random.permutation(epoch_key, config.episodes)
+        return order.reshape(-1, config.minibatch)
+
+    minibatches = jax.vmap(permute)(jax.random.split(key, config.epochs))
+    (params, opt_state), metrics = jax.lax.scan(
+        update, start, minibatches.reshape(-1, config.minibatch)
+    )
+    return params, opt_state, jax.tree.map(jnp.mean, metrics)
+
+
+def loss(params: Params, agent: Agent, config: Config, batch: Batch) -> tuple[jax.Array, Metrics]:
+    """The total loss f32[] and its terms, weighted as they enter it.
+
+    L = policy + value - entropy + curiosity_coef * (forward + inverse)
+    """
+    features = encode_batch(params, agent, config, batch)
+    embedding, next_embedding = agent.unroll(params, features, batch.action, batch.reward)
+    outputs = agent.act(params, embedding)
+    log_prob = action_log_prob(outputs, batch.action)
+    surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
+    value_error = losses.squared_error(outputs.value, batch.value_target)
+    entropy = losses.entropy(outputs.grasp_logits) + losses.entropy(outputs.move_logits)
+    terms = {
+        "policy_loss": losses.masked_mean(surrogate, batch.mask),
+        "value_loss": config.value_coef * losses.masked_mean(value_error, batch.mask),
+        "entropy_loss": -config.entropy_coef * losses.masked_mean(entropy, batch.mask),
+    }
+    if agent.curiosity is not None:
+        prediction = agent.predict(params, embedding, next_embedding, features, batch.action)
+        terms |= curiosity_losses(config, prediction, batch)
+    total = sum(terms.values(), jnp.zeros(()))
+    mean_entropy = jnp.sum(entropy * batch.mask) / jnp.sum(batch.mask)
+    return total, {**terms, "loss": total, "entropy": mean_entropy}
+
+
+def curiosity_losses(config: Config, prediction: Prediction, batch: Batch) -> Metrics:
+    """The forward loss and, where there is an inverse model, the inverse loss, weighted."""
+    coef = config.curiosity_coef
+    terms = {"forward_loss": coef * losses.masked_mean(forward_loss(prediction), batch.mask)}
+    if prediction.grasp_logits is not None and prediction.move_logits is not None:
+        grasp = losses.log_prob(prediction.grasp_logits, batch.action[..., 0])
+        move = losses.log_prob(prediction.move_logits, batch.action[..., 1])
+        terms["inverse_loss"] = -coef * losses.masked_mean(grasp + move, batch.mask)
+    return terms
+
+
+def encode_batch(params: Params, agent: Agent, config: Config, batch: Batch) -> jax.Array:
+    """The features f32[T + 1, B, F] of a batch, each distinct observation encoded once."""
+    shape = batch.observation_id.shape
+    groups = distinct.group(batch.observation_id.reshape(-1))
+    time, episode = groups.representative // shape[1], groups.representative % shape[1]
+    layout = jax.tree.map(lambda x: x[episode], batch.layout)
+    rows = jax.vmap(lambda layout, cells: tt.observe(place(layout, cells)))(
+        layout, batch.cells[time, episode]
+    )
+    features = distinct.map_rows(
+        agent.encode, config.chunk, agent.encoding_params(params), rows, groups.total
+    )
+    return features[groups.number].reshape(*shape, -1)
+
+
+def observation_ids(trajectory: Trajectory) -> jax.Array:
+    """i32[T + 1, B]: equal only for equal observations, numbered from 0."""
+    layout_id = distinct.layout_ids(trajectory.layout)
+    place_all = jax.vmap(jax.vmap(place), in_axes=(None, 0))
+    states = place_all(trajectory.layout, trajectory.cells)
+    position = jax.vmap(jax.vmap(distinct.position_id))(states)
+    layout_id = jnp.broadcast_to(layout_id, position.shape)
+    groups = distinct.group(layout_id.reshape(-1), position.reshape(-1))
+    return groups.number.reshape(position.shape)
+
+
+def first_visits(observation_id: jax.Array) -> jax.Array:
+    """f32[T + 1, B]: 1 where an observation is new in its episode, 0 where it returns."""
+    time = jnp.arange(len(observation_id))
+    same = observation_id[:, None] == observation_id[None]
+    earlier = (time[:, None] > time[None])[..., None]
+    return 1.0 - jnp.any(same & earlier, axis=1)
+
+
+def _curiosity_reward(agent: Agent, params: Params, trajectory: Trajectory) -> jax.Array:
+    """The raw intrinsic reward f32[T, B]."""
+    _, next_embedding = agent.unroll(
+        params, trajectory.features, trajectory.action, trajectory.reward
+    )
+    prediction = agent.predict(
+        params, trajectory.embedding, next_embedding, trajectory.features, trajectory.action
+    )
+    return intrinsic_reward(prediction)
+
+
+def _environment(config: Config, env: Environment | None) -> Environment:
+    if env is None:
+        return tt.make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
+    for name in ("num_features", "max_steps"):
+        if getattr(env, name) != getattr(config, name):
+            raise ValueError(
+                f"the environment's {name} is {getattr(env, name)}, the config's "
+                f"{getattr(config, name)}; they must agree"
+            )
+    return env

@@ -1,0 +1,124 @@
+"""Returns, advantages and the statistics that scale them: functions of arrays.
+
+Time ranges follow the paper's episodes of T steps: step t leads from observation t to
+observation t + 1. `mask` is 1 on steps that were really taken, 0 after the end.
+
+Source: agent specification "PPO" and "ICM".
+"""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Array:
+    """The discounted sum of rewards to the end of the episode, without bootstrap.
+
+      G_t = r_t + discount * G_{t+1},  G_T = 0.
+
+    Args:
+      reward: f32[T], zero after the end.
+      discount: scalar in [0, 1].
+
+    Returns:
+      f32[T].
+    """
+    chex.assert_rank([reward, discount], [1, 0])
+    return _backward_sum(reward, jnp.full_like(reward, discount))
+
+
+def generalized_advantages(
+    reward: jax.Array,
+    value: jax.Array,
+    bootstrap: jax.Array,
+    mask: jax.Array,
+    discount: float | jax.Array,
+    lambda_: float | jax.Array,
+) -> jax.Array:
+    """Generalised advantage estimates over a padded episode (Schulman et al., 2016).
+
+      delta_t = mask_t (r_t + discount v_{t+1} - v_t),  v_T = bootstrap,
+      A_t = delta_t + discount * lambda * A_{t+1},  A_T = 0.
+
+    Args:
+      reward: f32[T].
+      value: f32[T], the values v_0 to v_{T-1}; after an early end v_t is the value of
+        the last board.
+      bootstrap: f32[], the value after the last step.
+      mask: f32[T].
+      discount: scalar in [0, 1].
+      lambda_: scalar in [0, 1].
+
+    Returns:
+      f32[T].
+    """
+    chex.assert_rank([reward, value, bootstrap, mask, discount, lambda_], [1, 1, 0, 1, 0, 0])
+    chex.assert_equal_shape([reward, value, mask])
+    value_next = jnp.append(value[1:], bootstrap)
+    delta = mask * (reward + discount * value_next - value)
+    return _backward_sum(delta, jnp.full_like(delta, discount * lambda_))
+
+
+def masked_moments(x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and variance f32[] of the elements of `x` f32[...] where `mask` f32[...] is 1.
+
+    Both are 0 if the mask is empty.
+    """
+    chex.assert_equal_shape([x, mask])
+    count = jnp.maximum(jnp.sum(mask), 1.0)
+    mean = jnp.sum(x * mask) / count
+    return mean, jnp.sum(jnp.square(x - mean) * mask) / count
+
+
+def normalize(x: jax.Array, mask: jax.Array, epsilon: float = 1e-8) -> jax.Array:
+    """`x` f32[...] less its masked mean, over its masked deviation; 0 where masked out."""
+    mean, variance = masked_moments(x, mask)
+    return mask * (x - mean) / jnp.sqrt(variance + epsilon)
+
+
+class Moments(NamedTuple):
+    """Exponential moving averages of batch moments.
+
+    Attributes:
+      mean: f32[].
+      variance: f32[].
+      batches: i32[], batches seen; the first one is taken as it is.
+    """
+
+    mean: jax.Array
+    variance: jax.Array
+    batches: jax.Array
+
+    @staticmethod
+    def zero() -> "Moments":
+        """The moments before the first batch."""
+        zero = jnp.zeros((), jnp.float32)
+        return Moments(zero, zero, jnp.zeros((), jnp.int32))
+
+    def update(self, x: jax.Array, mask: jax.Array, rate: float) -> "Moments":
+        """Moves by 1 - `rate` towards the moments of a batch f32[...] under its mask."""
+        mean, variance = masked_moments(x, mask)
+        keep = jnp.where(self.batches == 0, 0.0, rate)
+        return Moments(
+            mean=keep * self.mean + (1 - keep) * mean,
+            variance=keep * self.variance + (1 - keep) * variance,
+            batches=self.batches + 1,
+        )
+
+    @property
+    def deviation(self) -> jax.Array:
+        """The standard deviation f32[], 1 where it would be 0."""
+        return jnp.where(self.variance > 0, jnp.sqrt(self.variance), 1.0)
+
+
+def _backward_sum(x: jax.Array, decay: jax.Array) -> jax.Array:
+    """y_t = x_t + decay_t * y_{t+1} with y_T = 0, f32[T]."""
+
+    def body(y: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        x_t, decay_t = inputs
+        y = x_t + decay_t * y
+        return y, y
+
+    return jax.lax.scan(body, jnp.zeros((), x.dtype), (x, decay), reverse=True)[1]

@@ -1,0 +1,192 @@
+"""Episodes, as one scan over time.
+
+Source: agent specification "PPO"; paper section "Experimental Setup".
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from agents import distinct
+from agents.agent import Agent, Params
+from agents.losses import log_prob
+from agents.network import Outputs
+from trap_tube_jax.environment import Environment
+from trap_tube_jax.observation import observe
+from trap_tube_jax.state import State
+
+ChooseAction = Callable[[jax.Array, Outputs], jax.Array]
+
+
+class Trajectory(NamedTuple):
+    """B episodes of T steps, padded after an early end with what does not change any more.
+
+    Attributes:
+      layout: B states, of which board, palette and tool extent hold for the episode.
+      cells: u8[T + 1, B, 3, 2], the (row, column) of agent, tool and food.
+      action: i32[T, B, 2], (grasp, move).
+      reward: f32[T, B], extrinsic.
+      mask: f32[T, B], 1 on steps taken before the episode's end.
+      features: f32[T + 1, B, F], the observations as encoded by the acting parameters.
+      log_prob: f32[T, B], of the actions, grasp plus move.
+      value: f32[T, B].
+      embedding: f32[T, B, hidden], the GRU's outputs.
+    """
+
+    layout: State
+    cells: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    mask: jax.Array
+    features: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+    embedding: jax.Array
+
+    @property
+    def solved(self) -> jax.Array:
+        """bool[B]: episodes that earned their reward."""
+        return jnp.any(self.reward > 0, axis=0)
+
+    @property
+    def length(self) -> jax.Array:
+        """i32[B]: steps taken."""
+        return jnp.sum(self.mask, axis=0).astype(jnp.int32)
+
+    def observations(self) -> jax.Array:
+        """All boards, u8[T + 1, B, 12, 12, N]."""
+        one_time = jax.vmap(lambda layout, cells: observe(place(layout, cells)))
+        return jax.vmap(one_time, in_axes=(None, 0))(self.layout, self.cells)
+
+
+class _Memory(NamedTuple):
+    """What has been encoded in each episode so far.
+
+    Attributes:
+      position: i32[T + 1, B], -1 where the future is.
+      features: f32[T + 1, B, F].
+    """
+
+    position: jax.Array
+    features: jax.Array
+
+
+class _Carry(NamedTuple):
+    state: State
+    embedding: jax.Array
+    action_tm1: jax.Array
+    reward_tm1: jax.Array
+    memory: _Memory
+
+
+def sample_action(key: jax.Array, outputs: Outputs) -> jax.Array:
+    """Draws grasp and move i32[B, 2] independently from their logits."""
+    grasp_key, move_key = jax.random.split(key)
+    grasp = jax.random.categorical(grasp_key, outputs.grasp_logits)
+    move = jax.random.categorical(move_key, outputs.move_logits)
+    return jnp.stack([grasp, move], axis=-1).astype(jnp.int32)
+
+
+def greedy_action(key: jax.Array, outputs: Outputs) -> jax.Array:
+    """The most probable grasp and move i32[B, 2]; the key is not used."""
+    del key
+    choices = [jnp.argmax(outputs.grasp_logits, -1), jnp.argmax(outputs.move_logits, -1)]
+    return jnp.stack(choices, axis=-1).astype(jnp.int32)
+
+
+def place(layout: State, cells: jax.Array) -> State:
+    """The state with agent, tool and food at `cells` u8[3, 2]."""
+    agent, tool, food = cells.astype(jnp.int32)
+    return layout.replace(agent=agent, tool=tool, food=food)
+
+
+def rollout(
+    agent: Agent,
+    params: Params,
+    env: Environment,
+    initial: State,
+    key: jax.Array,
+    *,
+    choose: ChooseAction,
+    chunk: int,
+) -> Trajectory:
+    """Plays one episode from each of B initial states.
+
+    Observations are encoded once each: an episode remembers what it has seen, and what
+    is new is shared between episodes of the same layout.
+
+    Args:
+      agent: the network.
+      params: its parameters.
+      env: the dynamics; `max_steps` is T.
+      initial: B states at time 0.
+      key: PRNG key of the actions.
+      choose: `sample_action` or `greedy_action`.
+      chunk: distinct observations encoded at once.
+    """
+    batch = initial.time.shape[0]
+    layout_id = distinct.layout_ids(initial)
+
+    def encode(state: State, memory: _Memory, time: jax.Array | int) -> tuple[jax.Array, _Memory]:
+        position = jax.vmap(distinct.position_id)(state)
+        known = memory.position == position[None]
+        seen = jnp.any(known, axis=0)
+        recalled = memory.features[jnp.argmax(known, axis=0), jnp.arange(batch)]
+        groups = distinct.group(seen.astype(jnp.int32), layout_id, position)
+        num_new = jnp.max(jnp.where(seen, -1, groups.number)) + 1
+        rows = jax.vmap(observe)(state)[groups.representative]
+        new = distinct.map_rows(agent.encode, chunk, agent.encoding_params(params), rows, num_new)
+        features = jnp.where(seen[:, None], recalled, new[groups.number])
+        return features, _Memory(
+            memory.position.at[time].set(position), memory.features.at[time].set(features)
+        )
+
+    def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[_Carry, Any]:
+        time, step_key = inputs
+        features, memory = encode(carry.state, carry.memory, time)
+        core_inputs = agent.core_inputs(params, features, carry.action_tm1, carry.reward_tm1)
+        embedding = agent.advance(params, carry.embedding, core_inputs)
+        outputs = agent.act(params, embedding)
+        action = choose(step_key, outputs)
+        state, timestep = jax.vmap(env.step)(carry.state, action)
+        alive = ~(carry.state.terminated | carry.state.truncated)
+        record = {
+            "cells": _cells(carry.state),
+            "action": action,
+            "reward": timestep.reward,
+            "mask": alive.astype(jnp.float32),
+            "log_prob": action_log_prob(outputs, action),
+            "value": outputs.value,
+            "embedding": embedding,
+        }
+        return _Carry(state, embedding, action, timestep.reward, memory), record
+
+    width = jax.eval_shape(agent.encode, params, jax.vmap(observe)(initial)).shape[-1]
+    start = _Carry(
+        state=initial,
+        embedding=agent.initial_state(params, batch),
+        action_tm1=jnp.zeros((batch, 2), jnp.int32),
+        reward_tm1=jnp.zeros(batch),
+        memory=_Memory(
+            position=jnp.full((env.max_steps + 1, batch), -1),
+            features=jnp.zeros((env.max_steps + 1, batch, width)),
+        ),
+    )
+    times = jnp.arange(env.max_steps)
+    end, record = jax.lax.scan(step, start, (times, jax.random.split(key, env.max_steps)))
+    _, memory = encode(end.state, end.memory, env.max_steps)
+    record["cells"] = jnp.concatenate([record["cells"], _cells(end.state)[None]])
+    return Trajectory(layout=initial, features=memory.features, **record)
+
+
+def action_log_prob(outputs: Outputs, action: jax.Array) -> jax.Array:
+    """The log-probability f32[...] of actions i32[..., 2], grasp plus move."""
+    grasp, move = action[..., 0], action[..., 1]
+    return log_prob(outputs.grasp_logits, grasp) + log_prob(outputs.move_logits, move)
+
+
+def _cells(state: State) -> jax.Array:
+    """u8[B, 3, 2]: the cells of agent, tool and food."""
+    return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)

@@ -1,0 +1,123 @@
+"""Reads the recorded update of the published baseline into this project's layout.
+
+In the recording `move` names action component 0, the grasp, and `grasp` component 1.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import trap_tube_jax as tt
+from agents.agent import Agent, Params
+from agents.rollout import Trajectory, action_log_prob
+from trap_tube_jax.objects import AGENT, BASE_COLORS, FOOD, GROUND, TOOL, TUBE1
+
+PARAMETER_NAMES = {
+    "encoder/conv1": "conv1",
+    "encoder/conv2": "conv2",
+    "encoder/block1/conv1": "residual_block1/conv1",
+    "encoder/block1/conv2": "residual_block1/conv2",
+    "encoder/block2/conv1": "residual_block2/conv1",
+    "encoder/block2/conv2": "residual_block2/conv2",
+    "core/grasp_embedding/embedding": "move_embedding/embeddings",
+    "core/move_embedding/embedding": "grasp_embedding/embeddings",
+    "core/reward_embedding": "reward_embedding",
+    "core/mix": "dense_hidden",
+    "core/input_kernel": "rnn/kernel",
+    "core/state_kernel": "rnn/recurrent_kernel",
+    "core/bias": "rnn/bias",
+    "core/initial": "initial_hidden_state",
+    "heads/grasp": "move_logits",
+    "heads/move": "grasp_logits",
+    "heads/value": "values_logits",
+    "curiosity/forward/Dense_0": "dense_forward",
+    "curiosity/inverse/Dense_0": "dense_inverse",
+    "curiosity/inverse/grasp": "dense_inverse_move",
+    "curiosity/inverse/move": "dense_inverse_grasp",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """The arrays of the recording by name."""
+
+    arrays: dict[str, np.ndarray]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """The array as recorded."""
+        return self.arrays[name]
+
+    def steps(self, name: str) -> np.ndarray:
+        """An array [episode, time, ...] as [time, episode, ...]."""
+        return np.swapaxes(self.arrays[name], 0, 1)
+
+    def params(self, prefix: str, like: Params) -> Params:
+        """The parameters (or gradients) under `prefix`, in the structure of `like`."""
+
+        def convert(path: Any, leaf: jax.Array) -> jax.Array:
+            name = jax.tree_util.keystr(path, simple=True, separator="/").replace("/params/", "/")
+            if name not in PARAMETER_NAMES:
+                module, _, kind = name.rpartition("/")
+                recorded = f"{PARAMETER_NAMES[module]}/{kind}"
+            else:
+                recorded = PARAMETER_NAMES[name]
+            return jnp.asarray(self.arrays[f"{prefix}/{recorded}"].reshape(leaf.shape))
+
+        return jax.tree_util.tree_map_with_path(convert, like)
+
+
+def parse_state(image: np.ndarray) -> tt.State:
+    """The state that a picture in base colours shows, the tool wholly visible."""
+    colors = BASE_COLORS.tolist()
+    codes = np.array([[colors.index(color) for color in row] for row in image.tolist()])
+    board = np.where(codes < FOOD, codes, GROUND)
+    tool = np.argwhere(codes == TOOL)
+    return tt.State.create(
+        board=np.where(board == TUBE1 + 1, TUBE1, board),
+        agent=np.argwhere(codes == AGENT)[0],
+        tool=tool[0],
+        tool_extent=tool[-1] - tool[0] + 1,
+        food=np.argwhere(codes == FOOD)[0],
+    )
+
+
+def replay(initial: tt.State, action: jax.Array) -> jax.Array:
+    """The cells u8[T + 1, B, 3, 2] of B episodes under actions i32[T, B, 2]."""
+    env = tt.Environment()
+
+    def cells(state: tt.State) -> jax.Array:
+        return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)
+
+    def body(state: tt.State, action_t: jax.Array) -> tuple[tt.State, jax.Array]:
+        state, _ = jax.vmap(env.step)(state, action_t)
+        return state, cells(state)
+
+    _, after = jax.lax.scan(body, initial, action)
+    return jnp.concatenate([cells(initial)[None], after])
+
+
+def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Trajectory:
+    """The recorded episodes as the agent with `params` would have stored them."""
+    images = recording.steps("batch/observation_rgb")
+    states = [parse_state(image) for image in images[0]]
+    initial = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    action = jnp.asarray(recording.steps("batch/action"), jnp.int32)
+    reward = jnp.asarray(recording.steps("batch/reward"))
+    cells = replay(initial, action)
+    features = jax.vmap(lambda image: agent.encode(params, image))(jnp.asarray(images))
+    embedding, _ = agent.unroll(params, features, action, reward)
+    outputs = agent.act(params, embedding)
+    return Trajectory(
+        layout=initial,
+        cells=cells,
+        action=action,
+        reward=reward,
+        mask=jnp.asarray(recording.steps("batch/weight")),
+        features=features,
+        log_prob=action_log_prob(outputs, action),
+        value=outputs.value,
+        embedding=embedding,
+    )
