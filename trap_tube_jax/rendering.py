@@ -39,7 +39,8 @@ SMALLEST_SIGN = 7  # pixels per cell from which on a sign can be read
 SMALLEST_GRID = 4  # pixels per cell from which on lines leave room for colour
 SIGN_OPACITY = 0.8
 GRID_OPACITY = 0.22
-TOOL_BAR_RADIUS = 0.16
+TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
+TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 MAX_FPS = 50  # browsers slow down GIFs with shorter frames
@@ -200,7 +201,7 @@ def _signs(cell_size: int) -> np.ndarray:
         distance[TUBE1] = _hatching(x + y)
         distance[TUBE2] = _hatching(x - y)
         distance[FOOD] = _apple(y, x)
-        distance[TOOL] = np.hypot(np.maximum(abs(y) - 0.2, 0), x) - TOOL_BAR_RADIUS
+        distance[TOOL] = np.hypot(np.maximum(abs(y) - TOOL_BAR_OVERHANG, 0), x) - TOOL_BAR_RADIUS
         distance[AGENT] = _face(y, x)
     return _coverage(distance, cell_size)
 
@@ -228,9 +229,10 @@ def _face(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _tool_bar(state: State, cell_size: int) -> jax.Array:
-    """f32[12 s, 12 s]: a bar with round ends through the centres of the tool's cells."""
-    half = (state.tool_extent - 1) / 2
-    y, x = _offsets(state.tool + 0.5 + half, BOARD_SIZE, cell_size)
+    """f32[12 s, 12 s]: a bar with round ends along the tool; a single cell is vertical."""
+    along = jnp.where(state.tool_extent[1] > 1, np.array([0, 1]), np.array([1, 0]))
+    half = (state.tool_extent - 1) / 2 + TOOL_BAR_OVERHANG * along
+    y, x = _offsets(state.tool + state.tool_extent / 2, BOARD_SIZE, cell_size)
     outside = [jnp.maximum(abs(y) - half[0], 0), jnp.maximum(abs(x) - half[1], 0)]
     return _coverage(jnp.hypot(*outside) - TOOL_BAR_RADIUS, cell_size)
 
