@@ -17,6 +17,7 @@ from trap_tube_jax.registry import (
     task_set,
 )
 from trap_tube_jax.rendering import render, save_gif
+from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
 from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
@@ -27,8 +28,10 @@ __all__ = [
     "PAPER_TASK_SETS",
     "ArraySpec",
     "AutoReset",
+    "Distances",
     "Environment",
     "EpisodeStatistics",
+    "Plan",
     "State",
     "TaskSet",
     "TimeStep",
@@ -38,6 +41,7 @@ __all__ = [
     "base_palette",
     "base_state",
     "compose",
+    "distances",
     "make",
     "observe",
     "perceptual",
@@ -46,6 +50,8 @@ __all__ = [
     "render",
     "render_ascii",
     "save_gif",
+    "solve",
+    "solve_batch",
     "structural",
     "symbolic",
     "task_set",

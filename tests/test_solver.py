@@ -1,0 +1,352 @@
+"""The solver against an exhaustive search that shares no code with it."""
+
+import json
+import subprocess
+import sys
+
+import brute_force
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import trap_tube_jax as tt
+from trap_tube_jax.objects import EXIT, TOOL, TRAP, TUBE1, TUBE2
+from trap_tube_jax.solver.__main__ import main
+from trap_tube_jax.solver.distance import count_reachable
+from trap_tube_jax.solver.search import take
+from trap_tube_jax.solver.survey import draw_tasks, survey
+from trap_tube_jax.transfers import swap_with_tool
+
+NUM_ROOMS = 30
+
+# The agent must push the food out of its cell through the exit.
+WORKSHOP = """
+    222222222222
+    2.....222222
+    2.A.T..e.e.2
+    2...TFx22222
+    2......22222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+"""
+WALLED_IN = """
+    .1..........
+    A1..........
+    11..........
+    ............
+    ....1111....
+    .T..xF.e....
+    .T..x..e....
+    .T..2222....
+    ............
+    ............
+    ............
+    ............
+"""
+MAZE = """
+    A...........
+    11111111111.
+    ............
+    .11111111111
+    ............
+    11111111111.
+    ............
+    .11111111111
+    ............
+    11111111111.
+    .....T......
+    F...........
+"""
+
+
+def random_room(seed: int) -> tt.State:
+    """A room of 3 x 4 cells in a corner of the board, with anything anywhere in it."""
+    rng = np.random.default_rng(seed)
+    board = np.full((12, 12), TUBE1)
+    room = rng.choice([0, TUBE2, TRAP, EXIT], size=(3, 4), p=[0.7, 0.1, 0.08, 0.12])
+    board[:3, :4] = room
+    ground = np.argwhere(board == 0)
+    food_cells = np.argwhere((board == 0) | (board == EXIT))
+    agent = rng.choice(ground)
+    food = rng.choice([cell for cell in food_cells if (cell != agent).any()])
+    extent = rng.permutation(np.array([1, rng.integers(1, 4)]))
+    return tt.State.create(
+        board=board, agent=agent, food=food, tool=rng.integers(0, (3, 4)), tool_extent=extent
+    )
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[tt.State]:
+    return [random_room(seed) for seed in range(NUM_ROOMS)]
+
+
+@pytest.fixture(scope="module")
+def room_plans(rooms) -> tt.Plan:
+    return tt.solve_batch(stack(rooms))
+
+
+@pytest.fixture(scope="module")
+def workshop() -> tt.State:
+    return tt.State.from_ascii(WORKSHOP)
+
+
+@pytest.fixture(scope="module")
+def base_plan() -> tt.Plan:
+    return tt.solve(tt.base_state())
+
+
+def stack(states: list[tt.State]) -> tt.State:
+    return jax.tree.map(lambda *fields: jnp.stack(fields), *states)
+
+
+@jax.jit
+@jax.vmap
+def play(state: tt.State, actions: jax.Array) -> tuple[tt.State, jax.Array]:
+    """The last states, and what `Environment.step` pays for plans i32[B, L, 2]: f32[B, L]."""
+
+    def step(state, action):
+        state, timestep = env.step(state, action)
+        return state, timestep.reward
+
+    env = tt.make("base")
+    return jax.lax.scan(step, state, actions)
+
+
+def assert_paid_exactly_at_the_end(states: tt.State, plans: tt.Plan):
+    _, rewards = play(states, plans.actions)
+    expected = np.arange(1, rewards.shape[1] + 1) == plans.length[:, None]
+    np.testing.assert_array_equal(rewards, expected)
+
+
+@pytest.mark.parametrize(
+    ("code", "length"), [(TOOL, 11), (TUBE1, 10), (TUBE2, 8), (TRAP, 10), (EXIT, 16)]
+)
+def test_lengths_of_the_symbolic_tasks(code, length):
+    state = swap_with_tool(tt.base_state(), jnp.int32(code))
+    plan = tt.solve(state)
+    assert (plan.length, plan.solvable) == (length, True)
+    assert plan.actions.shape == (length, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "mean", "standard_deviation"), [("p", 22.7, 6), ("pstsy", 12.5, 7)]
+)
+def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
+    name, mean, standard_deviation
+):
+    states = draw_tasks(tt.task_set(name), tasks=40, seed=0)
+    plans = tt.solve_batch(states)
+    assert plans.solvable.all()
+    assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(40)
+    assert plans.length.max() <= 41
+    assert_paid_exactly_at_the_end(states, plans)
+
+
+def test_no_plan_is_beaten_by_brute_force(rooms, room_plans):
+    for index, room in enumerate(rooms):
+        expected = brute_force.first_plan(*brute_force.read(room))
+        plan = take(room_plans, index)
+        assert plan.solvable == (expected is not None), f"room {index}"
+        if expected is not None:
+            assert plan.actions[: plan.length].tolist() == [list(pair) for pair in expected]
+    assert 5 < room_plans.solvable.sum() < NUM_ROOMS - 5
+
+
+def test_some_rooms_need_the_tool(rooms, room_plans):
+    end, _ = play(stack(rooms), room_plans.actions)
+    is_moved = (end.tool != stack(rooms).tool).any(axis=1)
+    assert (is_moved & room_plans.solvable).sum() >= 3
+
+
+@pytest.mark.parametrize("code", [TOOL, TUBE2])
+def test_no_plan_of_a_paper_task_is_beaten_by_brute_force(code):
+    state = swap_with_tool(tt.base_state(), jnp.int32(code))
+    task, start = brute_force.read(state)
+    length = int(tt.solve(state).length)
+    assert brute_force.is_solved_within(task, start, length)
+    assert not brute_force.is_solved_within(task, start, length - 1)
+
+
+def test_a_batch_equals_its_single_tasks(rooms, room_plans):
+    longest = room_plans.length.max()
+    assert room_plans.actions.shape == (NUM_ROOMS, longest, 2)
+    for index in range(0, NUM_ROOMS, 5):
+        plan = tt.solve(rooms[index])
+        of_batch = take(room_plans, index)
+        assert (plan.length, plan.solvable) == (of_batch.length, of_batch.solvable)
+        steps = max(int(plan.length), 0)
+        np.testing.assert_array_equal(plan.actions, of_batch.actions[:steps])
+        assert (of_batch.actions[steps:] == -1).all()
+
+
+def test_the_padding_of_a_batch_changes_nothing(rooms, room_plans):
+    assert_paid_exactly_at_the_end(stack(rooms), room_plans)
+
+
+def test_equal_tasks_of_a_batch_get_equal_plans(base_plan):
+    plans = tt.solve_batch(stack([tt.base_state()] * 2))
+    np.testing.assert_array_equal(plans.actions, np.stack([base_plan.actions] * 2))
+
+
+def test_dtypes_are_those_documented(base_plan, room_plans):
+    for plan in (base_plan, room_plans):
+        dtypes = [field.dtype for field in (plan.actions, plan.length, plan.solvable)]
+        assert dtypes == [np.int32, np.int32, np.bool_]
+
+
+@pytest.mark.parametrize("num_features", [1, 5])
+def test_colours_play_no_part(base_plan, num_features):
+    plan = tt.solve(tt.base_state(num_features))
+    np.testing.assert_array_equal(plan.actions, base_plan.actions)
+
+
+def test_a_task_without_a_way_to_the_goal():
+    state = tt.State.from_ascii(WALLED_IN)
+    plan = tt.solve(state)
+    assert (plan.length, plan.solvable, plan.actions.shape) == (-1, False, (0, 2))
+    plans = tt.solve_batch(stack([state]))
+    assert plans.actions.shape == (1, 0, 2)
+    found = tt.distances(state)
+    assert found.num_reachable == 2
+    assert (found.to_goal == -1).all()
+
+
+def test_plans_are_not_bound_by_the_step_limit():
+    assert tt.solve(tt.State.from_ascii(MAZE)).length == 6 * 11 + 11
+
+
+def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
+    env, state = tt.make("base"), tt.base_state()
+    for action in base_plan.actions[:4]:
+        state, _ = env.step(state, action)
+    np.testing.assert_array_equal(tt.solve(state).actions, base_plan.actions[4:])
+
+
+def test_distances_equal_those_of_brute_force(workshop):
+    edges = brute_force.graph(*brute_force.read(workshop))
+    expected = brute_force.distances_to_goal(edges)
+    found = tt.distances(workshop)
+    assert found.num_reachable == len(edges) == count_reachable(workshop)
+    for agent, tool, food in edges:
+        place = (*food, *tool, *agent)
+        assert found.to_goal[place] == expected.get((agent, tool, food), -1)
+        assert found.from_start[place] >= 0
+    assert np.count_nonzero(found.to_goal >= 0) == len(expected)
+
+
+def test_distances_satisfy_bellmans_equation(workshop):
+    found = tt.distances(workshop)
+    cells = np.argwhere(found.to_goal > 0).astype(np.int32)
+    states = jax.vmap(lambda cell: workshop.replace(food=cell[:2], tool=cell[2:4], agent=cell[4:]))(
+        cells
+    )
+    actions = tt.action_from_index(jnp.arange(16))
+    env = tt.make("base")
+    step_all = jax.vmap(jax.vmap(lambda s, a: env.step(s, a)[0], (None, 0)), (0, None))
+    to_goal = found.lookup(jax.jit(step_all)(states, actions))
+    best = np.where(to_goal < 0, 1000, to_goal).min(axis=1)
+    np.testing.assert_array_equal(found.lookup(states), 1 + best)
+
+
+def test_distances_count_down_along_the_plan(workshop):
+    found, plan = tt.distances(workshop), tt.solve(workshop)
+    state = workshop
+    for time, action in enumerate(plan.actions):
+        assert found.lookup(state) == plan.length - time
+        cells = (*np.asarray(state.food), *np.asarray(state.tool), *np.asarray(state.agent))
+        assert found.from_start[cells] == time
+        state, _ = tt.make("base").step(state, action)
+    assert found.lookup(state) == 0
+
+
+def test_refused_states():
+    base = tt.base_state()
+    solved = base.replace(agent=base.food, terminated=jnp.array(True))
+    with pytest.raises(ValueError, match="state is terminated"):
+        tt.solve(solved)
+    with pytest.raises(ValueError, match="state is truncated"):
+        tt.distances(base.replace(truncated=jnp.array(True)))
+    with pytest.raises(ValueError, match=r"agent at .* stands on tube1"):
+        tt.solve(base.replace(agent=jnp.array([4, 4], jnp.int32)))
+    with pytest.raises(ValueError, match=r"expected a trap_tube_jax\.State"):
+        tt.solve((1, 2))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="runs on the host"):
+        jax.jit(lambda state: tt.solve(state).length)(base)
+    with pytest.raises(ValueError, match="state 1 of the batch: the state is terminated"):
+        tt.solve_batch(stack([base, solved]))
+    with pytest.raises(ValueError, match="one leading axis"):
+        tt.solve_batch(base)
+    with pytest.raises(ValueError, match="must be"):
+        tt.solve(stack([base, base]))
+
+
+def test_survey_refuses_numbers_out_of_range():
+    with pytest.raises(ValueError, match="tasks must be >= 1, got 0"):
+        survey(tt.task_set("p"), tasks=0, graphs=0)
+    with pytest.raises(ValueError, match="graphs must be from 0 to tasks=2, got 3"):
+        survey(tt.task_set("p"), tasks=2, graphs=3)
+
+
+def test_command_line_surveys_task_sets(tmp_path, capsys):
+    picture = tmp_path / "histogram.png"
+    arguments = ["--tasks", "12", "--graphs", "0", "--output", str(picture), "--sets"]
+    main([*arguments, "sy", "--json"])
+    (found,) = json.loads(capsys.readouterr().out)
+    assert (found["id"], found["tasks"], found["solvable"]) == ("SymbolicTrapTube-v0", 12, 1)
+    assert 8 <= found["mean"] <= found["longest"] <= 16
+    main([*arguments, "base"])
+    assert "100.00 %  11.0   11" in capsys.readouterr().out
+    with Image.open(picture) as image:
+        assert image.format == "PNG"
+
+
+def test_command_line_shows_a_plan(tmp_path, capsys):
+    animation = tmp_path / "plan.gif"
+    arguments = ["--show", "SymbolicTrapTube-v0", "--seed", "3", "--output", str(animation)]
+    main([*arguments, "--json"])
+    plan = json.loads(capsys.readouterr().out)
+    state, _ = tt.make("sy").reset(jax.random.key(3))
+    assert plan["actions"] == tt.solve(state).actions.tolist()
+    main(arguments)
+    text = capsys.readouterr().out
+    assert f"step {plan['length']}: grasp" in text
+    assert tt.render_ascii(state) in text
+    with Image.open(animation) as image:
+        assert image.format == "GIF"
+
+
+def test_command_line_draws_distances(tmp_path, capsys):
+    picture = tmp_path / "distances.png"
+    main(["--distances", "base", "--output", str(picture)])
+    assert "1,547,184 reachable states" in capsys.readouterr().out
+    with Image.open(picture) as image:
+        assert image.format == "PNG"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--show", "p", "--distances", "p"], "exclude each other"),
+        (["--show", "nowhere"], "unknown task set 'nowhere'"),
+        (["--tasks", "0"], "tasks must be >= 1"),
+    ],
+)
+def test_command_line_refuses(arguments, message, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        main(arguments)
+    assert exit_info.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_runs_as_a_module_without_warnings():
+    command = [sys.executable, "-W", "error", "-m", "trap_tube_jax.solver", "--help"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "--distances" in result.stdout

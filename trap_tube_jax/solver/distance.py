@@ -1,0 +1,99 @@
+"""Distances from the start and to the goal, for every state that a task can reach.
+
+Source: specification section 3.
+"""
+
+import numpy as np
+from flax import struct
+
+from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.solver.search import NUM_NODES, checked, levels
+from trap_tube_jax.state import State
+
+UNKNOWN = -1
+
+
+class Distances(struct.PyTreeNode):
+    """Shortest distances in one task, in steps. NumPy arrays.
+
+    Both are addressed by the food's, the tool's (its top-left cell's) and the agent's
+    row and column, in this order: `to_goal[(*state.food, *state.tool)]` is a picture
+    i16[12, 12] over the agent's cells. They hold for the task's board and tool only.
+
+    Attributes:
+      from_start: i16[12, 12, 12, 12, 12, 12], steps from the task's first state; -1
+        where it cannot be reached.
+      to_goal: i16[12, 12, 12, 12, 12, 12], fewest steps until the reward: 0 where the
+        task is solved; -1 where it cannot be solved any more, or not be reached.
+    """
+
+    from_start: np.ndarray
+    to_goal: np.ndarray
+
+    @property
+    def num_reachable(self) -> int:
+        """The number of distinct states that the task can reach, solved ones included."""
+        return int(np.count_nonzero(self.from_start != UNKNOWN))
+
+    def lookup(self, states: State) -> np.ndarray:
+        """i16[...]: `to_goal` of states of this task, with any leading axes."""
+        cells = (np.asarray(cell) for cell in (states.food, states.tool, states.agent))
+        return self.to_goal[tuple(axis for cell in cells for axis in np.moveaxis(cell, -1, 0))]
+
+
+def distances(state: State) -> Distances:
+    """Distances for every state that can be reached from `state`. Host side.
+
+    d(s) = 0 if s is solved, else 1 + min over the 16 actions a of d(step(s, a)).
+
+    It explores the whole graph, up to some two million states, which takes seconds;
+    `solve` stops at the goal.
+
+    Args:
+      state: one unbatched state, at any time of an unfinished episode.
+
+    Raises:
+      ValueError: the state is one that `solve` refuses.
+    """
+    from_start, nodes, successors = _explore(checked(state))
+    to_goal = _distances_to_goal(from_start, nodes, successors)
+    shape = (BOARD_SIZE,) * 6
+    return Distances(from_start.reshape(shape), to_goal.reshape(shape))
+
+
+def count_reachable(state: State) -> int:
+    """`distances(state).num_reachable`, in less time and memory."""
+    num_open = 0
+    solved = []
+    for level in levels(checked(state)):
+        num_open += len(level.nodes)
+        solved.append(np.unique(level.successors[level.solved]))
+    return num_open + len(np.unique(np.concatenate(solved)))
+
+
+def _explore(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`from_start` i16[144^3] by node, the unsolved nodes i32[n], their successors i32[n, 16]."""
+    from_start = np.full(NUM_NODES, UNKNOWN, np.int16)
+    nodes, successors = [], []
+    for depth, level in enumerate(levels(state)):
+        from_start[level.nodes] = depth
+        solved = level.successors[level.solved]
+        from_start[solved[from_start[solved] == UNKNOWN]] = depth + 1
+        nodes.append(level.nodes)
+        successors.append(level.successors)
+    return from_start, np.concatenate(nodes), np.concatenate(successors)
+
+
+def _distances_to_goal(
+    from_start: np.ndarray, nodes: np.ndarray, successors: np.ndarray
+) -> np.ndarray:
+    """`to_goal` i16[144^3] by node: breadth-first, backward from the solved nodes."""
+    to_goal = np.where(from_start == UNKNOWN, np.int16(UNKNOWN), np.int16(0))
+    to_goal[nodes] = UNKNOWN
+    for distance in range(1, NUM_NODES):
+        is_next = (to_goal[successors] == distance - 1).any(axis=1)
+        if not is_next.any():
+            break
+        to_goal[nodes[is_next]] = distance
+        nodes, successors = nodes[~is_next], successors[~is_next]
+    return to_goal

@@ -1,0 +1,102 @@
+"""What the solver's command line draws: a plan as GIF, distances and lengths as PNG."""
+
+import os
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from trap_tube_jax import dynamics
+from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.rendering import render, save_gif
+from trap_tube_jax.solver.distance import Distances
+from trap_tube_jax.solver.search import NO_DIRECTION, Plan
+from trap_tube_jax.solver.survey import Survey
+from trap_tube_jax.state import State
+
+CELL_SIZE = 32  # pixels
+MOMENTS = 4  # pictures of distances along a plan
+
+
+def replay(state: State, plan: Plan) -> list[State]:
+    """The L + 1 states of a plan, the first included."""
+    states = [state]
+    for action in plan.actions:
+        states.append(_step(states[-1], jnp.asarray(action)))
+    return states
+
+
+def save_plan(state: State, plan: Plan, path: str | os.PathLike[str]) -> None:
+    """Writes a GIF of a plan; the agent's hand shows where each action is about to grasp."""
+    grasps = [*plan.actions[:, 0].tolist(), NO_DIRECTION]
+    frames = [
+        np.asarray(render(at, CELL_SIZE, grasp=grasp))
+        for at, grasp in zip(replay(state, plan), grasps, strict=True)
+    ]
+    save_gif(np.stack(frames), path, fps=4)
+
+
+def save_distances(
+    state: State, plan: Plan, distances: Distances, path: str | os.PathLike[str]
+) -> None:
+    """Writes a PNG of the distance to the goal over the board, at moments of a plan.
+
+    A picture shows one place of tool and food. The number in a cell is how many steps
+    are left if the agent is there; no number: it cannot be there.
+
+    Args:
+      state: the task's first state.
+      plan: its plan; of an unsolvable task only the first moment is shown.
+      distances: its distances.
+      path: the file to write.
+    """
+    states = replay(state, plan)
+    last = max(len(plan.actions) - 1, 0)
+    times = np.unique(np.linspace(0, last, MOMENTS).round().astype(int))
+    boards = [distances.to_goal[(*states[time].food, *states[time].tool)] for time in times]
+    scale = Normalize(0, max(np.max(boards), 1))
+    figure = Figure(figsize=(4 * len(times) + 0.6, 4.2), layout="constrained")
+    axes = figure.subplots(1, len(times), squeeze=False)[0]
+    for axis, time, steps in zip(axes, times, boards, strict=True):
+        _draw_distances(axis, states[time], steps, scale)
+        axis.set_title(f"{len(plan.actions) - time} steps left" if plan.solvable else "unsolvable")
+    figure.colorbar(axes[0].images[-1], ax=list(axes), label="steps to the goal", shrink=0.8)
+    figure.savefig(path, format="png", dpi=100)
+
+
+def save_histogram(surveys: Sequence[Survey], path: str | os.PathLike[str]) -> None:
+    """Writes a PNG of the shortest plans' lengths, one panel per task set."""
+    longest = max((survey.solved_length.max(initial=1) for survey in surveys), default=1)
+    figure = Figure(figsize=(7, 1.8 * len(surveys) + 0.6), layout="constrained")
+    axes = figure.subplots(len(surveys), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, survey in zip(axes, surveys, strict=True):
+        solved = survey.solved_length
+        share = np.bincount(solved, minlength=longest + 1) / len(survey.length)
+        axis.bar(np.arange(len(share)), 100 * share, width=0.9)
+        if len(solved):
+            axis.axvline(solved.mean(), color="black", linewidth=1, linestyle="--")
+        axis.set_ylabel("% of tasks")
+        axis.set_title(f"{survey.task_set.label}: {len(survey.length)} tasks", loc="left")
+    axes[-1].set_xlabel("steps of the shortest plan (dashed: mean)")
+    figure.savefig(path, format="png", dpi=100)
+
+
+_step = jax.jit(dynamics.step)
+
+
+def _draw_distances(axis: Axes, state: State, steps: np.ndarray, scale: Normalize) -> None:
+    """Draws the board, and over it steps i16[12, 12] by the agent's cell."""
+    extent = (-0.5, BOARD_SIZE - 0.5, BOARD_SIZE - 0.5, -0.5)
+    axis.imshow(np.asarray(render(state, CELL_SIZE)), extent=extent)
+    shown = np.ma.masked_less(steps, 0)
+    shown[tuple(np.asarray(state.agent))] = np.ma.masked  # the agent's picture stays in sight
+    axis.imshow(shown, norm=scale, cmap="viridis_r", extent=extent, alpha=0.8)
+    for row, column in np.argwhere(~np.ma.getmaskarray(shown)):
+        value = steps[row, column]
+        color = "white" if scale(value) > 0.5 else "black"
+        axis.text(column, row, str(value), color=color, ha="center", va="center", fontsize=7)
+    axis.set_axis_off()

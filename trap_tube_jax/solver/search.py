@@ -1,0 +1,255 @@
+"""Breadth-first search over a task's graph, and the shortest plans that it finds.
+
+Source: specification sections 3 and 6.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.core import Tracer
+
+from trap_tube_jax import dynamics
+from trap_tube_jax.environment import action_from_index
+from trap_tube_jax.geometry import cell_of
+from trap_tube_jax.objects import BOARD_SIZE, NUM_ACTIONS, NUM_DIRECTIONS
+from trap_tube_jax.state import State, check_structure, validate
+
+Record = TypeVar("Record", bound=struct.PyTreeNode)
+
+NUM_CELLS = BOARD_SIZE**2
+# A node is one integer, (food * 144 + tool) * 144 + agent, each a cell in reading order.
+NUM_NODES = NUM_CELLS**3
+NO_DIRECTION = -1
+# Frontiers are padded to one of few sizes, since each size is compiled once.
+CHUNK_SIZES = (256, 1024, 4096)
+
+
+class Plan(struct.PyTreeNode):
+    """A shortest way to the goal, or the finding that there is none. NumPy arrays.
+
+    Of several shortest plans it is the first in the order of their action indices
+    (4 * grasp + move), compared step by step.
+
+    Attributes:
+      actions: i32[L, 2], the (grasp, move) of every step. In a batch i32[B, L, 2], L
+        being the longest length: shorter plans are filled up with (-1, -1), which is no
+        direction and changes nothing.
+      length: i32[] or i32[B], the number of steps, whatever an environment's step
+        limit; -1 if unsolvable.
+      solvable: bool[] or bool[B], whether any sequence of actions leads to the goal.
+    """
+
+    actions: np.ndarray
+    length: np.ndarray
+    solvable: np.ndarray
+
+
+class Level(NamedTuple):
+    """All nodes at one distance from the start, and what follows them.
+
+    Attributes:
+      nodes: i32[n], in the order of the first shortest plan that leads to each.
+      successors: i32[n, 16], the node after each action.
+      solved: bool[n, 16], whether that action solves the task.
+      origin: i32[n], the flat index into the previous level's `successors` at which
+        each node was found first; empty at the start.
+    """
+
+    nodes: np.ndarray
+    successors: np.ndarray
+    solved: np.ndarray
+    origin: np.ndarray
+
+
+def solve(state: State) -> Plan:
+    """The shortest plan of one task, exact, for any valid state, own layouts included.
+
+    Runs on the host, outside jit and vmap. Colours and the step limit play no part.
+
+    Args:
+      state: one unbatched state, at any time of an unfinished episode.
+
+    Returns:
+      The plan; replaying it through `Environment.step` pays the reward at its last step.
+
+    Raises:
+      ValueError: the state is invalid (see `validate`), done, batched or traced.
+    """
+    return _to_plan(_shortest_actions(checked(state)))
+
+
+def solve_batch(states: State) -> Plan:
+    """The shortest plans of many tasks, each exactly as `solve` finds it.
+
+    Args:
+      states: states with one leading axis B, as from `jax.vmap(env.reset)`.
+
+    Returns:
+      The plans with a leading axis B, padded to the longest (see `Plan`).
+
+    Raises:
+      ValueError: `states` is not a batch, or a state is refused by `solve`; the message
+        names its index.
+    """
+    # Many tasks of a set may be the same one; each is solved once.
+    found: dict[bytes, np.ndarray | None] = {}
+    plans = []
+    for state in _unbatched(states):
+        task = _fingerprint(state)
+        if task not in found:
+            found[task] = _shortest_actions(state)
+        plans.append(_to_plan(found[task]))
+    length = np.array([plan.length for plan in plans])
+    actions = np.full((len(plans), max(length.max(), 0), 2), NO_DIRECTION, np.int32)
+    for row, plan in zip(actions, plans, strict=True):
+        row[: len(plan.actions)] = plan.actions
+    return Plan(actions, length, length >= 0)
+
+
+def checked(state: State) -> State:
+    """Returns `state` as NumPy arrays if it can be solved; refuses it as `solve` does."""
+    state = _to_host(state)
+    check_structure(state)
+    for flag in ("terminated", "truncated"):
+        if getattr(state, flag):
+            raise ValueError(f"the state is {flag}; allowed: one whose episode is not over")
+    return validate(state)
+
+
+def take(batch: Record, index: int | slice) -> Record:
+    """One record, or a part, of a batch of states or plans."""
+    return jax.tree.map(lambda field: field[index], batch)
+
+
+def levels(state: State) -> Iterator[Level]:
+    """The task's nodes by distance from the start, none twice, from distance 0 on.
+
+    Solved nodes end an episode: they appear as successors only. The search goes on until
+    no node is new; stop iterating to stop it earlier.
+
+    Args:
+      state: a checked state.
+    """
+    # Colours play no part; without them there is one compilation for every N.
+    layout = jax.device_put(state.replace(palette=np.zeros((0, 0), np.uint8)))
+    nodes = np.array([_node_of(state)], np.int32)
+    origin = np.empty(0, np.int32)
+    is_known = np.zeros(NUM_NODES, bool)
+    is_known[nodes] = True
+    while len(nodes):
+        successors, solved = _expand_all(layout, nodes)
+        yield Level(nodes, successors, solved, origin)
+        new = np.flatnonzero(~(is_known[successors] | solved))
+        _, first = np.unique(successors.reshape(-1)[new], return_index=True)
+        origin = new[np.sort(first)]
+        nodes = successors.reshape(-1)[origin]
+        is_known[nodes] = True
+
+
+def _shortest_actions(state: State) -> np.ndarray | None:
+    """i32[L]: the action indices of the first shortest plan; None if there is no plan."""
+    origins = []
+    for level in levels(state):
+        origins.append(level.origin)
+        if level.solved.any():
+            return _trace_back(origins, int(np.argmax(level.solved)))
+    return None
+
+
+def _trace_back(origins: Sequence[np.ndarray], last: int) -> np.ndarray:
+    """i32[L]: the actions on the way to entry `last` of the last level's `successors`."""
+    actions = [last % NUM_ACTIONS]
+    for origin in origins[:0:-1]:
+        last = int(origin[last // NUM_ACTIONS])
+        actions.append(last % NUM_ACTIONS)
+    return np.array(actions[::-1], np.int32)
+
+
+def _expand_all(layout: State, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The successors i32[n, 16] of nodes i32[n], and where they are solved bool[n, 16]."""
+    parts = []
+    for start in range(0, len(nodes), CHUNK_SIZES[-1]):
+        chunk = nodes[start : start + CHUNK_SIZES[-1]]
+        size = next(size for size in CHUNK_SIZES if size >= len(chunk))
+        padded = np.resize(chunk, size)
+        parts.append([array[: len(chunk)] for array in jax.device_get(_expand(layout, padded))])
+    if len(parts) == 1:
+        return parts[0][0], parts[0][1]
+    successors, solved = zip(*parts, strict=True)
+    return np.concatenate(successors), np.concatenate(solved)
+
+
+@jax.jit
+def _expand(layout: State, nodes: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The successors i32[n, 16] of nodes i32[n], and where they are solved bool[n, 16]."""
+    actions = action_from_index(jnp.arange(NUM_ACTIONS))
+
+    def expand_node(node: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state = _state_at(layout, node)
+        following = jax.vmap(lambda action: dynamics.step(state, action))(actions)
+        return jax.vmap(_node_of)(following), following.terminated
+
+    return jax.vmap(expand_node)(nodes)
+
+
+def _node_of(state: State) -> Any:
+    """i32[]: the node that a state is, of NumPy or JAX arrays."""
+    food, tool, agent = (
+        cell[0] * BOARD_SIZE + cell[1] for cell in (state.food, state.tool, state.agent)
+    )
+    return (food * NUM_CELLS + tool) * NUM_CELLS + agent
+
+
+def _state_at(layout: State, node: jax.Array) -> State:
+    """The state that a node i32[] is, on the board and with the tool of `layout`."""
+    return layout.replace(
+        food=cell_of(node // NUM_CELLS**2),
+        tool=cell_of(node // NUM_CELLS % NUM_CELLS),
+        agent=cell_of(node % NUM_CELLS),
+    )
+
+
+def _to_plan(indices: np.ndarray | None) -> Plan:
+    is_solvable = indices is not None
+    grasp, move = divmod(indices if is_solvable else np.empty(0, np.int32), NUM_DIRECTIONS)
+    return Plan(
+        actions=np.stack([grasp, move], axis=-1),
+        length=np.array(len(grasp) if is_solvable else -1, np.int32),
+        solvable=np.array(is_solvable),
+    )
+
+
+def _unbatched(states: State) -> Iterator[State]:
+    """The checked states of a batch."""
+    states = _to_host(states)
+    if np.ndim(states.time) != 1 or not len(states.time):
+        raise ValueError(
+            "solve_batch takes states with one leading axis of at least 1, got a state whose "
+            f"time has shape {np.shape(states.time)}; solve takes a single one"
+        )
+    for index in range(len(states.time)):
+        try:
+            yield checked(take(states, index))
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"state {index} of the batch: {error}") from error
+
+
+def _fingerprint(state: State) -> bytes:
+    """Equal for two states exactly if they are the same task, whatever their colours."""
+    fields = (state.board, state.tool_extent, state.food, state.tool, state.agent)
+    return b"".join(np.asarray(field).tobytes() for field in fields)
+
+
+def _to_host(state: State) -> State:
+    if not isinstance(state, State):
+        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}")
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
+        raise ValueError(
+            "the solver runs on the host and got a traced state; call it outside jit, vmap and "
+            "scan, with solve_batch for many states"
+        )
+    return jax.device_get(state)

@@ -1,0 +1,108 @@
+"""How hard a task set is: the shortest plans and the graphs of many of its tasks.
+
+Source: specification section 6.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from trap_tube_jax.registry import TaskSet, make
+from trap_tube_jax.solver.distance import count_reachable
+from trap_tube_jax.solver.search import solve_batch, take
+from trap_tube_jax.state import State
+
+QUANTILES = (5, 25, 50, 75, 95)
+TASKS_PER_CALL = 100  # how often progress is told
+
+
+@dataclasses.dataclass(frozen=True)
+class Survey:
+    """What was found on tasks drawn from a set.
+
+    Attributes:
+      task_set: the set.
+      seed: the seed of the tasks.
+      length: i32[T], the shortest plan of every task; -1 if unsolvable.
+      reachable: i32[G], the distinct reachable states of each of the first G tasks.
+    """
+
+    task_set: TaskSet
+    seed: int
+    length: np.ndarray
+    reachable: np.ndarray
+
+    @property
+    def solved_length(self) -> np.ndarray:
+        """i32[S]: the shortest plans of the solvable tasks."""
+        return self.length[self.length >= 0]
+
+    def summary(self) -> dict[str, Any]:
+        """The figures as plain numbers, None where there is nothing to average."""
+        solved = self.solved_length
+        quantiles = np.percentile(solved, QUANTILES) if len(solved) else [None] * len(QUANTILES)
+        return {
+            "id": self.task_set.id,
+            "tasks": len(self.length),
+            "seed": self.seed,
+            "solvable": len(solved) / len(self.length),
+            "mean": _plain(np.mean, solved),
+            "quantiles": dict(zip(map(str, QUANTILES), quantiles, strict=True)),
+            "longest": _plain(np.max, solved),
+            "reachable": {
+                "tasks": len(self.reachable),
+                "mean": _plain(np.mean, self.reachable),
+                "fewest": _plain(np.min, self.reachable),
+                "most": _plain(np.max, self.reachable),
+            },
+        }
+
+
+def survey(
+    task_set: TaskSet,
+    *,
+    tasks: int,
+    graphs: int,
+    seed: int = 0,
+    advance: Callable[[int], None] = lambda count: None,
+) -> Survey:
+    """Solves `tasks` tasks of a set and explores the whole graph of the first `graphs`.
+
+    Args:
+      task_set: the set; its id is registered.
+      tasks: how many to draw, at least 1.
+      graphs: of how many to count the reachable states, at least 0, a second each.
+      seed: the tasks are those of the keys `jax.random.split(jax.random.key(seed), tasks)`.
+      advance: called with the number of tasks and graphs done since its last call.
+
+    Raises:
+      ValueError: a number is out of range.
+    """
+    if tasks < 1:
+        raise ValueError(f"tasks must be >= 1, got {tasks}")
+    if not 0 <= graphs <= tasks:
+        raise ValueError(f"graphs must be from 0 to tasks={tasks}, got {graphs}")
+    states = draw_tasks(task_set, tasks, seed)
+    lengths = []
+    for start in range(0, tasks, TASKS_PER_CALL):
+        lengths.append(solve_batch(take(states, slice(start, start + TASKS_PER_CALL))).length)
+        advance(len(lengths[-1]))
+    reachable = []
+    for index in range(graphs):
+        reachable.append(count_reachable(take(states, index)))
+        advance(1)
+    return Survey(task_set, seed, np.concatenate(lengths), np.array(reachable, np.int32))
+
+
+def draw_tasks(task_set: TaskSet, tasks: int, seed: int) -> State:
+    """First states of tasks of a set, with a leading axis, as NumPy arrays."""
+    env = make(task_set.id)
+    keys = jax.random.split(jax.random.key(seed), tasks)
+    return jax.device_get(jax.jit(jax.vmap(lambda key: env.reset(key)[0]))(keys))
+
+
+def _plain(function: Callable[[np.ndarray], Any], values: np.ndarray) -> Any:
+    return function(values).item() if len(values) else None
