@@ -74,6 +74,19 @@ def graph(task: Task, start: Place) -> dict[Place, list[Place]]:
     return found
 
 
+def distances_from(start: Place, edges: dict[Place, list[Place]]) -> dict[Place, int]:
+    """Fewest steps from the start to every place that can be reached."""
+    steps = {start: 0}
+    waiting = deque(steps)
+    while waiting:
+        place = waiting.popleft()
+        for following in edges[place]:
+            if following not in steps:
+                steps[following] = steps[place] + 1
+                waiting.append(following)
+    return steps
+
+
 def distances_to_goal(edges: dict[Place, list[Place]]) -> dict[Place, int]:
     """Fewest steps to a solved place, of those that have a way to one."""
     leads_here: dict[Place, list[Place]] = {place: [] for place in edges}

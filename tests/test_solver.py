@@ -230,15 +230,17 @@ def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
 
 
 def test_distances_equal_those_of_brute_force(workshop):
-    edges = brute_force.graph(*brute_force.read(workshop))
-    expected = brute_force.distances_to_goal(edges)
+    task, start = brute_force.read(workshop)
+    edges = brute_force.graph(task, start)
+    from_start = brute_force.distances_from(start, edges)
+    to_goal = brute_force.distances_to_goal(edges)
     found = tt.distances(workshop)
     assert found.num_reachable == len(edges) == count_reachable(workshop)
     for agent, tool, food in edges:
         place = (*food, *tool, *agent)
-        assert found.to_goal[place] == expected.get((agent, tool, food), -1)
-        assert found.from_start[place] >= 0
-    assert np.count_nonzero(found.to_goal >= 0) == len(expected)
+        assert found.from_start[place] == from_start[agent, tool, food]
+        assert found.to_goal[place] == to_goal.get((agent, tool, food), -1)
+    assert np.count_nonzero(found.to_goal >= 0) == len(to_goal)
 
 
 def test_distances_satisfy_bellmans_equation(workshop):

@@ -36,8 +36,8 @@ class Plan(struct.PyTreeNode):
 
     Attributes:
       actions: i32[L, 2], the (grasp, move) of every step. In a batch i32[B, L, 2], L
-        being the longest length: shorter plans are filled up with (-1, -1), which is no
-        direction and changes nothing.
+        being the longest length: shorter plans are filled up with (-1, -1), which under
+        jit is no direction and changes nothing, and eagerly an action that is refused.
       length: i32[] or i32[B], the number of steps, whatever an environment's step
         limit; -1 if unsolvable.
       solvable: bool[] or bool[B], whether any sequence of actions leads to the goal.
@@ -144,6 +144,7 @@ def levels(state: State) -> Iterator[Level]:
         successors, solved = _expand_all(layout, nodes)
         yield Level(nodes, successors, solved, origin)
         new = np.flatnonzero(~(is_known[successors] | solved))
+        # Of equal entries the first counts, and the order is kept: `Plan` promises a tie-break.
         _, first = np.unique(successors.reshape(-1)[new], return_index=True)
         origin = new[np.sort(first)]
         nodes = successors.reshape(-1)[origin]
