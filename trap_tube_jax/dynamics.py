@@ -8,7 +8,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from trap_tube_jax.geometry import bar_covers, unit_vector
+from trap_tube_jax.geometry import bar_covers, is_on_board, same_cell, unit_vector
 from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND
 from trap_tube_jax.state import State
 
@@ -43,12 +43,12 @@ def step(state: State, action: jax.Array) -> State:
     food_moves = grasped & agent_free & food_ahead & food_free
     new_food = food + move * food_moves
 
-    tool_fits = jnp.all((tool + move >= 0) & (tool + extent + move <= BOARD_SIZE))
+    tool_fits = is_on_board(tool + move) & is_on_board(tool + move + extent - 1)
     tool_moves = grasped & agent_free & (~food_ahead | food_moves) & tool_fits
     new_tool = tool + move * tool_moves
 
     held = grasped & ~tool_moves
-    reaches_food = jnp.all(agent + move == new_food)
+    reaches_food = same_cell(agent + move, new_food)
     blocked_by_tool = bar_covers(new_tool, extent, agent + move)
     agent_moves = ~held & ~blocked_by_tool & (agent_free | reaches_food)
     new_agent = agent + move * agent_moves
@@ -57,12 +57,11 @@ def step(state: State, action: jax.Array) -> State:
         agent=new_agent,
         tool=new_tool,
         food=new_food,
-        terminated=state.terminated | jnp.all(new_agent == new_food),
+        terminated=state.terminated | same_cell(new_agent, new_food),
     )
 
 
 def static_object(board: jax.Array, cell: jax.Array) -> jax.Array:
     """i32[]: the static object's code at `cell` i32[2], -1 off the board u8[12, 12]."""
-    on_board = jnp.all((cell >= 0) & (cell < BOARD_SIZE))
     row, column = jnp.clip(cell, 0, BOARD_SIZE - 1)
-    return jnp.where(on_board, board[row, column].astype(jnp.int32), -1)
+    return jnp.where(is_on_board(cell), board[row, column].astype(jnp.int32), -1)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.geometry import CELLS, bar_cells
+from trap_tube_jax.geometry import COLUMNS, ROWS, bar_cells
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS, OBJECT_CHARS, TOOL
 from trap_tube_jax.state import State
 
@@ -38,4 +38,4 @@ def render_ascii(state: State) -> str:
 
 def _at(cell: jax.Array) -> jax.Array:
     """bool[12, 12]: true at `cell` i32[2]."""
-    return jnp.all(cell == CELLS, axis=-1)
+    return (cell[0] == ROWS) & (cell[1] == COLUMNS)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from trap_tube_jax.geometry import CELLS, bar_cells, cell_of
+from trap_tube_jax.geometry import COLUMNS, ROWS, bar_cells, cell_of
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     EXIT,
@@ -32,6 +32,11 @@ Transfer = Callable[[jax.Array, State], State]
 SYMBOLIC_OBJECTS = np.array([TOOL, TUBE1, TUBE2, TRAP, EXIT], np.int32)
 TUBE_SIDES = (3, 4)  # shortest and longest height and width of the tube
 CENTER_FIRST, CENTER_LAST = 4, 8  # rows and columns of the central block, both included
+# bool[12, 12]: the cells outside the central block.
+AROUND_CENTER = ~(
+    ((ROWS >= CENTER_FIRST) & (ROWS <= CENTER_LAST))
+    & ((COLUMNS >= CENTER_FIRST) & (COLUMNS <= CENTER_LAST))
+)
 
 
 def compose(*transfers: Transfer) -> Transfer:
@@ -70,13 +75,12 @@ def perceptual(key: jax.Array, state: State) -> State:
     outline_key, board_key, food_key, bar_key, agent_key = jax.random.split(key, 5)
     outline = _sample_outline(outline_key)
     tool, extent, candidates = _sample_tool(bar_key, outline)
-    around_center = jnp.any((CELLS < CENTER_FIRST) | (CELLS > CENTER_LAST), axis=-1)
     return state.replace(
         board=_sample_board(board_key, outline),
         food=_uniform_cell(food_key, outline.inside(margin=-1)),
         tool=tool,
         tool_extent=extent,
-        agent=_uniform_cell(agent_key, around_center & ~candidates & ~bar_cells(tool, extent)),
+        agent=_uniform_cell(agent_key, ~candidates & ~bar_cells(tool, extent) & AROUND_CENTER),
     )
 
 
@@ -96,7 +100,9 @@ def structural(key: jax.Array, state: State) -> State:
     """
     num_features = state.palette.shape[-1]
     normal = jax.random.normal(key, (5, num_features))
-    points = normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
+    # On the line a quotient in float32 could miss -1 and 1, which are all there is.
+    length = jnp.linalg.norm(normal, axis=-1, keepdims=True)
+    points = normal / length if num_features > 1 else jnp.sign(normal)
     features = jnp.floor((points + 1) / 2 * 255).astype(jnp.uint8)
     categories = np.array([TOOL, TUBE1, TUBE2, TRAP, EXIT, GROUND])
     points_of = np.array([0, 1, 1, 2, 3, 4])
@@ -163,10 +169,9 @@ class _Outline(struct.PyTreeNode):
     corner: jax.Array
     size: jax.Array
 
-    def inside(self, margin: int | jax.Array = 0) -> jax.Array:
-        """bool[12, 12]: the cells of the box grown by `margin` (rows, columns) on each side."""
-        first, last = self.corner - margin, self.corner + self.size - 1 + margin
-        return jnp.all((first <= CELLS) & (last >= CELLS), axis=-1)
+    def inside(self, margin: int = 0) -> jax.Array:
+        """bool[12, 12]: the cells of the box grown by `margin` on each side."""
+        return bar_cells(self.corner - margin, self.size + 2 * margin)
 
 
 def _sample_outline(key: jax.Array) -> _Outline:
@@ -181,10 +186,9 @@ def _sample_board(key: jax.Array, outline: _Outline) -> jax.Array:
     axis, swap_openings, swap_tubes = jax.random.bernoulli(key, shape=(3,))
     # (depth, breadth) counts along and across the openings' axis, which is west-east or
     # north-south; the openings are the first and last cells along it, the tubes across it.
-    place = CELLS - outline.corner
-    place = jnp.where(axis, place, place[..., ::-1])
+    row, column = ROWS - outline.corner[0], COLUMNS - outline.corner[1]
+    breadth, depth = jnp.where(axis, row, column), jnp.where(axis, column, row)
     last = jnp.where(axis, outline.size, outline.size[::-1]) - 1
-    breadth, depth = place[..., 0], place[..., 1]
     tube = (breadth == 0) | (breadth == last[0])
     opening = (depth == 0) | (depth == last[1])
     tube_code = jnp.where((breadth == 0) ^ swap_tubes, TUBE1, TUBE2)
@@ -202,11 +206,12 @@ def _sample_tool(key: jax.Array, outline: _Outline) -> tuple[jax.Array, jax.Arra
     length = jnp.sum(outline.size * along)
     # Along itself the bar must end before the last row or column, and start `length` before
     # the tube or behind it; across, it keeps two cells away.
-    fits = jnp.all(CELLS < BOARD_SIZE - length * along, axis=-1)
+    corners = BOARD_SIZE - length * along
+    fits = (corners[0] > ROWS) & (corners[1] > COLUMNS)
     before = jnp.where(along == 1, length, 2)
     behind = jnp.where(along == 1, 0, 2)
-    first, end = outline.corner - before, outline.corner + outline.size + behind
-    candidates = fits & ~jnp.all((first <= CELLS) & (end > CELLS), axis=-1)
+    near = bar_cells(outline.corner - before, outline.size + before + behind)
+    candidates = fits & ~near
     extent = jnp.where(along == 1, length, 1)
     return _uniform_cell(corner_key, candidates), extent, candidates
 
