@@ -197,10 +197,13 @@ def validate(state: State) -> State:
       state: one unbatched state of concrete arrays.
 
     Raises:
-      ValueError: a field has the wrong type, shape or dtype, an object is off the
-        board or where it cannot be; the message says what is allowed.
+      ValueError: a field has the wrong type, shape or dtype, the episode is over, an
+        object is off the board or where it cannot be; the message says what is allowed.
     """
     check_structure(state)
+    for flag in ("terminated", "truncated"):
+        if getattr(state, flag):
+            raise ValueError(f"the state is {flag}; allowed: one whose episode is not over")
     board, tool, extent = (np.asarray(x) for x in (state.board, state.tool, state.tool_extent))
     if board.max() > max(STATIC_OBJECTS):
         row, column = np.argwhere(board > max(STATIC_OBJECTS))[0]
