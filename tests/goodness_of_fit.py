@@ -1,0 +1,39 @@
+"""Pearson's chi-square test against probabilities that are known exactly."""
+
+import numpy as np
+
+# One false alarm in 30,000 tests of a correct sampler; seeds are fixed, so it stays away.
+NORMAL_QUANTILE = 4.0
+SMALLEST_EXPECTATION = 5.0
+
+
+def chi_square_quantile(degrees: int, normal_quantile: float = NORMAL_QUANTILE) -> float:
+    """Wilson and Hilferty's approximation: the cube root is nearly normal."""
+    spread = 2 / (9 * degrees)
+    return degrees * (1 - spread + normal_quantile * np.sqrt(spread)) ** 3
+
+
+def assert_fits(counts: np.ndarray, chances: np.ndarray) -> None:
+    """Refuses counts that samples of distribution `chances` would hardly give.
+
+    Nothing may fall where the chance is 0. Rare outcomes are tested together, at five
+    expected counts or more.
+    """
+    counts, chances = np.ravel(counts), np.ravel(chances)
+    assert counts.shape == chances.shape
+    np.testing.assert_allclose(chances.sum(), 1, rtol=1e-9)
+    impossible = counts[chances == 0]
+    assert not impossible.any(), f"{impossible.sum()} samples lie outside the support"
+    expected = chances * counts.sum()
+    rare = expected < SMALLEST_EXPECTATION
+    observed = np.append(counts[~rare], counts[rare].sum())
+    expected = np.append(expected[~rare], expected[rare].sum())
+    if expected[-1] < SMALLEST_EXPECTATION:
+        observed, expected = observed[:-1], expected[:-1]
+    statistic = np.sum((observed - expected) ** 2 / expected)
+    limit = chi_square_quantile(max(len(expected) - 1, 1))
+    worst = np.argmax((observed - expected) ** 2 / expected)
+    assert statistic < limit, (
+        f"chi-square {statistic:.1f} exceeds {limit:.1f} with {len(expected)} cells; the worst has "
+        f"{observed[worst]:.0f} samples, expected {expected[worst]:.1f}"
+    )
