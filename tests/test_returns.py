@@ -1,0 +1,111 @@
+"""Returns, advantages and moments against float64 NumPy, on random episodes with masks."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from agents import returns
+
+CASES, STEPS = 1_000, 23
+
+
+@pytest.fixture(scope="module")
+def episodes() -> dict[str, np.ndarray]:
+    """Random episodes, each masked after an end of its own (0 to STEPS steps)."""
+    rng = np.random.default_rng(0)
+    length = rng.integers(0, STEPS + 1, CASES)
+    mask = (np.arange(STEPS)[None] < length[:, None]).astype(np.float32)
+    return {
+        "mask": mask,
+        "reward": (rng.normal(size=mask.shape) * mask).astype(np.float32),
+        "value": rng.normal(size=mask.shape).astype(np.float32),
+        "bootstrap": rng.normal(size=CASES).astype(np.float32),
+        "discount": rng.uniform(0, 1, CASES).astype(np.float32),
+        "lambda": rng.uniform(0, 1, CASES).astype(np.float32),
+    }
+
+
+def test_returns_by_hand():
+    result = returns.discounted_returns(jnp.array([1.0, 0.0, 2.0]), 0.5)
+    np.testing.assert_allclose(result, [1.5, 1.0, 2.0])
+
+
+def test_returns(episodes):
+    result = jax.vmap(returns.discounted_returns)(episodes["reward"], episodes["discount"])
+    for case in range(CASES):
+        reward = episodes["reward"][case].astype(np.float64)
+        powers = np.float64(episodes["discount"][case]) ** np.arange(STEPS)
+        expected = [reward[t:] @ powers[: STEPS - t] for t in range(STEPS)]
+        np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_advantages_by_hand():
+    result = returns.generalized_advantages(
+        jnp.array([0.0, 1.0]), jnp.array([0.5, 0.25]), jnp.float32(2.0), jnp.ones(2), 0.5, 0.5
+    )
+    delta = [0.0 + 0.5 * 0.25 - 0.5, 1.0 + 0.5 * 2.0 - 0.25]
+    np.testing.assert_allclose(result, [delta[0] + 0.25 * delta[1], delta[1]])
+
+
+def test_advantages(episodes):
+    names = ("reward", "value", "bootstrap", "mask", "discount", "lambda")
+    result = jax.vmap(returns.generalized_advantages)(*(episodes[name] for name in names))
+    for case in range(CASES):
+        reward, value, bootstrap, mask, discount, lambda_ = (
+            episodes[name][case].astype(np.float64) for name in names
+        )
+        after = np.append(value[1:], bootstrap)
+        delta = mask * (reward + discount * after - value)
+        powers = (discount * lambda_) ** np.arange(STEPS)
+        expected = [delta[t:] @ powers[: STEPS - t] for t in range(STEPS)]
+        np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_advantages_without_lambda_are_errors_and_with_it_are_returns(episodes):
+    """At lambda 0 the advantage is one step's error, at lambda 1 return less value."""
+    ones = np.ones_like(episodes["mask"])
+    gae: Any = jax.vmap(returns.generalized_advantages, in_axes=(0, 0, 0, 0, 0, None))
+    args: list[Any] = [episodes["reward"], episodes["value"], np.zeros(CASES, np.float32), ones]
+    after = np.append(episodes["value"][:, 1:], np.zeros((CASES, 1)), axis=1)
+    error = episodes["reward"] + episodes["discount"][:, None] * after - episodes["value"]
+    np.testing.assert_allclose(gae(*args, episodes["discount"], 0.0), error, atol=1e-5)
+    full = jax.vmap(returns.discounted_returns)(episodes["reward"], episodes["discount"])
+    np.testing.assert_allclose(
+        gae(*args, episodes["discount"], 1.0), full - episodes["value"], atol=1e-4
+    )
+
+
+def test_masked_moments_and_normalize(episodes):
+    mean, variance = jax.vmap(returns.masked_moments)(episodes["value"], episodes["mask"])
+    normalized = jax.vmap(returns.normalize)(episodes["value"], episodes["mask"])
+    for case in range(CASES):
+        chosen = episodes["value"][case][episodes["mask"][case] > 0].astype(np.float64)
+        expected = (chosen.mean(), chosen.var()) if len(chosen) else (0, 0)
+        np.testing.assert_allclose([mean[case], variance[case]], expected, rtol=1e-4, atol=1e-6)
+        if len(chosen) > 2:
+            want = (chosen - chosen.mean()) / chosen.std()
+            got = np.asarray(normalized[case])[: len(chosen)]
+            np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-3)
+        assert np.all(np.asarray(normalized[case])[len(chosen) :] == 0)
+
+
+def test_moving_moments():
+    rng = np.random.default_rng(1)
+    moments, mean, variance = returns.Moments.zero(), 0.0, 0.0
+    for index in range(6):
+        x, mask = rng.normal(3, 2, (4, 5)), rng.integers(0, 2, (4, 5))
+        moments = moments.update(jnp.float32(x), jnp.float32(mask), 0.9)
+        batch_mean, batch_variance = x[mask > 0].mean(), x[mask > 0].var()
+        keep = 0.9 if index else 0.0
+        mean = keep * mean + (1 - keep) * batch_mean
+        variance = keep * variance + (1 - keep) * batch_variance
+        np.testing.assert_allclose(moments.mean, mean, rtol=1e-5)
+        np.testing.assert_allclose(moments.deviation, np.sqrt(variance), rtol=1e-5)
+
+
+def test_constant_rewards_are_not_scaled():
+    moments = returns.Moments.zero().update(jnp.zeros((3, 4)), jnp.ones((3, 4)), 0.9)
+    assert moments.deviation == 1.0
