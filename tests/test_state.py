@@ -1,7 +1,6 @@
 """Building states, from arrays and from pictures, and the refusal of broken ones."""
 
 import dataclasses
-import re
 from typing import Any
 
 import jax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import spec_reference as spec
+from refusal import assert_refused
 
 import trap_tube_jax as tt
 
@@ -171,14 +171,6 @@ BAD_ARRAYS = [
     ("tool of no cell", {"tool_extent": (0, 1)}, ["tool_extent", "(0, 1)", "1 to 4"]),
     ("tool's extent a number", {"tool_extent": 4}, ["tool_extent", "(2)", "()"]),
 ]
-
-
-def assert_refused(words: list[str], function: Any, *args: Any, **kwargs: Any) -> None:
-    """A ValueError with all the words: what is wrong, and what is allowed."""
-    with pytest.raises(ValueError, match=re.escape(words[0])) as error:
-        function(*args, **kwargs)
-    message = str(error.value)
-    assert all(word in message for word in words), message
 
 
 @pytest.mark.parametrize(

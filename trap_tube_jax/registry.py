@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
-from trap_tube_jax.state import State, base_state
+from trap_tube_jax.state import State, base_state, check_structure
 from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
 
 
@@ -89,7 +89,8 @@ def make(
     transfers = task_set(name).transfers
     if base is None:
         base = base_state(num_features)
-    elif num_features not in (3, base.palette.shape[-1]):
+    check_structure(base)
+    if num_features not in (3, base.palette.shape[-1]):
         raise ValueError(
             f"num_features={num_features} contradicts base, whose palette has "
             f"{base.palette.shape[-1]} features; give one of them"

@@ -1,0 +1,102 @@
+"""What imports what: downward only, and little at the top."""
+
+import ast
+import graphlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parent.parent
+MAY_IMPORT = {
+    "trap_tube_jax": {"trap_tube_jax"},
+    "agents": {"agents", "trap_tube_jax"},
+    "benchmarks": {"benchmarks", "agents", "trap_tube_jax"},
+}
+SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
+# The project's other dependencies, and what only its extras install.
+HEAVY = {"PIL", "chex", "gymnasium", "gymnax", "matplotlib", "optax", "orbax", "tyro"}
+
+
+def module_name(path: pathlib.Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path) for path in SOURCES}
+
+
+def imported_modules(path: pathlib.Path, tree: ast.AST) -> set[str]:
+    """Absolute names of the imported modules, with relative imports resolved."""
+    package = module_name(path).split(".")
+    if path.name != "__init__.py":
+        package = package[:-1]
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                submodule = f"{module}.{alias.name}"
+                names.add(submodule if submodule in MODULES else module)
+    return names
+
+
+class WithoutFunctions(ast.NodeTransformer):
+    """Leaves what runs on import; functions import later."""
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        del node
+
+
+def test_the_sources_are_found():
+    assert {"trap_tube_jax.dynamics", "agents", "benchmarks"} <= MODULES
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=module_name)
+def test_imports_run_downward(path):
+    package = module_name(path).split(".")[0]
+    own = {name.split(".")[0] for name in imported_modules(path, ast.parse(path.read_text()))}
+    assert own & (set(MAY_IMPORT) | {"tests"}) <= MAY_IMPORT[package]
+
+
+def test_no_module_needs_itself():
+    graph = {}
+    for path in SOURCES:
+        tree = WithoutFunctions().visit(ast.parse(path.read_text()))
+        graph[module_name(path)] = imported_modules(path, tree) & MODULES - {module_name(path)}
+    graphlib.TopologicalSorter(graph).prepare()
+
+
+def test_importing_the_environment_is_light(tmp_path):
+    """A fresh interpreter, where even the extras seem to be installed."""
+    for package in ("gymnasium", "gymnax"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
+    program = """
+import json, sys
+import jax, numpy
+from flax import struct
+before = set(sys.modules)
+import trap_tube_jax
+print(json.dumps([sorted(before), sorted(set(sys.modules) - before)]))
+"""
+    path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"PYTHONPATH": path},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    before, added = ({name.split(".")[0] for name in names} for names in json.loads(result.stdout))
+    assert "trap_tube_jax" in added
+    assert added - before - set(sys.stdlib_module_names) == {"trap_tube_jax"}
+    assert not added & HEAVY
+    assert not before & {"agents", "benchmarks"}

@@ -1,0 +1,111 @@
+"""The task sets by name."""
+
+import numpy as np
+import pytest
+from refusal import assert_refused
+
+import trap_tube_jax as tt
+from trap_tube_jax import registry
+
+# Specification section 6.
+SPECIFIED = [
+    ("TrapTube-v0", "base", "base", ()),
+    ("PerceptualTrapTube-v0", "p", "{P}", (tt.perceptual,)),
+    ("StructuralTrapTube-v0", "st", "{St}", (tt.structural,)),
+    ("SymbolicTrapTube-v0", "sy", "{Sy}", (tt.symbolic,)),
+    ("PerceptualStructuralTrapTube-v0", "pst", "{P, St}", (tt.perceptual, tt.structural)),
+    ("PerceptualSymbolicTrapTube-v0", "psy", "{P, Sy}", (tt.perceptual, tt.symbolic)),
+    ("StructuralSymbolicTrapTube-v0", "stsy", "{St, Sy}", (tt.structural, tt.symbolic)),
+    (
+        "PerceptualStructuralSymbolicTrapTube-v0",
+        "pstsy",
+        "{P, St, Sy}",
+        (tt.perceptual, tt.structural, tt.symbolic),
+    ),
+]
+
+
+@pytest.fixture
+def own_registry(monkeypatch):
+    """What a test registers is gone after it."""
+    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+
+
+def test_the_papers_sets_are_those_of_the_specification():
+    sets = [(entry.id, entry.short, entry.label, entry.transfers) for entry in tt.PAPER_TASK_SETS]
+    assert sets == SPECIFIED
+    assert tt.registered_ids()[:8] == tuple(entry[0] for entry in SPECIFIED)
+
+
+@pytest.mark.parametrize(("name", "short", "transfers"), [(s[0], s[1], s[3]) for s in SPECIFIED])
+def test_make_knows_id_and_short_name(name, short, transfers):
+    for env in (tt.make(name), tt.make(short)):
+        assert env.transfers == transfers
+        assert env.max_steps == 50
+        assert env.num_features == 3
+
+
+def test_make_passes_its_options_on():
+    base = tt.base_state(5).replace(agent=np.array((0, 0), np.int32))
+    env = tt.make("TrapTube-v0", base=base, max_steps=7)
+    assert env.base is base
+    assert (env.max_steps, env.num_features) == (7, 5)
+    assert tt.make("p", num_features=2).num_features == 2
+    assert tt.make("p", base=base, num_features=5).num_features == 5
+
+
+def test_register_adds_a_set(own_registry):
+    def to_the_top(key, state):
+        del key
+        return state.replace(agent=state.agent.at[0].set(0))
+
+    entry = tt.register("Top-v0", (tt.structural, to_the_top), short="top")
+    assert tt.registered_ids()[-1] == "Top-v0"
+    assert tt.task_set("top") is entry
+    assert entry.label == "{St, to_the_top}"
+    assert tt.make("Top-v0").transfers == (tt.structural, to_the_top)
+
+
+def test_register_takes_the_id_for_a_missing_short_name(own_registry):
+    assert tt.register("Plain-v0", ()).short == "Plain-v0"
+
+
+UNKNOWN = ["TrapTube-v1", "traptube-v0", "", "P", 3, None]
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_make_refuses_an_unknown_id(name):
+    every_id = [entry[0] for entry in SPECIFIED]
+    assert_refused([f"unknown task set {name!r}", *every_id, "(pstsy)"], tt.make, name)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"num_features": 0}, ["num_features", ">= 1", "0"]),
+        ({"num_features": 2.5}, ["num_features", ">= 1", "2.5"]),
+        ({"num_features": 4, "base": tt.base_state(5)}, ["num_features=4", "5 features"]),
+        ({"base": "TrapTube-v0"}, ["trap_tube_jax.State", "str"]),
+        ({"max_steps": 0}, ["max_steps", ">= 1", "0"]),
+    ],
+    ids=["no feature", "half a feature", "contradiction", "base a name", "no step"],
+)
+def test_make_refuses(options, words):
+    assert_refused(words, tt.make, "TrapTube-v0", **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "transfers", "short", "words"),
+    [
+        ("TrapTube-v0", (), None, ["'TrapTube-v0' is taken", "pstsy"]),
+        ("Mine-v0", (), "psy", ["'psy' is taken", "TrapTube-v0"]),
+        ("", (), None, ["non-empty string", "''"]),
+        (7, (), None, ["non-empty string", "7"]),
+        ("Mine-v0", (), 7, ["non-empty string", "7"]),
+        ("Mine-v0", tt.symbolic, None, ["transfers", "sequence", "symbolic"]),
+        ("Mine-v0", ("symbolic",), None, ["(key, state) -> state", "'symbolic'", "perceptual"]),
+    ],
+)
+def test_register_refuses(own_registry, name, transfers, short, words):
+    assert_refused(words, tt.register, name, transfers, short=short)
+    assert "Mine-v0" not in tt.registered_ids()
