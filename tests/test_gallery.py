@@ -1,0 +1,85 @@
+"""The contact sheet and the pictures of episodes."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import trap_tube_jax as tt
+from trap_tube_jax import gallery
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    return np.asarray(gallery.contact_sheet(("base", "sy"), tasks=2, cell_size=8))
+
+
+def tile(sheet, panel, index):
+    """The picture of a task: 96 pixels a side, 16 around the panels, 24 above the tasks."""
+    left = 16 + panel * (2 * 96 + 4 + 16) + index * (96 + 4)
+    return sheet[40:136, left : left + 96]
+
+
+def test_the_sheet_shows_the_base_and_a_legend(sheet):
+    assert sheet.shape == (16 + 120 + 16, 2 * (196 + 16) + 16, 3)
+    np.testing.assert_array_equal(tile(sheet, 0, 0), tt.render(tt.base_state(), 8))
+    shown = {tuple(color) for color in tile(sheet, 0, 1).reshape(-1, 3)}
+    assert shown >= {tuple(color) for color in tt.base_palette()}
+
+
+def test_the_sheet_shows_different_tasks_and_titles(sheet):
+    one, other = tile(sheet, 1, 0), tile(sheet, 1, 1)
+    assert (one != other).any()
+    title = sheet[16:40, 228:]
+    assert (title < 128).any()
+    assert (sheet[:16] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tasks": 1}, "tasks must be >= 2, got 1"),
+        ({"cell_size": 7}, "cell_size must be >= 8, got 7"),
+        ({"ids": ()}, "at least one task set"),
+        ({"ids": ("nonesuch",)}, "unknown task set 'nonesuch'; allowed"),
+    ],
+)
+def test_the_sheet_refuses(options, message):
+    with pytest.raises(ValueError, match=message):
+        gallery.contact_sheet(**options)
+
+
+def test_episode_frames_show_every_state_and_grasp():
+    state = tt.base_state()
+    frames = gallery.episode_frames(state, np.array([[0, 0], [0, 3]]), 8)
+    assert frames.shape == (3, 96, 96, 3)
+    np.testing.assert_array_equal(frames[0], tt.render(state, 8, grasp=0))
+    moved = state.replace(agent=state.agent.at[0].add(-1))
+    np.testing.assert_array_equal(frames[1], tt.render(moved, 8, grasp=0))
+    after = moved.replace(agent=moved.agent.at[1].add(1), tool=moved.tool.at[1].add(1))
+    np.testing.assert_array_equal(frames[2], tt.render(after, 8))
+
+
+def test_a_solved_episode_ends_on_the_food():
+    frames = gallery.solved_episode(tt.base_state(), 1)
+    assert len(frames) == 12
+    food, agent = tt.base_palette()[[5, 7]]
+    assert (frames[0] == food).all(-1).any()
+    assert not (frames[-1] == food).all(-1).any()
+    assert (frames[-1] == agent).all(-1).sum() == 1
+
+
+def test_no_episode_of_an_unsolvable_task():
+    board = np.zeros((12, 12), np.uint8)
+    board[[0, 1, 1], [1, 0, 1]] = 3
+    state = tt.State.create(board=board, agent=(9, 9), tool=(5, 5), tool_extent=(1, 1), food=(0, 0))
+    with pytest.raises(ValueError, match="no solution"):
+        gallery.solved_episode(state, 1)
+
+
+def test_the_command_line_writes_the_pictures(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(gallery, "contact_sheet", lambda **_: Image.new("RGB", (4, 4)))
+    monkeypatch.setattr(gallery, "SOLVED_SETS", ("base",))
+    gallery.main(gallery.Arguments(out=tmp_path / "new", gifs=True))
+    written = [path.name for path in sorted((tmp_path / "new").iterdir())]
+    assert written == ["gallery.png", "solved_base.gif"]
+    assert "solved_base.gif" in capsys.readouterr().out
