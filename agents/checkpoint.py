@@ -1,0 +1,224 @@
+"""Checkpoints: the whole state of training, on disk, whole or not at all.
+
+A checkpoint is a flat table of NumPy arrays, named by their place in the state, and a
+JSON record with a digest of them. Reading one needs neither the classes that wrote it nor
+the device.
+"""
+
+import hashlib
+import logging
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Tree = TypeVar("Tree")
+Arrays = dict[str, np.ndarray]
+
+SEPARATOR = "/"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint cannot be used; the message names it and says what to do."""
+
+
+class Checkpoints:
+    """The checkpoints of one run, each named by the iteration after which it was made.
+
+    Close it, or use it as a context manager.
+    """
+
+    def __init__(self, folder: Path, *, keep: int | None = None):
+        """Opens `folder`.
+
+        Args:
+          folder: made on the first save.
+          keep: how many to keep, the newest, at least 1; None opens it for reading only.
+
+        Raises:
+          ValueError: `keep` is below 1.
+        """
+        if keep is not None and keep < 1:
+            raise ValueError(f"keep must be >= 1, got {keep}")
+        import orbax.checkpoint as ocp  # noqa: PLC0415  slow to import
+
+        # Orbax reports every refused file with a stack trace of its own.
+        logging.getLogger("absl").setLevel(logging.CRITICAL)
+        self.folder = folder
+        self._ocp = ocp
+        self._manager = None
+        if keep is not None or folder.is_dir():
+            options = ocp.CheckpointManagerOptions(
+                max_to_keep=keep,
+                read_only=keep is None,
+                cleanup_tmp_directories=keep is not None,
+                enable_async_checkpointing=False,
+            )
+            self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends whatever works in the background."""
+        if self._manager is not None:
+            self._manager.close()
+
+    @property
+    def iterations(self) -> list[int]:
+        """The iterations that have a checkpoint, in order."""
+        return [] if self._manager is None else sorted(self._manager.all_steps(read=True))
+
+    def save(self, iteration: int, state: Any, record: dict[str, Any]) -> None:
+        """Saves a pytree of arrays, PRNG keys included; returns once it is on disk.
+
+        Args:
+          iteration: its name; nothing happens if that is taken.
+          state: the pytree.
+          record: plain values to keep with it.
+        """
+        if self._manager is None or iteration in self.iterations:
+            return
+        arrays = to_arrays(state)
+        record = {**record, "iteration": iteration, "digest": digest(arrays)}
+        args = self._ocp.args
+        items = args.Composite(state=args.StandardSave(arrays), record=args.JsonSave(record))
+        self._manager.save(iteration, args=items, force=True)
+
+    def load(self, iteration: int | None = None) -> tuple[Arrays, dict[str, Any]]:
+        """The arrays of a checkpoint by name, and its record.
+
+        Args:
+          iteration: which one; the newest if absent.
+
+        Raises:
+          CheckpointError: there is none, or it is damaged or of another kind.
+        """
+        known = self.iterations
+        if self._manager is None or not known or (iteration is not None and iteration not in known):
+            names = ", ".join(map(str, known)) or "none"
+            wanted = "no checkpoint" if iteration is None else f"no checkpoint {iteration}"
+            raise CheckpointError(f"{self.folder} holds {wanted}; allowed: {names}")
+        iteration = known[-1] if iteration is None else iteration
+        args = self._ocp.args
+        items = args.Composite(state=args.StandardRestore(), record=args.JsonRestore())
+        try:
+            restored = self._manager.restore(iteration, args=items)
+            arrays, record = restored["state"], restored["record"]
+            intact = digest(arrays) == record["digest"]
+        # Which of its many errors Orbax raises depends on the file that is damaged.
+        except Exception as error:
+            raise self.refuse(iteration, f"cannot be read ({_first_line(error)})") from error
+        if not intact:
+            raise self.refuse(iteration, "does not hold the numbers that were saved")
+        return arrays, record
+
+    def restore(self, template: Tree) -> tuple[Tree, dict[str, Any]]:
+        """The state and the record of the newest checkpoint.
+
+        Args:
+          template: the structure, as arrays or as `jax.eval_shape` gives it.
+
+        Raises:
+          CheckpointError: there is none, or it is damaged or does not fit the template.
+        """
+        arrays, record = self.load()
+        try:
+            return from_arrays(arrays, template), record
+        except ValueError as error:
+            problem = f"does not fit the run's settings or this version ({error})"
+            raise self.refuse(record["iteration"], problem) from error
+
+    def refuse(self, iteration: int, problem: str) -> CheckpointError:
+        """The error that says what to do about a checkpoint."""
+        others = [other for other in self.iterations if other != iteration]
+        advice = f"to use checkpoint {max(others)} instead" if others else "to begin again"
+        path = self.folder / str(iteration)
+        return CheckpointError(
+            f"checkpoint {path} {problem}: delete that folder {advice}, or use another run"
+        )
+
+
+def to_arrays(tree: Any) -> Arrays:
+    """Every leaf as a NumPy array of its own, by its place in `tree`; keys as their data."""
+    leaves, _ = jax.tree.flatten_with_path(tree)
+    return {_name(path): _to_array(leaf) for path, leaf in leaves}
+
+
+def from_arrays(arrays: Arrays, template: Tree) -> Tree:
+    """The inverse of `to_arrays`.
+
+    Args:
+      arrays: as `to_arrays` gives them; more of them than the template has is an error.
+      template: a pytree of that structure, of arrays or `jax.ShapeDtypeStruct`.
+
+    Raises:
+      ValueError: a name, shape or dtype differs; the message names it.
+    """
+    leaves, structure = jax.tree.flatten_with_path(template)
+    names = [_name(path) for path, _ in leaves]
+    for name in set(names) ^ set(arrays):
+        raise ValueError(f"{name} is {'missing' if name in names else 'not expected'}")
+    return structure.unflatten(
+        [_to_leaf(name, arrays[name], leaf) for name, (_, leaf) in zip(names, leaves, strict=True)]
+    )
+
+
+def subtree(arrays: Arrays, *path: str) -> dict[str, Any]:
+    """The nested dictionary that lay at `path`; its names come from dictionaries only."""
+    prefix = "".join(name + SEPARATOR for name in path)
+    result: dict[str, Any] = {}
+    for name, array in arrays.items():
+        if name.startswith(prefix):
+            *parents, last = name.removeprefix(prefix).split(SEPARATOR)
+            node = result
+            for parent in parents:
+                node = node.setdefault(parent, {})
+            node[last] = array
+    return result
+
+
+def digest(arrays: Arrays) -> str:
+    """A SHA-256 over names, types, shapes and values."""
+    total = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
+        total.update(f"{name} {array.dtype} {array.shape}\n".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=SEPARATOR)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _to_array(leaf: Any) -> np.ndarray:
+    # A copy: on a CPU the array could be a view of memory that is donated next.
+    return np.array(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _to_leaf(name: str, array: np.ndarray, template: Any) -> jax.Array:
+    if _is_key(template):
+        if array.dtype != np.uint32 or array.shape[:-1] != template.shape:
+            raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, not PRNG keys")
+        return jax.random.wrap_key_data(jnp.asarray(array))
+    if (array.dtype, array.shape) != (template.dtype, template.shape):
+        raise ValueError(
+            f"{name} is {array.dtype}{list(array.shape)}, "
+            f"not {template.dtype}{list(template.shape)}"
+        )
+    return jnp.asarray(array)
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).splitlines()
+    return f"{type(error).__name__}: {lines[0][:120]}" if lines else type(error).__name__

@@ -1,0 +1,268 @@
+"""How a run is shown: the live table, tables of results, learning curves, a GIF."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from agents.metrics import FirstSolved, Row, Score, column
+from trap_tube_jax.gallery import episode_frames
+from trap_tube_jax.rendering import save_gif
+from trap_tube_jax.state import State
+
+LIVE_ROWS = 10
+CELL_SIZE = 24  # pixels
+
+
+class LiveColumn(NamedTuple):
+    """A column of the live table.
+
+    Attributes:
+      title: its head.
+      metric: the metric that it shows, averaged over seeds.
+      show: number to text.
+    """
+
+    title: str
+    metric: str
+    show: Callable[[float], str]
+
+
+def _integer(value: float) -> str:
+    return f"{value:,.0f}"
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.2f}"
+
+
+def _decimal(value: float) -> str:
+    return f"{value:.3g}"
+
+
+LIVE_COLUMNS = (
+    LiveColumn("iter", "iteration", _integer),
+    LiveColumn("episodes", "episodes", _integer),
+    LiveColumn("steps/s", "transitions_per_second", _integer),
+    LiveColumn("solved%", "success", _percent),
+    LiveColumn("greedy%", "evaluation", _percent),
+    LiveColumn("intrins.", "intrinsic_reward", _decimal),
+    LiveColumn("policy", "policy_loss", _decimal),
+    LiveColumn("value", "value_loss", _decimal),
+    LiveColumn("forward", "forward_loss", _decimal),
+    LiveColumn("inverse", "inverse_loss", _decimal),
+    LiveColumn("entropy", "entropy", _decimal),
+)
+
+
+class LiveReport:
+    """Shows training as it goes: a live table on a terminal, else a line per iteration.
+
+    A context manager. Numbers are means over the seeds that still train.
+    """
+
+    def __init__(self, console: Console, total_iterations: int, num_seeds: int):
+        self._console = console
+        self._total = total_iterations
+        self._num_seeds = num_seeds
+        self._rows: deque[Row] = deque(maxlen=LIVE_ROWS)
+        self._durations: deque[float] = deque(maxlen=LIVE_ROWS)
+        self._shown_at = time.monotonic()
+        self._live = None
+        if console.is_terminal:
+            self._live = Live(console=console, auto_refresh=False, transient=False)
+
+    def __enter__(self) -> Self:
+        self._shown_at = time.monotonic()
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, rows: Sequence[Row], num_solved: int) -> None:
+        """Shows an iteration.
+
+        Args:
+          rows: its rows of metrics, one per seed that trained.
+          num_solved: seeds solved so far.
+        """
+        now = time.monotonic()
+        self._durations.append(now - self._shown_at)
+        self._shown_at = now
+        mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        mean["transitions_per_second"] *= len(rows)
+        is_first = not self._rows
+        self._rows.append(mean)
+        if self._live is None:
+            self._print_line(mean, is_first, num_solved)
+        else:
+            self._live.update(Group(self._table(), self._status(mean, num_solved)), refresh=True)
+
+    def _columns(self) -> list[LiveColumn]:
+        return [entry for entry in LIVE_COLUMNS if entry.metric in self._rows[0]]
+
+    def _print_line(self, mean: Row, is_first: bool, num_solved: int) -> None:
+        columns = self._columns()
+        if is_first:
+            self._line([entry.title for entry in columns])
+        self._line([entry.show(mean[entry.metric]) for entry in columns], self._left(num_solved))
+
+    def _line(self, cells: Sequence[str], rest: str = "") -> None:
+        text = " ".join(f"{cell:>9}" for cell in cells)
+        self._console.print(Text(f"{text}  {rest}".rstrip()), soft_wrap=True)
+
+    def _table(self) -> Table:
+        table = Table(box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
+        for entry in self._columns():
+            table.add_column(entry.title, justify="right", no_wrap=True)
+        for row in self._rows:
+            table.add_row(*(entry.show(row[entry.metric]) for entry in self._columns()))
+        return table
+
+    def _status(self, mean: Row, num_solved: int) -> Text:
+        done = int(mean["iteration"])
+        return Text(f"iteration {done} of {self._total}, {self._left(num_solved)}")
+
+    def _left(self, num_solved: int) -> str:
+        remaining = max(0, self._total - int(self._rows[-1]["iteration"]))
+        seconds = remaining * float(np.mean(self._durations))
+        text = f"{duration(seconds)} left at most"
+        return text if self._num_seeds == 1 else f"{num_solved}/{self._num_seeds} solved, {text}"
+
+
+def duration(seconds: float) -> str:
+    """A number of seconds for people, as in 1:02:03 or 4:05."""
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"
+
+
+def evaluation_table(scores: Sequence[Score], title: str) -> Table:
+    """The scores of a policy, one set per row."""
+    table = Table(title=f"Greedy evaluation: {title}", box=SIMPLE_HEAD, title_justify="left")
+    table.add_column("set")
+    heads = ["tasks", "solved %", "95 % interval", "mean steps"]
+    with_optimality = any(score.optimality is not None for score in scores)
+    if with_optimality:
+        heads += ["of solvable %", "shortest / taken", "worst"]
+    for head in heads:
+        table.add_column(head, justify="right")
+    for score in scores:
+        table.add_row(*_score_cells(score, with_optimality))
+    if any(score.interval is None for score in scores):
+        table.caption = "A set without transfers has a single task: there is no interval."
+        table.caption_justify = "left"
+    return table
+
+
+def _score_cells(score: Score, with_optimality: bool) -> list[str]:
+    interval = "–" if score.interval is None else "{:.1f} to {:.1f}".format(*score.interval)
+    cells = [
+        f"{score.label} ({score.set})" if score.label != score.set else score.label,
+        str(score.tasks),
+        f"{score.percent:.1f}",
+        interval,
+        _optional(score.mean_steps, ".1f"),
+    ]
+    if with_optimality and score.optimality is not None:
+        found = score.optimality
+        cells.append(_optional(found.percent_of_solvable, ".1f"))
+        cells += [_optional(found.mean, ".3f"), _optional(found.worst, ".3f")]
+    return cells
+
+
+def _optional(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def summary_table(solved: Mapping[int, FirstSolved | None], env: str) -> Table:
+    """When each seed was first solved."""
+    table = Table(title=f"First solved on {env}", box=SIMPLE_HEAD, title_justify="left")
+    for head in ("seed", "iteration", "episodes", "transitions", "training time"):
+        table.add_column(head, justify="right")
+    for seed, first in solved.items():
+        if first is None:
+            table.add_row(str(seed), *["–"] * 4)
+        else:
+            counts = (first.iteration, first.episodes, first.transitions)
+            cells = [f"{count:,}" for count in counts]
+            table.add_row(str(seed), *cells, duration(first.seconds))
+    return table
+
+
+PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("success", ("success",), "share of training episodes solved"),
+    ("greedy evaluation", ("evaluation",), "share of tasks solved"),
+    ("episode length", ("episode_length",), "steps"),
+    ("intrinsic reward", ("intrinsic_reward",), "mean per step, before scaling"),
+    ("policy and value loss", ("policy_loss", "value_loss"), "weighted loss"),
+    ("curiosity losses", ("forward_loss", "inverse_loss"), "weighted loss"),
+    ("entropy", ("entropy",), "nats, grasp + move"),
+    ("gradient norm", ("gradient_norm",), "before clipping"),
+)
+
+
+def save_curves(rows: Sequence[Row], path: Path, title: str) -> None:
+    """Draws the learning curves over episodes as PNG, a line per seed.
+
+    Args:
+      rows: all rows of metrics, at least one.
+      path: the file to write.
+      title: over all panels.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+
+    panels = [
+        (name, [metric for metric in metrics if metric in rows[0]], unit)
+        for name, metrics, unit in PANELS
+    ]
+    panels = [panel for panel in panels if panel[1]]
+    height = -(-len(panels) // 2)
+    figure = Figure(figsize=(11, 2.6 * height), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(height, 2, sharex=True, squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.remove()
+    for axis, (name, metrics, unit) in zip(axes.flat, panels, strict=False):
+        _draw_panel(axis, rows, metrics)
+        axis.set_title(name, loc="left", fontsize="medium")
+        axis.set_ylabel(unit, fontsize="small")
+    for axis in axes[-1]:
+        axis.set_xlabel("episodes")
+    figure.savefig(path, format="png", dpi=110)
+
+
+def _draw_panel(axis: Any, rows: Sequence[Row], metrics: Sequence[str]) -> None:
+    seeds = sorted({row["seed"] for row in rows})
+    for color, metric in zip(("C0", "C1"), metrics, strict=False):
+        for seed in seeds:
+            of_seed = [row for row in rows if row["seed"] == seed]
+            label = metric.replace("_", " ") if seed == seeds[0] else None
+            axis.plot(
+                column(of_seed, "episodes"),
+                column(of_seed, metric),
+                color=color,
+                linewidth=1.2,
+                alpha=1.0 if len(seeds) == 1 else 0.6,
+                marker="." if len(of_seed) < 20 else None,
+                label=label,
+            )
+    axis.grid(alpha=0.3)
+    if len(metrics) > 1:
+        axis.legend(fontsize="small")
+
+
+def save_episode(state: State, actions: np.ndarray, path: Path) -> None:
+    """Writes a GIF of an episode: `actions` i32[T, 2] from one `state` at time 0."""
+    save_gif(episode_frames(state, actions, CELL_SIZE), path, fps=4)

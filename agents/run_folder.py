@@ -1,0 +1,157 @@
+"""The folder of one run: where its files lie, and its settings in `config.json`."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any, Self
+
+from agents.config import PRESETS, Config
+
+CONFIG_FILE = "config.json"
+MAX_SEED = 2**31 - 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What a run trains; with the code it fixes the result.
+
+    Attributes:
+      config: the settings.
+      preset: the preset that the settings started from.
+      seed: the first seed.
+      seeds: how many seeds are trained side by side, from `seed` on.
+    """
+
+    config: Config
+    preset: str = "paper"
+    seed: int = 0
+    seeds: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuses impossible seeds.
+
+        Raises:
+          ValueError: naming the value and what is allowed.
+        """
+        if self.preset not in PRESETS:
+            raise ValueError(f"unknown preset {self.preset!r}; allowed: {', '.join(PRESETS)}")
+        for name, low in (("seed", 0), ("seeds", 1)):
+            value = getattr(self, name)
+            if type(value) is not int or value < low:
+                raise ValueError(f"{name} must be an integer >= {low}, got {value!r}")
+        if self.seed_range[-1] > MAX_SEED:
+            raise ValueError(f"seeds must be at most {MAX_SEED}, got {self.seed_range[-1]}")
+
+    @property
+    def seed_range(self) -> range:
+        """All seeds."""
+        return range(self.seed, self.seed + self.seeds)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Any) -> Self:
+        """The inverse of `to_dict`.
+
+        Raises:
+          ValueError: a value is missing, unknown or not allowed.
+        """
+        names = [field.name for field in dataclasses.fields(cls)]
+        if not isinstance(values, dict) or sorted(values) != sorted(names):
+            raise ValueError(f"a run is described by {', '.join(names)}, got {values!r}")
+        if not isinstance(values["config"], dict):
+            raise ValueError(f"config must be a table of settings, got {values['config']!r}")
+        return cls(**{**values, "config": Config.from_dict(values["config"])})
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """The files of a run.
+
+    Attributes:
+      path: the folder.
+    """
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """The settings."""
+        return self.path / CONFIG_FILE
+
+    @property
+    def metrics(self) -> Path:
+        """A row per seed and iteration."""
+        return self.path / "metrics.csv"
+
+    @property
+    def checkpoints(self) -> Path:
+        """One folder per checkpoint, named after its iteration."""
+        return self.path / "checkpoints"
+
+    @property
+    def curves(self) -> Path:
+        """The learning curves."""
+        return self.path / "curves.png"
+
+    @property
+    def evaluation(self) -> Path:
+        """Greedy evaluation on all task sets."""
+        return self.path / "evaluation.json"
+
+    @property
+    def summary(self) -> Path:
+        """When each seed was first solved, and what that took."""
+        return self.path / "summary.json"
+
+    @property
+    def animation(self) -> Path:
+        """A solved episode."""
+        return self.path / "solved.gif"
+
+    @classmethod
+    def create(cls, path: Path, run: Run) -> Self:
+        """Makes the folder of a new run.
+
+        Raises:
+          ValueError: there is something already.
+        """
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise ValueError(
+                f"{path} is not empty; give --resume to continue the run in it, or another --name"
+            )
+        # The folder appears together with its settings, so that a kill leaves either no run
+        # or one that can be resumed.
+        draft = path.parent / f".{path.name}.{os.getpid()}"
+        draft.mkdir(parents=True)
+        write_json(draft / CONFIG_FILE, run.to_dict())
+        draft.rename(path)
+        return cls(path)
+
+    @classmethod
+    def open(cls, path: Path) -> tuple[Self, Run]:
+        """The folder of an existing run, and the run.
+
+        Raises:
+          ValueError: there is none, or its settings cannot be read.
+        """
+        folder = cls(path)
+        if not folder.config.is_file():
+            known = sorted(entry.parent.name for entry in path.parent.glob(f"*/{CONFIG_FILE}"))
+            raise ValueError(
+                f"{path} holds no run; runs in {path.parent}: {', '.join(known) or 'none'}"
+            )
+        try:
+            return folder, Run.from_dict(json.loads(folder.config.read_text()))
+        except ValueError as error:
+            raise ValueError(f"{folder.config} is not the settings of a run: {error}") from error
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Writes a JSON file whole or not at all."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.write_text(json.dumps(values, indent=2) + "\n")
+    draft.replace(path)
