@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
 
 from trap_tube_jax.geometry import bar_covers, unit_vector
 from trap_tube_jax.objects import (
@@ -112,6 +111,8 @@ def save_gif(
     Raises:
       ValueError: naming the value and what is allowed.
     """
+    from PIL import Image  # noqa: PLC0415  importing the environment must stay light
+
     pictures = np.asarray(frames)
     if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[-1] != 3:
         raise ValueError(
