@@ -88,12 +88,18 @@ def evaluation_tasks(
 
 
 def fixed_tasks(env: Environment, name: str, num_tasks: int) -> State:
-    """As `evaluation_tasks`, for any environment; `name` sets its tasks apart from others'."""
+    """As `evaluation_tasks`, for any environment; `name` sets its tasks apart from others'.
+
+    They are the tasks that `env.reset` draws from `evaluation_keys(name, B)`.
+    """
     if num_tasks < 1:
         raise ValueError(f"the number of evaluation tasks must be >= 1, got {num_tasks}")
     count = num_tasks if env.transfers else 1
-    states, _ = jax.jit(jax.vmap(env.reset))(evaluation_keys(name, count))
-    return states
+    # Transfers are compiled one by one: the sets share them, so eight sets take three
+    # compilations, and a transfer has the same bits in each.
+    draw = tt.compose(*map(_compiled, env.transfers))
+    base = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), env.base)
+    return jax.vmap(draw)(evaluation_keys(name, count), base)
 
 
 def evaluation_keys(name: str, num_tasks: int) -> jax.Array:
@@ -190,7 +196,6 @@ def shortest_lengths(tasks: State) -> np.ndarray:
 
 
 def scores(
-    evaluator: Evaluator,
     played: Mapping[str, Evaluation],
     max_steps: int,
     shortest: Mapping[str, np.ndarray] | None = None,
@@ -198,28 +203,14 @@ def scores(
     """The score of every set; with `shortest`, by set, compared with shortest plans.
 
     Args:
-      evaluator: what played.
-      played: what it returned.
+      played: what an `Evaluator` returned.
       max_steps: the step limit.
       shortest: the lengths i32[B] of each set's shortest plans, if known.
     """
-    result = []
-    for name, outcome in played.items():
-        solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
-        optimality = None
-        if shortest is not None:
-            optimality = Optimality.of(solved, length, shortest[name], max_steps)
-        result.append(
-            Score.of(
-                name,
-                tt.task_set(name).label,
-                solved,
-                length,
-                is_sample=bool(tt.task_set(name).transfers),
-                optimality=optimality,
-            )
-        )
-    return result
+    return [
+        _score(name, outcome, max_steps, None if shortest is None else shortest[name])
+        for name, outcome in played.items()
+    ]
 
 
 def save_solved_episode(
@@ -265,6 +256,24 @@ def load_run(path: Path, iteration: int | None = None) -> list[Policy]:
         Policy(f"seed {seed}", run.config, policy, int(done))
         for seed, policy, done in zip(run.seed_range, policies, iterations, strict=True)
     ]
+
+
+@functools.cache
+def _compiled(transfer: tt.Transfer) -> tt.Transfer:
+    return jax.jit(transfer)
+
+
+def _score(name: str, outcome: Evaluation, max_steps: int, shortest: np.ndarray | None) -> Score:
+    known = {tt.task_set(id).short: tt.task_set(id) for id in tt.registered_ids()}.get(name)
+    solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
+    return Score.of(
+        name,
+        known.label if known else name,
+        solved,
+        length,
+        is_sample=known is None or bool(known.transfers),
+        optimality=None if shortest is None else Optimality.of(solved, length, shortest, max_steps),
+    )
 
 
 def _rows(tree: Any, index: Any) -> Any:
@@ -322,8 +331,7 @@ def _evaluate_run(options: Options) -> None:
         shortest = {name: shortest_lengths(tasks) for name, tasks in evaluator.tasks.items()}
     played = {policy.name: evaluator(policy.params) for policy in policies}
     results = {
-        name: scores(evaluator, outcome, config.max_steps, shortest)
-        for name, outcome in played.items()
+        name: scores(outcome, config.max_steps, shortest) for name, outcome in played.items()
     }
     console = Console()
     for policy in policies:

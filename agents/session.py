@@ -1,0 +1,339 @@
+"""A run from its start or newest checkpoint to its results: training, saving, reporting."""
+
+import dataclasses
+import signal
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+import trap_tube_jax as tt
+from agents import report
+from agents.agent import num_parameters
+from agents.checkpoint import Checkpoints
+from agents.config import Config
+from agents.evaluate import (
+    ALL_SETS,
+    Evaluator,
+    Policy,
+    evaluate,
+    evaluation_tasks,
+    results_json,
+    save_solved_episode,
+    scores,
+)
+from agents.metrics import FirstSolved, MetricsLog, Row
+from agents.ppo import Train, TrainState, make_train
+from agents.run_folder import Run, RunFolder, write_json
+
+POLL_SECONDS = 0.005
+
+Advance = Callable[[TrainState, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
+
+
+class Progress(NamedTuple):
+    """What a run has come to, beside the state of training.
+
+    Attributes:
+      iteration: iterations done by the seeds that still train.
+      seconds: seconds of training, compilation excluded.
+      compile_seconds: seconds of compiling the iteration, over all processes.
+      solved: for each seed, when it was first solved.
+    """
+
+    iteration: int
+    seconds: float
+    compile_seconds: float
+    solved: tuple[FirstSolved | None, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        solved = [first and dataclasses.asdict(first) for first in self.solved]
+        return {**self._asdict(), "solved": solved}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """The inverse of `to_dict`; further values are ignored."""
+        solved = tuple(first and FirstSolved(**first) for first in values["solved"])
+        counts = (values["iteration"], values["seconds"], values["compile_seconds"])
+        return cls(*counts, solved)
+
+    def active(self, config: Config) -> np.ndarray:
+        """bool[S]: the seeds that have more to learn."""
+        done = [config.stop_when_solved > 0 and first is not None for first in self.solved]
+        return ~np.array(done) & (self.iteration < config.iterations)
+
+
+class Stopped(Exception):  # noqa: N818  it is no error
+    """Training was asked to stop and has saved."""
+
+
+class StopSignals:
+    """Turns the first Ctrl-C or SIGTERM into a request, and the second into an exception."""
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self, on_request: Callable[[], None]):
+        self.received: int | None = None
+        self._on_request = on_request
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {
+                number: signal.signal(number, self._handle) for number in self.SIGNALS
+            }
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        del frame
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+        self._on_request()
+
+
+class Session:
+    """One process's part of a run: owns its state, its files and what is shown."""
+
+    def __init__(
+        self, folder: RunFolder, run: Run, console: Console, *, checkpoint_every: int, keep: int
+    ):
+        """Builds training and takes up the newest checkpoint.
+
+        Args:
+          folder: the run's files.
+          run: what to train.
+          console: where to show it.
+          checkpoint_every: iterations from one checkpoint to the next.
+          keep: how many checkpoints to keep.
+
+        Raises:
+          ValueError: the settings cannot be trained with, or the checkpoint is unusable.
+        """
+        self.folder, self.run, self._console = folder, run, console
+        self._every = checkpoint_every
+        self._train = make_train(run.config)
+        self._checkpoints = Checkpoints(folder.checkpoints, keep=keep)
+        self._state, self._progress = self._start()
+        self.saved = self._progress.iteration
+        self._log = MetricsLog(folder.metrics, last_iteration=self.saved)
+
+    def close(self) -> None:
+        """Ends whatever works in the background."""
+        self._checkpoints.close()
+
+    def train(self, stop: StopSignals) -> None:
+        """Trains until all seeds are solved or the iterations are over.
+
+        Raises:
+          Stopped: on request; everything is saved.
+          KeyboardInterrupt: on a second request; the current iteration is lost.
+        """
+        config, total = self.run.config, self.run.config.iterations
+        if not self._progress.active(config).any():
+            return
+        self._introduce()
+        advance = self._compile()
+        live = report.LiveReport(self._console, total, self.run.seeds)
+        with stop, live:
+            while self._progress.active(config).any():
+                rows = self._iterate(advance)
+                live.update(rows, sum(first is not None for first in self._progress.solved))
+                is_over = not self._progress.active(config).any()
+                if is_over or stop.received or self._progress.iteration % self._every == 0:
+                    self._save()
+                if stop.received:
+                    raise Stopped
+
+    def finish(self) -> None:
+        """Evaluates on all task sets, writes the results and says where they are."""
+        run, folder = self.run, self.folder
+        evaluator = Evaluator.of_sets(run.config, ALL_SETS, run.config.eval_episodes)
+        policies = self._policies()
+        played = {policy.name: evaluator(policy.params) for policy in policies}
+        results = {name: scores(outcome, run.config.max_steps) for name, outcome in played.items()}
+        write_json(folder.evaluation, results_json(policies, results))
+        write_json(folder.summary, self._summary())
+        if self._log.rows:
+            report.save_curves(self._log.rows, folder.curves, folder.path.name)
+        env = tt.task_set(run.config.env_id)
+        folder.animation.unlink(missing_ok=True)
+        for outcome in played.values():
+            if save_solved_episode(folder.animation, evaluator, outcome, env.short):
+                break
+        for name, result in results.items():
+            self._console.print(report.evaluation_table(result, f"{folder.path.name}, {name}"))
+        solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
+        self._console.print(report.summary_table(solved, env.id))
+        self._say_where()
+
+    def _start(self) -> tuple[TrainState, Progress]:
+        keys = jax.vmap(jax.random.key)(np.array(self.run.seed_range, np.uint32))
+        init = jax.jit(jax.vmap(self._train.init))
+        if self._checkpoints.iterations:
+            state, record = self._checkpoints.restore(jax.eval_shape(init, keys))
+            return state, Progress.from_dict(record)
+        return init(keys), Progress(0, 0.0, 0.0, (None,) * self.run.seeds)
+
+    def _compile(self) -> Any:
+        started = time.perf_counter()
+        active = jnp.ones(self.run.seeds, bool)
+        advance = jax.jit(make_advance(self._train, self.run.seeds), donate_argnums=0)
+        with self._console.status("Compiling ..."):
+            compiled = advance.lower(self._state, active).compile()
+        seconds = time.perf_counter() - started
+        self._progress = self._progress._replace(
+            compile_seconds=self._progress.compile_seconds + seconds
+        )
+        self._console.print(f"Compiled in {seconds:.1f} s.")
+        return compiled
+
+    def _iterate(self, advance: Advance) -> list[Row]:
+        config, progress = self.run.config, self._progress
+        active = progress.active(config)
+        started = time.perf_counter()
+        self._state, metrics = advance(self._state, jnp.asarray(active))
+        _wait(metrics)
+        host = {name: np.asarray(values) for name, values in metrics.items()}
+        taken = time.perf_counter() - started
+        steps = host.pop("steps")
+        iteration, seconds = progress.iteration + 1, progress.seconds + taken
+        rows: list[Row] = [
+            {
+                "seed": seed,
+                "iteration": iteration,
+                **{name: values[index] for name, values in host.items()},
+                "transitions_per_second": round(float(steps[index]) / taken, 1),
+                "seconds": round(seconds, 3),
+            }
+            for index, seed in enumerate(self.run.seed_range)
+            if active[index]
+        ]
+        self._log.append(rows)
+        solved = _first_solved(self.run, progress.solved, rows)
+        self._progress = progress._replace(iteration=iteration, seconds=seconds, solved=solved)
+        return rows
+
+    def _save(self) -> None:
+        record = {**self._progress.to_dict(), "run": self.run.to_dict(), "version": tt.__version__}
+        self._checkpoints.save(self._progress.iteration, self._state, record)
+        self.saved = self._progress.iteration
+
+    def _policies(self) -> list[Policy]:
+        iterations = np.asarray(self._state.iteration)
+        return [
+            Policy(
+                f"seed {seed}",
+                self.run.config,
+                jax.tree.map(lambda x, index=index: x[index], self._state.params),
+                int(iterations[index]),
+            )
+            for index, seed in enumerate(self.run.seed_range)
+        ]
+
+    def _summary(self) -> dict[str, Any]:
+        seeds = zip(self.run.seed_range, self._state.episodes, self._progress.solved, strict=True)
+        return {
+            "env_id": self.run.config.env_id,
+            "iterations": self._progress.iteration,
+            "training_seconds": round(self._progress.seconds, 3),
+            "compile_seconds": round(self._progress.compile_seconds, 3),
+            "seeds": [
+                {
+                    "seed": seed,
+                    "episodes": int(episodes),
+                    "first_solved": first and dataclasses.asdict(first),
+                }
+                for seed, episodes, first in seeds
+            ],
+        }
+
+    def _introduce(self) -> None:
+        run, iteration = self.run, self._progress.iteration
+        count = num_parameters(self._state.params) // run.seeds
+        seeds = ", ".join(map(str, run.seed_range))
+        begin = f"from iteration {iteration}" if iteration else "from the start"
+        self._console.print(
+            f"{self.folder.path}: preset {run.preset}, {tt.task_set(run.config.env_id).id}, "
+            f"curiosity {run.config.curiosity}, seed {seeds}, {count:,} parameters, {begin}, "
+            f"on {jax.devices()[0].platform}",
+            soft_wrap=True,
+        )
+
+    def _say_where(self) -> None:
+        folder = self.folder
+        files = {
+            "settings": folder.config,
+            "metrics": folder.metrics,
+            "checkpoints": folder.checkpoints,
+            "learning curves": folder.curves,
+            "evaluation": folder.evaluation,
+            "summary": folder.summary,
+            "solved episode": folder.animation,
+        }
+        for name, path in files.items():
+            where = str(path) if path.exists() else "none: no episode is solved"
+            self._console.print(f"{name:>15}: {where}", soft_wrap=True, highlight=False)
+
+
+def make_advance(train: Train, num_seeds: int) -> Advance:
+    """One iteration of every seed and the greedy evaluation after it, as a pure function.
+
+    The function takes the states [S, ...] and bool[S], the seeds to advance; the others stay
+    as they are. It returns the states and metrics [S].
+    """
+    config = train.config
+    tasks = evaluation_tasks(
+        config.env_id, config.eval_episodes, config.num_features, config.max_steps
+    )
+
+    def advance(state: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
+        after, metrics = train.iterate(state)
+        outcome = evaluate(train.agent, after.params, train.env, tasks, config.chunk)
+        metrics = {
+            **metrics,
+            "episodes": after.episodes,
+            "transitions": after.transitions,
+            "steps": after.transitions - state.transitions,
+            "evaluation": jnp.mean(outcome.solved.astype(jnp.float32)),
+        }
+        after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
+        return after, metrics
+
+    def advance_one(
+        state: TrainState, active: jax.Array
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        first = jax.tree.map(lambda x: x[0], (state, active))
+        return jax.tree.map(lambda x: x[None], advance(*first))
+
+    # A vmapped loop has to carry on until the slowest of its elements is done.
+    return advance_one if num_seeds == 1 else jax.vmap(advance)
+
+
+def _first_solved(
+    run: Run, solved: Sequence[FirstSolved | None], rows: Sequence[Row]
+) -> tuple[FirstSolved | None, ...]:
+    """Adds the seeds that these rows show to be solved for the first time."""
+    share = run.config.stop_when_solved or 1.0
+    found = {row["seed"]: row for row in rows if row["evaluation"] >= share}
+    return tuple(
+        FirstSolved.of(found[seed]) if first is None and seed in found else first
+        for seed, first in zip(run.seed_range, solved, strict=True)
+    )
+
+
+def _wait(arrays: Any) -> None:
+    """Blocks until the arrays are there, but lets signals through."""
+    pause = threading.Event()
+    while not all(x.is_ready() for x in jax.tree.leaves(arrays)):
+        pause.wait(POLL_SECONDS)
