@@ -1,5 +1,8 @@
 """The trap-tube task of tool use as a functional, vectorised JAX gridworld."""
 
+import contextlib
+import importlib
+
 from trap_tube_jax.environment import (
     ArraySpec,
     Environment,
@@ -21,6 +24,10 @@ from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
 from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
+
+# Gymnasium's convention: importing a package registers its environments.
+with contextlib.suppress(ImportError):
+    importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
 
 __version__ = "0.1.0"
 

@@ -1,0 +1,236 @@
+"""The Gymnasium adapter under Gymnasium's own tools."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+
+gymnasium = pytest.importorskip("gymnasium")
+
+check_env = pytest.importorskip("gymnasium.utils.env_checker").check_env
+statistics = pytest.importorskip("gymnasium.wrappers.vector")
+AutoresetMode = gymnasium.vector.AutoresetMode
+SyncVectorEnv = gymnasium.vector.SyncVectorEnv
+
+from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv, TrapTubeVectorEnv, register
+
+pytestmark = pytest.mark.interop
+
+
+@pytest.mark.parametrize("name", [entry.id for entry in tt.PAPER_TASK_SETS])
+def test_the_environment_checker_finds_nothing(name):
+    env = gymnasium.make(f"trap_tube_jax/{name}", render_mode="rgb_array", cell_size=8)
+    check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize(
+    "options", [{"flat_actions": True}, {"render_mode": "ansi"}, {"num_features": 5}]
+)
+def test_the_environment_checker_finds_nothing_with_options(options):
+    check_env(gymnasium.make("trap_tube_jax/TrapTube-v0", **options).unwrapped)
+
+
+def test_a_seeded_episode_is_that_of_the_environment_below():
+    env = gymnasium.make("trap_tube_jax/PerceptualTrapTube-v0")
+    below = tt.AutoReset(tt.make("p"))
+    observation, _ = env.reset(seed=3)
+    state, timestep = jax.jit(below.reset)(jax.random.key(3))
+    np.testing.assert_array_equal(observation, timestep.observation)
+    for action in env.action_space.sample(), env.action_space.sample():
+        observation, reward, *flags, info = env.step(action)
+        state, timestep = jax.jit(below.step)(state, jnp.asarray(action))
+        np.testing.assert_array_equal(observation, timestep.observation)
+        assert (type(reward), [type(flag) for flag in flags], info) == (float, [bool, bool], {})
+    # Without a seed the sequence goes on; with the same seed it starts anew.
+    following, _ = env.reset()
+    np.testing.assert_array_equal(
+        env.reset(seed=3)[0], jax.jit(below.reset)(jax.random.key(3))[1].observation
+    )
+    np.testing.assert_array_equal(env.reset()[0], following)
+
+
+def test_flat_actions_are_grasp_and_move(easy_env):
+    flat, pair = TrapTubeEnv(easy_env, flat_actions=True), TrapTubeEnv(easy_env)
+    assert flat.action_space == gymnasium.spaces.Discrete(16)
+    assert pair.action_space == gymnasium.spaces.MultiDiscrete([4, 4])
+    for grasp, move in itertools.product(range(4), repeat=2):
+        flat.reset(seed=0)
+        pair.reset(seed=0)
+        one, other = flat.step(4 * grasp + move), pair.step([grasp, move])
+        np.testing.assert_array_equal(one[0], other[0])
+
+
+def test_an_episode_ends_with_success_or_at_the_limit(easy_env):
+    env = TrapTubeEnv(easy_env)
+    env.reset(seed=0)
+    assert env.step([0, 3])[1:4] == (0.0, False, False)
+    assert env.step([0, 1])[1:4] == (1.0, True, False)
+    env.reset()
+    ends = [env.step([0, 0])[2:4] for _ in range(easy_env.max_steps)]
+    assert ends == [(False, False)] * (easy_env.max_steps - 1) + [(False, True)]
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("flat", [False, True])
+def test_the_batch_equals_gymnasiums_own(mode, flat):
+    options = {"task_set": "p", "flat_actions": flat, "max_steps": 5}
+    mode = AutoresetMode(mode)
+    ours = TrapTubeVectorEnv(num_envs=3, autoreset_mode=mode, **options)
+    theirs = SyncVectorEnv([lambda: TrapTubeEnv(**options)] * 3, autoreset_mode=mode)
+    assert ours.action_space == theirs.action_space
+    assert ours.observation_space == theirs.observation_space
+    np.testing.assert_array_equal(ours.reset(seed=7)[0], theirs.reset(seed=7)[0])
+    ours.action_space.seed(1)
+    for _ in range(14):
+        actions = ours.action_space.sample()
+        assert_same(ours.step(actions), theirs.step(actions))
+    np.testing.assert_array_equal(ours.reset()[0], theirs.reset()[0])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_the_batch_equals_gymnasiums_own_when_tasks_are_solved(mode, easy_env):
+    mode = AutoresetMode(mode)
+    ours = TrapTubeVectorEnv(easy_env, 4, autoreset_mode=mode)
+    theirs = SyncVectorEnv([lambda: TrapTubeEnv(easy_env)] * 4, autoreset_mode=mode)
+    ours.reset(seed=0)
+    theirs.reset(seed=0)
+    ours.action_space.seed(0)
+    total = 0.0
+    for _ in range(60):
+        actions = ours.action_space.sample()
+        step = ours.step(actions)
+        assert_same(step, theirs.step(actions))
+        total += step[1].sum()
+    assert total >= 3
+
+
+def assert_same(ours, theirs):
+    for one, other in zip(ours[:4], theirs[:4], strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert one.dtype == other.dtype
+    assert ours[4].keys() == theirs[4].keys()
+    if "final_obs" in ours[4]:
+        assert ours[4]["final_info"] == theirs[4]["final_info"]
+        np.testing.assert_array_equal(ours[4]["_final_obs"], theirs[4]["_final_obs"])
+        np.testing.assert_array_equal(ours[4]["_final_info"], theirs[4]["_final_info"])
+        for one, other in zip(ours[4]["final_obs"], theirs[4]["final_obs"], strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_make_vec_makes_the_compiled_batch():
+    envs = gymnasium.make_vec(
+        "trap_tube_jax/TrapTube-v0", num_envs=2, autoreset_mode="SameStep", max_steps=3
+    )
+    assert isinstance(envs.unwrapped, TrapTubeVectorEnv)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert TrapTubeVectorEnv.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    assert set(envs.metadata["autoreset_modes"]) == {
+        AutoresetMode.NEXT_STEP,
+        AutoresetMode.SAME_STEP,
+    }
+
+
+def test_steps_do_not_loop_over_environments():
+    calls = []
+
+    def counted(key, state):
+        calls.append(key)
+        return state
+
+    envs = TrapTubeVectorEnv(tt.Environment((counted,), max_steps=2), num_envs=64)
+    envs.reset(seed=0)
+    envs.step(envs.action_space.sample())
+    traced = len(calls)
+    for _ in range(6):
+        envs.step(envs.action_space.sample())
+    assert len(calls) == traced < 16
+
+
+def test_episode_statistics_count_over_the_batch(easy_env):
+    envs = statistics.RecordEpisodeStatistics(
+        TrapTubeVectorEnv(easy_env, 2, autoreset_mode="SameStep")
+    )
+    envs.reset(seed=0)
+    envs.step([[0, 3], [0, 0]])
+    infos = envs.step([[0, 1], [0, 0]])[4]
+    assert infos["episode"]["r"].tolist() == [1.0, 0.0]
+    assert infos["episode"]["l"].tolist() == [2, 0]
+    for _ in range(4):
+        infos = envs.step([[0, 0], [0, 0]])[4]
+    assert infos["episode"]["l"].tolist() == [0, 6]
+
+
+def test_several_seeds():
+    envs = TrapTubeVectorEnv("p", 2)
+    pair = envs.reset(seed=[5, 9])[0]
+    np.testing.assert_array_equal(pair[1], envs.reset(seed=9)[0][0])
+    with pytest.raises(ValueError, match="one or 2 integers, got 3"):
+        envs.reset(seed=[1, 2, 3])
+
+
+def test_pictures(easy_env):
+    env = TrapTubeEnv(easy_env, render_mode="rgb_array", cell_size=8)
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), tt.render(easy_env.base, 8))
+    text = TrapTubeVectorEnv(easy_env, 2, render_mode="ansi")
+    text.reset(seed=0)
+    assert text.render() == (tt.render_ascii(easy_env.base),) * 2
+    batch = TrapTubeVectorEnv(easy_env, 2, render_mode="rgb_array", cell_size=8)
+    batch.reset(seed=0)
+    np.testing.assert_array_equal(np.stack(batch.render() or ())[1], env.render())
+
+
+def test_observations_are_the_callers_to_change(easy_env):
+    for env in TrapTubeEnv(easy_env), TrapTubeVectorEnv(easy_env, 2):
+        observation, _ = env.reset(seed=0)
+        observation[...] = 0
+        following = env.step(env.action_space.sample())[0]
+        assert following.flags.writeable
+        assert following.any()
+
+
+def test_own_task_sets_can_be_registered():
+    tt.register("GymnasiumTest-v0", (tt.perceptual,))
+    register()
+    env = gymnasium.make("trap_tube_jax/GymnasiumTest-v0")
+    assert env.reset(seed=0)[0].shape == (12, 12, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task_set": "nonesuch"}, "unknown task set 'nonesuch'; allowed"),
+        ({"render_mode": "human"}, "one of rgb_array, ansi, got 'human'"),
+        ({"num_envs": 0}, "num_envs must be an integer >= 1, got 0"),
+        ({"autoreset_mode": "Disabled"}, "one of NextStep, SameStep, got 'Disabled'"),
+        ({"task_set": tt.Environment(), "max_steps": 9}, "do not apply"),
+    ],
+)
+def test_refused_arguments(options, message):
+    with pytest.raises(ValueError, match=message):
+        TrapTubeVectorEnv(**options)
+
+
+@pytest.mark.parametrize("action", [16, -1, 1.5, [0, 1], "up"])
+def test_refused_actions(action, easy_env):
+    env = TrapTubeEnv(easy_env, flat_actions=True)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(0)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="actions must"):
+        env.step(action)
+
+
+def test_refused_batches_of_actions(easy_env):
+    envs = TrapTubeVectorEnv(easy_env, 2)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step([[0, 0], [0, 0]])
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(2, 2\), got int64 of shape \(2,\)"):
+        envs.step(np.array([0, 0]))
+    with pytest.raises(ValueError, match="lie in 0 to 3"):
+        envs.step([[0, 0], [0, 4]])
