@@ -1,0 +1,215 @@
+"""The gymnax adapter, under gymnax 0.x and 1.x and under agents written for it."""
+
+import copy
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+
+gymnax = pytest.importorskip("gymnax")
+spaces = gymnax.environments.spaces
+wrappers = pytest.importorskip("gymnax.wrappers")
+
+import purejaxrl_loop
+
+from trap_tube_jax.adapters import to_gymnax
+
+pytestmark = pytest.mark.interop
+needs_six_values = pytest.mark.skipif(
+    not to_gymnax.HAS_SIX_VALUES, reason="gymnax before 1.0 has neither six values nor registration"
+)
+
+
+@pytest.fixture(scope="module")
+def easy(easy_env):
+    return to_gymnax.make(easy_env)
+
+
+def test_spaces_are_gymnaxs_own(easy):
+    env, params = easy
+    assert isinstance(env, gymnax.environments.environment.Environment)
+    assert isinstance(env.action_space(params), spaces.Discrete)
+    assert env.action_space(params).n == env.num_actions == 16
+    box = env.observation_space(params)
+    assert isinstance(box, spaces.Box)
+    assert (box.low, box.high, box.shape, box.dtype) == (0, 255, (12, 12, 3), jnp.uint8)
+    observation, state = env.reset(jax.random.key(0), params)
+    assert (observation.shape, observation.dtype) == (box.shape, box.dtype)
+    assert env.state_space(params).contains(state)
+    assert env.get_obs(state).tolist() == observation.tolist()
+
+
+def test_parameters_are_hashable_with_the_limit_as_a_leaf(easy):
+    _, params = easy
+    assert jax.tree.leaves(params) == [6]
+    assert hash(params) == hash(params.replace(max_steps_in_episode=6))
+    assert isinstance(params, gymnax.EnvParams)
+    assert to_gymnax.make("TrapTube-v0")[1].max_steps_in_episode == 50
+
+
+def test_five_values_are_those_of_the_environment_below(easy, easy_env):
+    env, params = easy
+    observation, state = env.reset(jax.random.PRNGKey(0), params)
+    below, timestep = easy_env.reset(jax.random.key(0))
+    np.testing.assert_array_equal(observation, timestep.observation)
+    for index, success in ((3, False), (1, True)):
+        below, timestep = easy_env.step(below, tt.action_from_index(jnp.int32(index)))
+        observation, state, reward, done, info = env.step(jax.random.key(1), state, index, params)
+        assert (bool(done), float(reward)) == (success, float(timestep.reward))
+        assert bool(info["terminated"]) == success
+        assert float(info["discount"]) == 1.0 - success
+        assert {key: value.shape for key, value in info.items()} == dict.fromkeys(
+            ("discount", "terminated", "truncated"), ()
+        )
+    # The solved episode is over: what came back starts the next.
+    np.testing.assert_array_equal(observation, tt.observe(easy_env.base))
+    assert int(state.time) == 0
+
+
+def test_the_limit_changes_without_compiling_again(easy):
+    env, params = easy
+    key, ends = jax.random.key(0), []
+    for limit in (2, 3):
+        params = params.replace(max_steps_in_episode=limit)
+        _, state = env.reset(key, params)
+        for time in range(limit):
+            _, state, _, done, info = env.step(key, state, 0, params)
+            assert bool(done) == bool(info["truncated"]) == (time == limit - 1)
+            assert float(info["discount"]) == 1.0
+        ends.append(type(env).step._cache_size())
+    assert ends[0] == ends[1]
+
+
+def test_the_final_observation_on_request(easy_env):
+    env, params = to_gymnax.make(easy_env, final_observation=True)
+    key = jax.random.key(0)
+    _, state = env.reset(key, params)
+    _, state, *_ = env.step(key, state, 3, params)
+    observation, _, _, done, info = env.step(key, state, 1, params)
+    assert done
+    food = tt.base_palette()[5]
+    assert not (info["final_observation"] == food).all(axis=-1).any()
+    assert (observation == food).all(axis=-1).any()
+
+
+def test_a_finished_episode_stays_without_the_reset(easy):
+    env, params = easy
+    key = jax.random.key(0)
+    _, state = env.reset(key, params)
+    for index in (3, 1):
+        _, state, *_ = env.step_env(key, state, index, params)
+    assert env.is_terminal(state, params)
+    assert env.discount(state, params) == 0.0
+    _, after, reward, done, _ = env.step_env(key, state, 0, params)
+    assert (float(reward), bool(done)) == (0.0, True)
+    np.testing.assert_array_equal(after.agent, state.agent)
+
+
+def test_pairs_as_actions(easy, easy_env):
+    env, params = to_gymnax.make(easy_env, flat_actions=False)
+    assert isinstance(env.action_space(params), spaces.Tuple)
+    key = jax.random.key(0)
+    _, state = env.reset(key, params)
+    flat, _ = easy
+    for grasp, move in ((1, 3), (2, 0)):
+        pair = (jnp.int32(grasp), jnp.int32(move))
+        expected = flat.step(key, state, 4 * grasp + move, params)[0]
+        np.testing.assert_array_equal(env.step(key, state, pair, params)[0], expected)
+
+
+def test_batches_and_copies(easy):
+    env, params = easy
+    env = copy.deepcopy(env)
+    keys = jax.random.split(jax.random.key(0), 3)
+    _, states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
+    step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
+    observations, *_, done, _ = step(keys, states, jnp.array([0, 3, 9]), params)
+    assert observations.shape == (3, 12, 12, 3)
+    assert done.shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nonesuch", {}), "unknown task set 'nonesuch'; allowed"),
+        ((tt.Environment(), {"num_features": 2}), "does not apply"),
+    ],
+)
+def test_refused_arguments(arguments, message):
+    task_set, options = arguments
+    with pytest.raises(ValueError, match=message):
+        to_gymnax.make(task_set, **options)
+
+
+def test_purejaxrl_learns_the_easy_task(easy):
+    info = jax.jit(purejaxrl_loop.make_train(*easy))(jax.random.PRNGKey(0))
+    assert info["returned_episode"].shape == (24, 16, 32)
+    success = info["returned_episode_returns"].mean((1, 2))
+    assert success[0] < 0.6
+    assert success[-1] > 0.95
+
+
+def test_gymnaxs_own_wrappers(easy, easy_env):
+    env, params = easy
+    if to_gymnax.HAS_SIX_VALUES:
+        env = to_gymnax.SixValueTrapTube(easy_env)
+    env = wrappers.purerl.LogWrapper(wrappers.purerl.FlattenObservationWrapper(env))
+    key = jax.random.key(0)
+    observation, state = env.reset(key, params)
+    assert observation.shape == (432,)
+    for index in (3, 1):
+        observation, state, reward, *_, info = env.step(key, state, index, params)
+    assert (observation.shape, float(reward)) == ((432,), 1.0)
+    assert float(info["returned_episode_returns"]) == 1.0
+    assert int(info["returned_episode_lengths"]) == 2
+
+
+def test_stoa_steps_it(easy):
+    stoa = pytest.importorskip("stoa.env_adapters.gymnax").GymnaxToStoa(*easy)
+    state, timestep = stoa.reset(jax.random.PRNGKey(0))
+    for index in (3, 1):
+        state, timestep = stoa.step(state, jnp.int32(index))
+    assert float(timestep.reward) == 1.0
+    assert float(timestep.discount) == 0.0
+    assert stoa.observation_space().shape == (12, 12, 3)
+
+
+@needs_six_values
+@pytest.mark.parametrize("name", [entry.id for entry in tt.PAPER_TASK_SETS])
+def test_gymnax_makes_every_task_set(name):
+    env, params = gymnax.make(name)
+    assert isinstance(env, to_gymnax.SixValueTrapTube)
+    assert (env.name, params.max_steps_in_episode) == (name, 50)
+
+
+@needs_six_values
+def test_six_values_agree_with_five(easy, easy_env):
+    five, params = easy
+    six = to_gymnax.SixValueTrapTube(easy_env)
+    legacy = wrappers.LegacyStepAPIWrapper(six)
+    _, state = five.reset(jax.random.key(0), params)
+    for time, index in enumerate((0, 0, 0, 0, 0, 0, 3, 1)):
+        key = jax.random.key(time)
+        observation, following, reward, terminated, truncated, info = six.step(
+            key, state, index, params
+        )
+        assert (bool(terminated), bool(truncated)) == (time == 7, time == 5)
+        assert info["final_observation"].shape == (12, 12, 3)
+        expected = five.step(key, state, index, params)
+        for one, other in zip(
+            jax.tree.leaves((observation, following, reward)),
+            jax.tree.leaves(expected[:3]),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(one, other)
+        assert legacy.step(key, state, index, params)[3] == expected[3] == (time in (5, 7))
+        state = following
+
+
+@pytest.mark.skipif(to_gymnax.HAS_SIX_VALUES, reason="gymnax 1.0 registers")
+def test_registration_needs_gymnax_1():
+    with pytest.raises(ImportError, match=r"to_gymnax.make instead"):
+        to_gymnax.register()

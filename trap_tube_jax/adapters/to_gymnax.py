@@ -1,0 +1,272 @@
+"""The task sets as gymnax environments, with the step of either generation.
+
+gymnax 0.x steps return five values, which PureJaxRL, rejax and Stoa expect whatever
+gymnax is installed: `make` and `FiveValueTrapTube`. gymnax 1.0 steps return six:
+`SixValueTrapTube`, which importing this module registers.
+
+    env, params = to_gymnax.make("TrapTube-v0")
+    observation, state, reward, done, info = env.step(key, state, action, params)
+
+    env, params = gymnax.make("TrapTube-v0")    # gymnax >= 1.0
+    observation, state, reward, terminated, truncated, info = env.step(...)
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from trap_tube_jax.environment import Environment, action_from_index
+from trap_tube_jax.objects import (
+    BOARD_SIZE,
+    MAX_STEPS,
+    MAX_TOOL_LENGTH,
+    NUM_ACTIONS,
+    NUM_DIRECTIONS,
+    NUM_OBJECTS,
+    STATIC_OBJECTS,
+)
+from trap_tube_jax.observation import observe
+from trap_tube_jax.registry import make as make_environment
+from trap_tube_jax.registry import registered_ids
+from trap_tube_jax.state import State, TimeStep
+
+try:
+    import gymnax  # pyright: ignore[reportMissingImports]
+    from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
+except ImportError as error:
+    raise ImportError(
+        "trap_tube_jax.adapters.to_gymnax needs gymnax: pip install 'trap-tube-jax[interop]'"
+    ) from error
+
+HAS_SIX_VALUES = hasattr(gymnax, "register")  # gymnax >= 1.0
+
+
+@struct.dataclass
+class EnvParams(environment.EnvParams):
+    """What may differ between calls without compiling again.
+
+    Attributes:
+      max_steps_in_episode: i32[], steps after which an unsolved episode is truncated.
+    """
+
+    max_steps_in_episode: int | jax.Array = MAX_STEPS
+
+
+class _TrapTube(environment.Environment):
+    """What both generations share."""
+
+    def __init__(
+        self,
+        task_set: str | Environment = "TrapTube-v0",
+        *,
+        flat_actions: bool = True,
+        num_features: int = 3,
+    ):
+        """Checks its arguments.
+
+        Args:
+          task_set: a registered id or short name, or an `Environment` of your own, which
+            brings its own number of features and, as the default parameter, step limit.
+          flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
+            `Tuple((Discrete(4), Discrete(4)))` or i32[2].
+          num_features: N, the feature channels of the observation.
+
+        Raises:
+          ValueError: naming the value and what is allowed.
+        """
+        super().__init__()
+        if not isinstance(task_set, Environment):
+            self._name = task_set
+            task_set = make_environment(task_set, num_features=num_features)
+        elif num_features != 3:
+            raise ValueError(
+                f"num_features={num_features} does not apply to an Environment of your own; "
+                "give it the base state you mean"
+            )
+        else:
+            self._name = repr(task_set)
+        self._default_max_steps = task_set.max_steps
+        # The limit in the parameters replaces the environment's own.
+        self._env = Environment(
+            task_set.transfers, base=task_set.base, max_steps=np.iinfo(np.int32).max
+        )
+        self.flat_actions = flat_actions
+
+    @property
+    def default_params(self) -> EnvParams:
+        """The step limit of the paper, or that of the `Environment` given."""
+        return EnvParams(max_steps_in_episode=self._default_max_steps)
+
+    @property
+    def name(self) -> str:
+        """The task set's name."""
+        return self._name
+
+    @property
+    def num_actions(self) -> int:
+        """16."""
+        return NUM_ACTIONS
+
+    def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:
+        """Draws a task: (observation u8[12, 12, N], state)."""
+        del params
+        state, timestep = self._env.reset(key)
+        return timestep.observation, state
+
+    def get_obs(self, state: State, params: Any = None, key: Any = None) -> jax.Array:
+        """The observation u8[12, 12, N]."""
+        del params, key
+        return observe(state)
+
+    def is_terminated(self, state: State, params: EnvParams) -> jax.Array:
+        """bool[]: the task is solved."""
+        del params
+        return state.terminated
+
+    def is_truncated(self, state: State, params: EnvParams) -> jax.Array:
+        """bool[]: the step limit is reached without success."""
+        return ~state.terminated & (state.time >= params.max_steps_in_episode)
+
+    def action_space(self, params: EnvParams | None = None) -> Any:
+        """`Discrete(16)`, or two `Discrete(4)`."""
+        del params
+        if self.flat_actions:
+            return spaces.Discrete(NUM_ACTIONS)
+        return spaces.Tuple((spaces.Discrete(NUM_DIRECTIONS), spaces.Discrete(NUM_DIRECTIONS)))
+
+    def observation_space(self, params: EnvParams | None = None) -> Any:
+        """`Box(0, 255, (12, 12, N), uint8)`."""
+        del params
+        return spaces.Box(0, 255, self._env.observation_spec.shape, jnp.uint8)
+
+    def state_space(self, params: EnvParams) -> Any:
+        """A `Dict` with the fields of `trap_tube_jax.State`."""
+        cell = spaces.Box(0, BOARD_SIZE - 1, (2,), jnp.int32)
+        flag = spaces.Box(0, 1, (), jnp.bool_)
+        return spaces.Dict(
+            {
+                "board": spaces.Box(0, max(STATIC_OBJECTS), (BOARD_SIZE, BOARD_SIZE), jnp.uint8),
+                "palette": spaces.Box(0, 255, (NUM_OBJECTS, self._env.num_features), jnp.uint8),
+                "agent": cell,
+                "tool": cell,
+                "tool_extent": spaces.Box(1, MAX_TOOL_LENGTH, (2,), jnp.int32),
+                "food": cell,
+                "time": spaces.Box(0, params.max_steps_in_episode, (), jnp.int32),
+                "terminated": flag,
+                "truncated": flag,
+            }
+        )
+
+    def _transition(self, state: State, action: Any, params: EnvParams) -> tuple[State, TimeStep]:
+        """The environment's step under the step limit in `params`."""
+        action = jnp.asarray(action)
+        state, timestep = self._env.step(
+            state, action_from_index(action) if self.flat_actions else action
+        )
+        truncated = self.is_truncated(state, params)
+        return state.replace(truncated=truncated), timestep.replace(truncated=truncated)
+
+
+class FiveValueTrapTube(_TrapTube):
+    """The environment of gymnax 0.x: (observation, state, reward, done, info).
+
+    `done` is true for either end of an episode, and the state then returned starts the
+    next. `info` holds scalars: discount, terminated, truncated.
+    """
+
+    def __init__(
+        self,
+        task_set: str | Environment = "TrapTube-v0",
+        *,
+        flat_actions: bool = True,
+        num_features: int = 3,
+        final_observation: bool = False,
+    ):
+        """See `SixValueTrapTube`; `final_observation` adds the observation before any
+        reset to `info`.
+        """
+        super().__init__(task_set, flat_actions=flat_actions, num_features=num_features)
+        self.final_observation = final_observation
+
+    @functools.partial(jax.jit, static_argnames=("self",))
+    def step(
+        self, key: jax.Array, state: State, action: Any, params: EnvParams | None = None
+    ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Takes one action and, if that ended the episode, draws the next task."""
+        params = self.default_params if params is None else params
+        step_key, reset_key = jax.random.split(key)
+        stepped = self.step_env(step_key, state, action, params)
+        observation, state, reward, done, info = stepped
+        if self.final_observation:
+            info["final_observation"] = observation
+        observation, state = jax.tree.map(
+            lambda new, old: jnp.where(done, new, old),
+            self.reset_env(reset_key, params),
+            (observation, state),
+        )
+        return observation, state, reward, done, info
+
+    def step_env(
+        self, key: jax.Array, state: State, action: Any, params: EnvParams
+    ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Takes one action and stays at the end of the episode, if it is one."""
+        del key
+        state, timestep = self._transition(state, action, params)
+        info = {
+            "discount": timestep.discount,
+            "terminated": timestep.terminated,
+            "truncated": timestep.truncated,
+        }
+        return timestep.observation, state, timestep.reward, timestep.done, info
+
+    def is_terminal(self, state: State, params: EnvParams) -> jax.Array:
+        """bool[]: the episode is over, for either reason."""
+        return self.is_terminated(state, params) | self.is_truncated(state, params)
+
+    def discount(self, state: State, params: EnvParams) -> jax.Array:
+        """f32[]: 0 where the task is solved, else 1."""
+        return 1.0 - self.is_terminated(state, params).astype(jnp.float32)
+
+
+class SixValueTrapTube(_TrapTube):
+    """The environment of gymnax >= 1.0, whose base class steps and resets it.
+
+    (observation, state, reward, terminated, truncated, info); `info` holds discount,
+    terminated, truncated, and final_observation, the observation before any reset.
+    """
+
+    def step_env(
+        self, key: jax.Array, state: State, action: Any, params: EnvParams
+    ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Takes one action: (observation, state, reward, terminated, info)."""
+        del key
+        state, timestep = self._transition(state, action, params)
+        info = {"discount": timestep.discount}
+        return timestep.observation, state, timestep.reward, timestep.terminated, info
+
+
+def make(task_set: str | Environment = "TrapTube-v0", **options: Any) -> tuple[Any, EnvParams]:
+    """A five-value environment and its default parameters. See `FiveValueTrapTube`."""
+    env = FiveValueTrapTube(task_set, **options)
+    return env, env.default_params
+
+
+def register() -> None:
+    """Registers every task set that `trap_tube_jax.make` knows and gymnax does not.
+
+    Raises:
+      ImportError: the installed gymnax is older than 1.0 and has no registration.
+    """
+    if not HAS_SIX_VALUES:
+        raise ImportError("gymnax before 1.0 has no registration; use to_gymnax.make instead")
+    for name in registered_ids():
+        if name not in gymnax.registered_envs:
+            gymnax.register(name, functools.partial(SixValueTrapTube, name))
+
+
+if HAS_SIX_VALUES:
+    register()
