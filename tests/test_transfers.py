@@ -300,6 +300,18 @@ def test_symbolic_on_perceptual_tasks(drawn):
     assert_fits(counts, np.full((layouts, 5), 0.2 / layouts))
 
 
+def test_symbolic_cannot_be_seen(drawn):
+    """Cells and colours change roles together, so that every cell keeps its colour."""
+
+    def before_and_after(key, state):
+        return tt.observe(state), tt.observe(tt.symbolic(key, state))
+
+    keys = jax.random.split(jax.random.key(12), 4_096)
+    starts = jax.tree.map(lambda leaf: leaf[:4_096], drawn)
+    before, after = jax.jit(jax.vmap(before_and_after))(keys, starts)
+    np.testing.assert_array_equal(before, after)
+
+
 def test_symbolic_leaves_alone_what_could_not_be_a_tool():
     """On own boards: an object of no cell, of five, or whose bar would leave the board."""
     start = tt.State.from_ascii(
