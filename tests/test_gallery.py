@@ -48,17 +48,6 @@ def test_the_sheet_refuses(options, message):
         gallery.contact_sheet(**options)
 
 
-def test_episode_frames_show_every_state_and_grasp():
-    state = tt.base_state()
-    frames = gallery.episode_frames(state, np.array([[0, 0], [0, 3]]), 8)
-    assert frames.shape == (3, 96, 96, 3)
-    np.testing.assert_array_equal(frames[0], tt.render(state, 8, grasp=0))
-    moved = state.replace(agent=state.agent.at[0].add(-1))
-    np.testing.assert_array_equal(frames[1], tt.render(moved, 8, grasp=0))
-    after = moved.replace(agent=moved.agent.at[1].add(1), tool=moved.tool.at[1].add(1))
-    np.testing.assert_array_equal(frames[2], tt.render(after, 8))
-
-
 def test_a_solved_episode_ends_on_the_food():
     frames = gallery.solved_episode(tt.base_state(), 1)
     assert len(frames) == 12

@@ -130,6 +130,18 @@ def test_render_object_refuses_unknown_codes():
         rendering.render_object(8)
 
 
+def test_episode_frames_show_every_state_and_grasp():
+    state = tt.base_state()
+    frames = rendering.episode_frames(state, np.array([[0, 0], [0, 3]]), 8)
+    assert frames.shape == (3, 96, 96, 3)
+    np.testing.assert_array_equal(frames[0], tt.render(state, 8, grasp=0))
+    moved = state.replace(agent=state.agent.at[0].add(-1))
+    np.testing.assert_array_equal(frames[1], tt.render(moved, 8, grasp=0))
+    after = moved.replace(agent=moved.agent.at[1].add(1), tool=moved.tool.at[1].add(1))
+    np.testing.assert_array_equal(frames[2], tt.render(after, 8))
+    assert len(rendering.episode_frames(state, [], 8)) == 1
+
+
 def test_gif_holds_the_frames(tmp_path):
     state = tt.base_state()
     agents = jnp.array([[9, 1], [9, 2], [9, 3]])

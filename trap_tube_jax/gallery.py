@@ -9,17 +9,14 @@ import sys
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
-from jax.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
-from trap_tube_jax.dynamics import step
 from trap_tube_jax.objects import BOARD_SIZE, NUM_OBJECTS, OBJECT_NAMES
 from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
-from trap_tube_jax.rendering import render, render_object, save_gif
+from trap_tube_jax.rendering import episode_frames, render, render_object, save_gif
 from trap_tube_jax.solver import solve
 from trap_tube_jax.state import State
 from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
@@ -104,25 +101,6 @@ def solved_episode(state: State, cell_size: int = 20) -> np.ndarray:
     if not plan.solvable:
         raise ValueError("the task has no solution, so there is no episode to show")
     return episode_frames(state, plan.actions, cell_size)
-
-
-def episode_frames(state: State, actions: ArrayLike, cell_size: int = 20) -> np.ndarray:
-    """The pictures of an episode: u8[T + 1, 12 s, 12 s, 3].
-
-    Each shows the board before an action with the hand in that action's grasp
-    direction; the last shows where the actions lead, without a hand.
-
-    Args:
-      state: one unbatched state, at time 0.
-      actions: i32[T, 2], (grasp, move) pairs.
-      cell_size: s >= 1, pixels per cell and side.
-    """
-
-    def body(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-        return step(state, action), render(state, cell_size, grasp=action[0])
-
-    last, frames = jax.lax.scan(body, state, jnp.asarray(actions, jnp.int32))
-    return np.concatenate([frames, render(last, cell_size)[None]])
 
 
 def main(arguments: Arguments) -> None:

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from trap_tube_jax.dynamics import step
 from trap_tube_jax.geometry import bar_covers, unit_vector
 from trap_tube_jax.objects import (
     AGENT,
@@ -95,6 +96,26 @@ def render_object(code: int, cell_size: int = 32) -> np.ndarray:
     color = np.broadcast_to(BASE_COLORS[code], (cell_size, cell_size, 3)).astype(np.float32)
     sign = _signs(int(cell_size))[code]
     return np.asarray(_to_pixels(_blend(color, _ink(color), sign * SIGN_OPACITY)))
+
+
+def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarray:
+    """The pictures of an episode: u8[T + 1, 12 s, 12 s, 3]. Host side.
+
+    Each shows the board before an action, with the hand in that action's grasp
+    direction; the last shows where the actions lead, without a hand.
+
+    Args:
+      state: one unbatched state, unfinished.
+      actions: i32[T, 2], (grasp, move) pairs; T may be 0.
+      cell_size: s >= 1, pixels per cell and side.
+    """
+
+    def body(state: State, action: jax.Array) -> tuple[State, jax.Array]:
+        return step(state, action), render(state, cell_size, grasp=action[0])
+
+    actions = np.asarray(actions, np.int32).reshape(-1, 2)
+    last, frames = jax.lax.scan(body, state, actions)
+    return np.concatenate([frames, render(last, cell_size)[None]])
 
 
 def save_gif(
