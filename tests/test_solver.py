@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
-from trap_tube_jax.objects import EXIT, TOOL, TRAP, TUBE1, TUBE2
+from trap_tube_jax.objects import EXIT, MAX_STEPS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.solver.__main__ import main
 from trap_tube_jax.solver.distance import count_reachable
 from trap_tube_jax.solver.search import take
@@ -145,7 +145,7 @@ def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
     plans = tt.solve_batch(states)
     assert plans.solvable.all()
     assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(40)
-    assert plans.length.max() <= 41
+    assert plans.length.max() <= MAX_STEPS
     assert_paid_exactly_at_the_end(states, plans)
 
 
