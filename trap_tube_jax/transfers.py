@@ -12,14 +12,17 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
-from trap_tube_jax.geometry import COLUMNS, ROWS, bar_cells, cell_of
+from trap_tube_jax.geometry import bar_cells, cell_of, is_on_board
+from trap_tube_jax.layouts import MAX_FOOD_CELLS, NUM_ASSIGNMENTS, NUM_FRAMES, layout_tables
 from trap_tube_jax.objects import (
+    AGENT,
     BOARD_SIZE,
     EXIT,
+    FOOD,
     GROUND,
     MAX_TOOL_LENGTH,
+    NUM_OBJECTS,
     TOOL,
     TRAP,
     TUBE1,
@@ -30,13 +33,8 @@ from trap_tube_jax.state import State
 Transfer = Callable[[jax.Array, State], State]
 
 SYMBOLIC_OBJECTS = np.array([TOOL, TUBE1, TUBE2, TRAP, EXIT], np.int32)
-TUBE_SIDES = (3, 4)  # shortest and longest height and width of the tube
-CENTER_FIRST, CENTER_LAST = 4, 8  # rows and columns of the central block, both included
-# bool[12, 12]: the cells outside the central block.
-AROUND_CENTER = ~(
-    ((ROWS >= CENTER_FIRST) & (ROWS <= CENTER_LAST))
-    & ((COLUMNS >= CENTER_FIRST) & (COLUMNS <= CENTER_LAST))
-)
+# Row of the resampled features per object code; agent and food take none.
+POINT_OF_OBJECT = np.array([4, 2, 3, 1, 1, 0, 0, 0], np.int32)
 
 
 def compose(*transfers: Transfer) -> Transfer:
@@ -55,6 +53,8 @@ def compose(*transfers: Transfer) -> Transfer:
     def composed(key: jax.Array, state: State) -> State:
         for index, transfer in enumerate(transfers):
             state = transfer(jax.random.fold_in(key, index), state)
+            # Without it XLA fuses a draw into each of its uses and repeats it there.
+            state = jax.lax.optimization_barrier(state)
         return state
 
     return composed
@@ -63,7 +63,9 @@ def compose(*transfers: Transfer) -> Transfer:
 def perceptual(key: jax.Array, state: State) -> State:
     """F_P: resamples tube, openings, food, tool and agent; keeps the palette.
 
-    Every choice is uniform over what specification section 5 leaves to it.
+    Every choice is uniform over what specification section 5 leaves to it; `layouts`
+    enumerates that. A number below n is the remainder of 32 random bits, off the uniform
+    distribution by less than n / 2**32.
 
     Args:
       key: PRNG key.
@@ -72,15 +74,17 @@ def perceptual(key: jax.Array, state: State) -> State:
     Returns:
       A state with a new layout.
     """
-    outline_key, board_key, food_key, bar_key, agent_key = jax.random.split(key, 5)
-    outline = _sample_outline(outline_key)
-    tool, extent, candidates = _sample_tool(bar_key, outline)
+    tables = jax.tree.map(jnp.asarray, layout_tables())
+    layout, food, tool, agent = jax.random.bits(key, (4,), jnp.uint32)
+    frame, assignment = layout % NUM_FRAMES, layout // NUM_FRAMES % NUM_ASSIGNMENTS
+    tool %= tables.num_tools[frame]
+    agent %= tables.num_agents[frame, tool]
     return state.replace(
-        board=_sample_board(board_key, outline),
-        food=_uniform_cell(food_key, outline.inside(margin=-1)),
-        tool=tool,
-        tool_extent=extent,
-        agent=_uniform_cell(agent_key, ~candidates & ~bar_cells(tool, extent) & AROUND_CENTER),
+        board=tables.board[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
+        food=cell_of(tables.food[frame, food % MAX_FOOD_CELLS]),
+        tool=cell_of(tables.tool[frame, tool]),
+        tool_extent=tables.extent[frame],
+        agent=cell_of(tables.agent[frame, tool, agent]),
     )
 
 
@@ -100,13 +104,12 @@ def structural(key: jax.Array, state: State) -> State:
     """
     num_features = state.palette.shape[-1]
     normal = jax.random.normal(key, (5, num_features))
-    # On the line a quotient in float32 could miss -1 and 1, which are all there is.
-    length = jnp.linalg.norm(normal, axis=-1, keepdims=True)
-    points = normal / length if num_features > 1 else jnp.sign(normal)
+    points = normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
+    if num_features == 1:  # -1 and 1, which the rounded quotient may miss
+        points = jnp.where(normal < 0, -1.0, 1.0)
     features = jnp.floor((points + 1) / 2 * 255).astype(jnp.uint8)
-    categories = np.array([TOOL, TUBE1, TUBE2, TRAP, EXIT, GROUND])
-    points_of = np.array([0, 1, 1, 2, 3, 4])
-    return state.replace(palette=state.palette.at[categories].set(features[points_of]))
+    keeps = np.isin(np.arange(NUM_OBJECTS), (AGENT, FOOD))[:, None]
+    return state.replace(palette=jnp.where(keeps, state.palette, features[POINT_OF_OBJECT]))
 
 
 def symbolic(key: jax.Array, state: State) -> State:
@@ -136,88 +139,25 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
       state: one unbatched state.
       code: i32[], one of `SYMBOLIC_OBJECTS`.
     """
-    flat = state.board.reshape(-1) == code
-    length = jnp.sum(flat, dtype=jnp.int32)
-    first = jnp.argmax(flat).astype(jnp.int32)
-    second = jnp.argmax(flat & (jnp.arange(flat.size) != first)).astype(jnp.int32)
+    cells = np.arange(BOARD_SIZE**2, dtype=np.int32)
+    is_object = state.board.reshape(-1) == code
+    length = jnp.sum(is_object, dtype=jnp.int32)
+    first = jnp.min(cells, where=is_object, initial=cells[-1])
+    second = jnp.min(cells, where=is_object & (cells > first), initial=cells[-1])
     corner = cell_of(first)
     horizontal = (length > 1) & (second // BOARD_SIZE == first // BOARD_SIZE)
     extent = jnp.where(horizontal, jnp.stack([1, length]), jnp.stack([length, 1]))
 
-    swaps = (length >= 1) & (length <= MAX_TOOL_LENGTH) & jnp.all(corner + extent <= BOARD_SIZE)
+    fits = is_on_board(corner + extent - 1)
+    swaps = (length >= 1) & (length <= MAX_TOOL_LENGTH) & fits
     old_tool = bar_cells(state.tool, state.tool_extent)
     board = jnp.where(state.board == code, jnp.uint8(GROUND), state.board)
     board = jnp.where(old_tool, code.astype(jnp.uint8), board)
-    colors = state.palette[jnp.stack([code, jnp.int32(TOOL)])]
-    palette = state.palette.at[jnp.stack([jnp.int32(TOOL), code])].set(colors)
+    objects = np.arange(NUM_OBJECTS)
+    looks_of = jnp.where(objects == TOOL, code, jnp.where(objects == code, TOOL, objects))
     return state.replace(
         board=jnp.where(swaps, board, state.board),
-        palette=jnp.where(swaps, palette, state.palette),
+        palette=jnp.where(swaps, state.palette[looks_of], state.palette),
         tool=jnp.where(swaps, corner, state.tool),
         tool_extent=jnp.where(swaps, extent, state.tool_extent),
     )
-
-
-class _Outline(struct.PyTreeNode):
-    """The tube's bounding box.
-
-    Attributes:
-      corner: i32[2], its top-left cell.
-      size: i32[2], its (height, width).
-    """
-
-    corner: jax.Array
-    size: jax.Array
-
-    def inside(self, margin: int = 0) -> jax.Array:
-        """bool[12, 12]: the cells of the box grown by `margin` on each side."""
-        return bar_cells(self.corner - margin, self.size + 2 * margin)
-
-
-def _sample_outline(key: jax.Array) -> _Outline:
-    size_key, corner_key = jax.random.split(key)
-    size = jax.random.randint(size_key, (2,), TUBE_SIDES[0], TUBE_SIDES[1] + 1)
-    corner = jax.random.randint(corner_key, (2,), CENTER_FIRST, CENTER_LAST - size + 1)
-    return _Outline(corner, size)
-
-
-def _sample_board(key: jax.Array, outline: _Outline) -> jax.Array:
-    """u8[12, 12]: two tubes on opposite sides, trap and exit in the other two, less corners."""
-    axis, swap_openings, swap_tubes = jax.random.bernoulli(key, shape=(3,))
-    # (depth, breadth) counts along and across the openings' axis, which is west-east or
-    # north-south; the openings are the first and last cells along it, the tubes across it.
-    row, column = ROWS - outline.corner[0], COLUMNS - outline.corner[1]
-    breadth, depth = jnp.where(axis, row, column), jnp.where(axis, column, row)
-    last = jnp.where(axis, outline.size, outline.size[::-1]) - 1
-    tube = (breadth == 0) | (breadth == last[0])
-    opening = (depth == 0) | (depth == last[1])
-    tube_code = jnp.where((breadth == 0) ^ swap_tubes, TUBE1, TUBE2)
-    opening_code = jnp.where((depth == 0) ^ swap_openings, TRAP, EXIT)
-    board = jnp.where(tube, tube_code, jnp.where(opening, opening_code, GROUND))
-    return jnp.where(outline.inside(), board, GROUND).astype(jnp.uint8)
-
-
-def _sample_tool(key: jax.Array, outline: _Outline) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The tool's corner i32[2] and extent i32[2], and its candidate corners bool[12, 12]."""
-    direction_key, corner_key = jax.random.split(key)
-    along = jnp.where(
-        jax.random.bernoulli(direction_key), np.array([1, 0], np.int32), np.array([0, 1], np.int32)
-    )
-    length = jnp.sum(outline.size * along)
-    # Along itself the bar must end before the last row or column, and start `length` before
-    # the tube or behind it; across, it keeps two cells away.
-    corners = BOARD_SIZE - length * along
-    fits = (corners[0] > ROWS) & (corners[1] > COLUMNS)
-    before = jnp.where(along == 1, length, 2)
-    behind = jnp.where(along == 1, 0, 2)
-    near = bar_cells(outline.corner - before, outline.size + before + behind)
-    candidates = fits & ~near
-    extent = jnp.where(along == 1, length, 1)
-    return _uniform_cell(corner_key, candidates), extent, candidates
-
-
-def _uniform_cell(key: jax.Array, allowed: jax.Array) -> jax.Array:
-    """i32[2]: a cell drawn uniformly from those true in `allowed` bool[12, 12], not empty."""
-    rank = jnp.cumsum(allowed.reshape(-1), dtype=jnp.int32)
-    chosen = jnp.argmax(rank > jax.random.randint(key, (), 0, rank[-1]))
-    return cell_of(chosen)

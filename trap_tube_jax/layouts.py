@@ -1,0 +1,138 @@
+"""Every layout of the perceptual transfer, enumerated once as tables.
+
+The transfer's support is small and finite, so it is written out in NumPy, cell by cell as
+the specification words it; a draw is then a few integers and as many look-ups. Counting
+out cells on masks within each draw is an order of magnitude slower under vmap on a CPU.
+
+Source: specification section 5.
+"""
+
+import functools
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from trap_tube_jax.geometry import COLUMNS, ROWS
+from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND, TRAP, TUBE1, TUBE2
+
+CENTER_FIRST, CENTER_LAST = 4, 8  # rows and columns of the central block, both included
+NUM_FRAMES = 32
+NUM_ASSIGNMENTS = 8
+MAX_FOOD_CELLS = 4
+
+# (length of a side of the tube, its first row or column), equally likely: the length is
+# uniform over 3 and 4 first, then the place over those that fit into 4 to 8.
+_SIDES = ((3, 4), (3, 5), (4, 4), (4, 4))
+
+
+class LayoutTables(NamedTuple):
+    """The outcomes of every choice, equally likely along their last axis unless counted.
+
+    A frame is a tube's outline with a direction of the tool; an assignment says which of
+    the outline's sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143.
+
+    Attributes:
+      board: u8[32, 8, 144], the static objects per frame and assignment.
+      food: i32[32, 4], the cells inside the tube, repeated to fill the row.
+      extent: i32[32, 2], the tool's (rows, columns).
+      tool: u8[32, T], the candidates of the tool's top-left cell, then padding.
+      num_tools: u32[32], how many candidates there are.
+      agent: u8[32, T, A], the agent's cells for each candidate, then padding.
+      num_agents: u32[32, T], how many cells there are; 1 in the padding.
+    """
+
+    board: np.ndarray
+    food: np.ndarray
+    extent: np.ndarray
+    tool: np.ndarray
+    num_tools: np.ndarray
+    agent: np.ndarray
+    num_agents: np.ndarray
+
+
+@functools.cache
+def layout_tables() -> LayoutTables:
+    """Builds the tables, at the first draw and once per process."""
+    frames = [
+        (height, width, top, left, vertical)
+        for (height, top), (width, left) in itertools.product(_SIDES, _SIDES)
+        for vertical in (True, False)
+    ]
+    tools = [_tool_corners(*frame) for frame in frames]
+    agents = [
+        [_agent_cells(corners, _extent(*frame), int(corner)) for corner in np.flatnonzero(corners)]
+        for frame, corners in zip(frames, tools, strict=True)
+    ]
+    tool, num_tools = _padded([np.flatnonzero(corners) for corners in tools])
+    agent, num_agents = zip(*(_padded(rows, len(tool[0])) for rows in agents), strict=True)
+    longest = max(rows.shape[1] for rows in agent)
+    return LayoutTables(
+        board=np.stack([_boards(*frame[:4]) for frame in frames]),
+        food=np.stack([_food_cells(*frame[:4]) for frame in frames]),
+        extent=np.array([_extent(*frame) for frame in frames], np.int32),
+        tool=tool,
+        num_tools=num_tools,
+        agent=np.stack([np.pad(rows, ((0, 0), (0, longest - rows.shape[1]))) for rows in agent]),
+        num_agents=np.stack(num_agents),
+    )
+
+
+def _box(top: int, left: int, bottom: int, right: int) -> np.ndarray:
+    """bool[12, 12]: the cells of the rows `top` to `bottom`, columns `left` to `right`."""
+    return ((top <= ROWS) & (bottom >= ROWS)) & ((left <= COLUMNS) & (right >= COLUMNS))
+
+
+def _boards(height: int, width: int, top: int, left: int) -> np.ndarray:
+    """u8[8, 144]: tubes on two opposite sides, the openings within the other two."""
+    bottom, right = top + height - 1, left + width - 1
+    rows = _box(top, left, top, right), _box(bottom, left, bottom, right)
+    columns = _box(top, left, bottom, left), _box(top, right, bottom, right)
+    boards = []
+    for tubes, openings in ((rows, columns), (columns, rows)):
+        for trap, exit in (openings, openings[::-1]):
+            for tube1, tube2 in (tubes, tubes[::-1]):
+                board = np.full((BOARD_SIZE, BOARD_SIZE), GROUND, np.uint8)
+                # The tubes keep the corners, so they are laid last.
+                for cells, code in ((trap, TRAP), (exit, EXIT), (tube1, TUBE1), (tube2, TUBE2)):
+                    board[cells] = code
+                boards.append(board.reshape(-1))
+    return np.stack(boards)
+
+
+def _food_cells(height: int, width: int, top: int, left: int) -> np.ndarray:
+    """i32[4]: the 1, 2 or 4 cells inside the tube, each equally often."""
+    inside = _box(top + 1, left + 1, top + height - 2, left + width - 2)
+    return np.resize(np.flatnonzero(inside), MAX_FOOD_CELLS).astype(np.int32)
+
+
+def _extent(height: int, width: int, top: int, left: int, vertical: bool) -> tuple[int, int]:
+    return (height, 1) if vertical else (1, width)
+
+
+def _tool_corners(height: int, width: int, top: int, left: int, vertical: bool) -> np.ndarray:
+    """bool[12, 12]: the candidates of the tool's top-left cell."""
+    if vertical:
+        fits = _box(0, 0, BOARD_SIZE - 1 - height, BOARD_SIZE - 1)
+        return fits & ~_box(top - height, left - 2, top + height - 1, left + width + 1)
+    fits = _box(0, 0, BOARD_SIZE - 1, BOARD_SIZE - 1 - width)
+    return fits & ~_box(top - 2, left - width, top + height + 1, left + width - 1)
+
+
+def _agent_cells(tool_corners: np.ndarray, extent: tuple[int, int], corner: int) -> np.ndarray:
+    """i64[A]: the agent's cells for a tool whose top-left cell is the flat index `corner`."""
+    row, column = divmod(corner, BOARD_SIZE)
+    center = _box(CENTER_FIRST, CENTER_FIRST, CENTER_LAST, CENTER_LAST)
+    tool = _box(row, column, row + extent[0] - 1, column + extent[1] - 1)
+    return np.flatnonzero(~center & ~tool_corners & ~tool)
+
+
+def _padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of cells as one table u8, and their lengths u32; 1 where a row is missing."""
+    num_rows = num_rows or len(rows)
+    table = np.zeros((num_rows, max(map(len, rows))), np.uint8)
+    lengths = np.ones(num_rows, np.uint32)
+    for index, row in enumerate(rows):
+        table[index, : len(row)] = row
+        lengths[index] = len(row)
+    return table, lengths
