@@ -124,6 +124,10 @@ def parse(arguments: Sequence[str]) -> tuple[Options, Run | None]:
         Options, args=arguments, prog=PROGRAM, default=defaults, config=(tyro.conf.OmitArgPrefixes,)
     )
     _check_env(options, given=selection.env)
+    env_id = tt.task_set(options.config.env_id).id
+    options = dataclasses.replace(
+        options, config=dataclasses.replace(options.config, env_id=env_id)
+    )
     if stored is not None:
         _check_same(options, stored)
     else:
