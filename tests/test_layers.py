@@ -74,10 +74,7 @@ def test_no_module_needs_itself():
 
 
 def test_importing_the_environment_is_light(tmp_path):
-    """A fresh interpreter, where even the extras seem to be installed."""
-    for package in ("gymnasium", "gymnax"):
-        (tmp_path / package).mkdir()
-        (tmp_path / package / "__init__.py").touch()
+    """Checked in a fresh interpreter: what JAX, Flax and NumPy import themselves is free."""
     program = """
 import json, sys
 import jax, numpy
@@ -86,7 +83,7 @@ before = set(sys.modules)
 import trap_tube_jax
 print(json.dumps([sorted(before), sorted(set(sys.modules) - before)]))
 """
-    path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     result = subprocess.run(
         [sys.executable, "-c", program],
         env=os.environ | {"PYTHONPATH": path},
