@@ -1,0 +1,191 @@
+"""What all benchmarks share: the machine's description, timing, and results as JSON."""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import pathlib
+import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """How long a compiled function takes.
+
+    Attributes:
+      compile_s: seconds of the first call, tracing and compiling included.
+      median_s: median seconds of the later calls.
+      fastest_s: seconds of the fastest of them.
+      slowest_s: seconds of the slowest of them.
+    """
+
+    compile_s: float
+    median_s: float
+    fastest_s: float
+    slowest_s: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """A batch of environments under random actions.
+
+    Attributes:
+      name: what the tables call it.
+      reset: keys [B] -> (state, observations [B, ...]).
+      step: (state, actions [B, ...]) -> (state, observations [B, ...]), with auto-reset.
+      sample_actions: (key, shape) -> actions [*shape, ...].
+    """
+
+    name: str
+    reset: Callable[[jax.Array], tuple[Any, jax.Array]]
+    step: Callable[[Any, jax.Array], tuple[Any, jax.Array]]
+    sample_actions: Callable[[jax.Array, tuple[int, ...]], jax.Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Throughput:
+    """The speed of a subject.
+
+    Attributes:
+      name: the subject's.
+      num_envs: B, environments in the batch.
+      num_steps: steps of each environment per call.
+      steps_per_s: environment steps per second, all together, by the median call.
+      observation_bytes: bytes of one environment's observation.
+      timing: of one call.
+    """
+
+    name: str
+    num_envs: int
+    num_steps: int
+    steps_per_s: float
+    observation_bytes: int
+    timing: Timing
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Bytes of observation written per second."""
+        return self.steps_per_s * self.observation_bytes
+
+
+def measure(function: Callable[[int], Any], repeats: int = 5) -> Timing:
+    """Times `function(index)`, which returns arrays, from call to completion."""
+    seconds = []
+    for index in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(function(index))
+        seconds.append(time.perf_counter() - start)
+    first, *later = seconds
+    return Timing(first, statistics.median(later), min(later), max(later))
+
+
+def measure_throughput(
+    subject: Subject, num_envs: int, *, num_steps: int = 100, repeats: int = 5
+) -> Throughput:
+    """Steps a subject by random actions and consumes every byte of every observation.
+
+    At each step the observations are XORed, byte for byte, into a running array of their
+    own size, which the scan carries and so writes to memory each time. The actions are
+    drawn before the clock starts. A call goes on where the one before it stopped.
+    """
+    state, observation = jax.jit(subject.reset)(jax.random.split(jax.random.key(0), num_envs))
+    actions = subject.sample_actions(jax.random.key(1), (num_steps, num_envs))
+
+    @jax.jit
+    def run(carry, actions):
+        def step(carry, actions):
+            state, folded = carry
+            state, observation = subject.step(state, actions)
+            return (state, folded ^ _bits(observation)), None
+
+        return jax.lax.scan(step, carry, actions)[0]
+
+    carry = (state, jnp.zeros_like(_bits(observation)))
+
+    def call(_: int) -> jax.Array:
+        nonlocal carry
+        carry = run(carry, actions)
+        return carry[1]
+
+    timing = measure(call, repeats)
+    return Throughput(
+        name=subject.name,
+        num_envs=num_envs,
+        num_steps=num_steps,
+        steps_per_s=num_envs * num_steps / timing.median_s,
+        observation_bytes=observation.nbytes // num_envs,
+        timing=timing,
+    )
+
+
+def copy_bandwidth(num_bytes: int = 2**28, repeats: int = 5) -> float:
+    """Bytes per second that a jitted copy of a large array writes (and reads as many)."""
+    source = jnp.zeros(num_bytes // 4, jnp.uint32)
+    copy = jax.jit(lambda array, index: array ^ jnp.uint32(index))
+    return num_bytes / measure(lambda index: copy(source, index), repeats).median_s
+
+
+def machine() -> dict[str, Any]:
+    """Hardware, versions and commit, for the record."""
+    return {
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "device": jax.devices()[0].device_kind,
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "jax": importlib.metadata.version("jax"),
+        "jaxlib": importlib.metadata.version("jaxlib"),
+        "commit": _commit(),
+    }
+
+
+def write_json(path: str | pathlib.Path, results: Sequence[Any], **extra: Any) -> None:
+    """Writes the machine, `extra` and a list of dataclass results to `path`."""
+    record = {
+        "machine": machine(),
+        **extra,
+        "results": [dataclasses.asdict(result) for result in results],
+    }
+    path = pathlib.Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(record, indent=2) + "\n")
+
+
+def _bits(observation: jax.Array) -> jax.Array:
+    """The observations [B, ...] as unsigned integers [B, K] of the same width."""
+    flat = observation.reshape(len(observation), -1)
+    if flat.dtype == jnp.bool_:
+        return flat.astype(jnp.uint8)
+    unsigned = jnp.dtype(f"uint{8 * flat.dtype.itemsize}")
+    return jax.lax.bitcast_convert_type(flat, unsigned)
+
+
+def _processor() -> str:
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def _commit() -> str | None:
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            cwd=pathlib.Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return described.stdout.strip()

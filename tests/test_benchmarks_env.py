@@ -1,0 +1,52 @@
+"""The environment's benchmarks run, and their figures belong together."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from benchmarks import env_throughput, harness, peers
+
+
+def test_measures_the_fast_path_and_writes_json(tmp_path):
+    path = tmp_path / "results" / "env.json"
+    arguments = env_throughput.Arguments(
+        sets=("base",), num_envs=(2,), num_steps=2, repeats=1, json=path
+    )
+    (result,) = env_throughput.main(arguments)
+    record = json.loads(path.read_text())
+    assert record["machine"]["jax"] == jax.__version__
+    assert record["results"][0]["name"] == "base"
+    assert result.observation_bytes == 12 * 12 * 3
+    assert result.steps_per_s == pytest.approx(2 * 2 / result.timing.median_s)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.uint8, jnp.bool_])
+def test_consumes_every_observation_of_any_dtype(dtype):
+    seen = []
+
+    def step(state, actions):
+        jax.debug.callback(lambda a: seen.append(a.tolist()), actions)
+        return state + actions, jnp.ones((len(actions), 3), dtype)
+
+    subject = harness.Subject(
+        "counter",
+        reset=lambda keys: (jnp.zeros(len(keys), jnp.int32), jnp.ones((len(keys), 3), dtype)),
+        step=step,
+        sample_actions=lambda key, shape: jnp.ones(shape, jnp.int32),
+    )
+    result = harness.measure_throughput(subject, 2, num_steps=3, repeats=1)
+    jax.effects_barrier()
+    assert result.observation_bytes == 3 * jnp.dtype(dtype).itemsize
+    assert len(seen) == 2 * 3, "a first call and one repeat, three steps each"
+
+
+def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):
+    def fail():
+        raise ImportError("no such package")
+
+    monkeypatch.setattr(peers, "PEERS", (("absent", fail),))
+    results, skipped = peers.run(peers.Arguments(num_envs=2, num_steps=1, repeats=1, sets=()))
+    assert results == []
+    assert skipped == {"absent": "ImportError: no such package"}
