@@ -1,0 +1,71 @@
+"""Settings: presets, round trips, and what is refused."""
+
+import dataclasses
+import json
+
+import pytest
+
+import trap_tube_jax as tt
+from agents import Config, make_train
+from agents.config import PRESETS
+
+
+def test_paper_preset_is_the_specification():
+    config = Config.preset("paper")
+    expected = {
+        "episodes": 1024, "max_steps": 50, "epochs": 10, "minibatch": 128, "discount": 0.99,
+        "gae_lambda": 0.95, "clip": 0.2, "value_coef": 0.01, "entropy_coef": 1e-4,
+        "learning_rate": 1e-3, "adam_epsilon": 1e-7, "max_gradient_norm": 1.0,
+        "curiosity": "icm", "intrinsic_scale": 0.1, "curiosity_coef": 10.0, "reward_rate": 0.9,
+        "filters": (32, 64), "hidden": 64, "embedding": 8, "iterations": 250,
+        "episodic_novelty": False,
+    }  # fmt: skip
+    assert {name: getattr(config, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_survive_json(name):
+    config = Config.preset(name)
+    assert Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_every_setting_is_documented():
+    for field in dataclasses.fields(Config):
+        assert f"\n      {field.name}: " in str(Config.__doc__).replace("    Attributes", ""), field
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"minibatch": 100}, ["minibatch", "100", "1024", "512"]),
+        ({"minibatch": 0}, ["minibatch", "0", "1"]),
+        ({"curiosity": "rdn"}, ["curiosity", "rdn", "icm-detached", "rnd", "none"]),
+        ({"discount": 1.5}, ["discount", "1.5", "[0, 1]"]),
+        ({"gae_lambda": -0.1}, ["gae_lambda", "-0.1"]),
+        ({"episodes": 0}, ["episodes", "0"]),
+        ({"episodes": 1.0}, ["episodes", "int", "1.0"]),
+        ({"episodes": True}, ["episodes", "int", "True"]),
+        ({"filters": (32,)}, ["filters", "2 integers", "(32,)"]),
+        ({"filters": (0, 64)}, ["filters", "0"]),
+        ({"learning_rate": "fast"}, ["learning_rate", "float", "fast"]),
+        ({"episodic_novelty": 1}, ["episodic_novelty", "bool", "1"]),
+        ({"num_features": 0}, ["num_features", "0"]),
+        ({"max_steps": 0}, ["max_steps", "0"]),
+        ({"epsiodes": 3}, ["epsiodes", "did you mean 'episodes'", "minibatch"]),
+    ],
+)
+def test_refusals_name_the_value_and_what_is_allowed(settings, words):
+    with pytest.raises(ValueError) as error:  # noqa: PT011
+        Config.preset("paper", **settings)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_unknown_preset_lists_the_known():
+    with pytest.raises(ValueError, match=r"quick.*paper.*fast"):
+        Config.preset("quick")
+
+
+def test_environment_that_contradicts_the_config_is_refused():
+    with pytest.raises(ValueError, match="max_steps is 9, the config's 50"):
+        make_train(Config(), tt.make("p", max_steps=9))

@@ -1,0 +1,119 @@
+"""The fast path of the encoder against the plain one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents import distinct
+
+ROWS, WIDTH = 37, 5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_groups_are_those_of_numpy(seed):
+    rng = np.random.default_rng(seed)
+    keys = rng.integers(0, 6, (2, 200)).astype(np.int32)
+    groups = distinct.group(*map(jnp.asarray, keys))
+    _, expected = np.unique(keys, axis=1, return_inverse=True)
+    np.testing.assert_array_equal(groups.number, expected)
+    assert groups.total == expected.max() + 1
+    representative = np.asarray(groups.representative)[expected]
+    np.testing.assert_array_equal(keys[:, representative], keys)
+
+
+def test_layouts_share_an_id_only_if_equal():
+    env = tt.make("pstsy")
+    keys = jax.random.split(jax.random.key(0), 40)
+    states, _ = jax.jit(jax.vmap(env.reset))(jnp.concatenate([keys, keys[::-1]]))
+    ids = np.asarray(distinct.layout_ids(states))
+    content = [
+        tuple(np.concatenate([np.ravel(leaf[i]) for leaf in parts]).tolist())
+        for parts in [(states.board, states.palette, states.tool_extent)]
+        for i in range(80)
+    ]
+    same = np.array([[a == b for a in content] for b in content])
+    np.testing.assert_array_equal(ids[:, None] == ids[None], same)
+    assert len(set(ids.tolist())) == len(set(content))
+
+
+def test_equal_hashes_do_not_merge_layouts(monkeypatch):
+    """With a hash that says nothing, layouts are still told apart by their content."""
+
+    class Zeros:
+        def integers(self, low: int, high: int, size: int, dtype: type) -> np.ndarray:
+            del low, high
+            return np.zeros(size, dtype)
+
+    monkeypatch.setattr(np.random, "default_rng", lambda seed: Zeros())
+    states, _ = jax.vmap(tt.make("st").reset)(jax.random.split(jax.random.key(1), 6))
+    assert len(set(np.asarray(distinct.layout_ids(states)).tolist())) == 6
+
+
+def test_positions_are_told_apart():
+    state = tt.base_state()
+    cells = np.random.default_rng(0).integers(0, 12, (500, 3, 2)).astype(np.int32)
+    ids = jax.vmap(lambda c: distinct.position_id(state.replace(agent=c[0], tool=c[1], food=c[2])))(
+        cells
+    )
+    assert len(set(np.asarray(ids).tolist())) == len(np.unique(cells, axis=0))
+
+
+def plain(params: dict[str, jax.Array], rows: jax.Array) -> jax.Array:
+    return jnp.tanh(rows @ params["w"] + params["b"].reshape(1, -1))
+
+
+@pytest.fixture(scope="module")
+def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
+    keys = jax.random.split(jax.random.key(0), 4)
+    params = {
+        "w": jax.random.normal(keys[0], (3, WIDTH)),
+        "b": jax.random.normal(keys[1], (WIDTH,)),
+    }
+    return params, jax.random.normal(keys[2], (ROWS, 3)), jax.random.normal(keys[3], (ROWS, WIDTH))
+
+
+@pytest.mark.parametrize("chunk", [1, 8, 37, 64])
+@pytest.mark.parametrize("count", [0, 1, 8, 9, ROWS])
+def test_map_rows_and_its_gradient(problem, chunk, count):
+    params, rows, cotangent = problem
+    valid = (jnp.arange(ROWS) < count)[:, None]
+
+    def ours(params):
+        features = distinct.map_rows(plain, chunk, params, rows, jnp.int32(count))
+        return jnp.sum(jnp.where(valid, features, 0) * cotangent)
+
+    def reference(params):
+        return jnp.sum(jnp.where(valid, plain(params, rows), 0) * cotangent)
+
+    got, want = jax.value_and_grad(ours)(params), jax.value_and_grad(reference)(params)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), got, want)
+
+
+def test_map_rows_under_vmap_with_different_counts(problem):
+    params, rows, cotangent = problem
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, -leaf]), params)
+    counts = jnp.array([0, 5, ROWS])
+
+    def gradient(params, count):
+        def total(params):
+            features = distinct.map_rows(plain, 8, params, rows, count)
+            return jnp.sum(features * cotangent * (jnp.arange(ROWS) < count)[:, None])
+
+        return jax.grad(total)(params)
+
+    together = jax.jit(jax.vmap(gradient))(many, counts)
+    alone = [
+        gradient(jax.tree.map(lambda leaf, i=index: leaf[i], many), counts[index])
+        for index in range(3)
+    ]
+    alone = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), together, alone
+    )
+
+
+def test_shared_maximum_is_unbatched():
+    doubled = jax.vmap(jax.vmap(lambda x: x + distinct.shared_maximum(x)))
+    np.testing.assert_array_equal(doubled(jnp.array([[1, 2], [3, 4]])), [[5, 6], [7, 8]])

@@ -1,0 +1,129 @@
+"""Episodes of the scan against a plain loop that encodes every observation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents import Config, ppo
+from agents.agent import Agent
+from agents.rollout import Trajectory, rollout, sample_action
+
+CONFIG = Config(
+    env_id="psy", max_steps=7, episodes=12, minibatch=6, epochs=2, curiosity="icm-detached",
+    filters=(3, 4), hidden=6, embedding=2, chunk=4,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def played():
+    env = tt.make(CONFIG.env_id, max_steps=CONFIG.max_steps)
+    agent = Agent(CONFIG)
+    params = agent.init(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), CONFIG.episodes)
+    initial, _ = jax.vmap(env.reset)(keys)
+    # One episode is solved by its first move, so that an early end is among them.
+    initial = initial.replace(
+        agent=initial.agent.at[0].set(jnp.array([11, 4])),
+        food=initial.food.at[0].set(jnp.array([11, 5])),
+        tool=initial.tool.at[0].set(jnp.array([0, 0])),
+    )
+
+    def choose(key, outputs):
+        return sample_action(key, outputs).at[0].set(jnp.array([0, 3]))
+
+    run = jax.jit(
+        lambda params: rollout(
+            agent, params, env, initial, jax.random.key(2), choose=choose, chunk=CONFIG.chunk
+        )
+    )
+    return env, agent, params, initial, run(params)
+
+
+def test_episodes_follow_the_environment(played):
+    env, _, _, initial, trajectory = played
+    state, done = initial, np.zeros(CONFIG.episodes, bool)
+    for t in range(CONFIG.max_steps):
+        np.testing.assert_array_equal(trajectory.mask[t], ~done)
+        for name, index in (("agent", 0), ("tool", 1), ("food", 2)):
+            np.testing.assert_array_equal(trajectory.cells[t, :, index], getattr(state, name))
+        state, timestep = jax.vmap(env.step)(state, trajectory.action[t])
+        np.testing.assert_array_equal(trajectory.reward[t], timestep.reward)
+        done = np.asarray(timestep.done)
+    assert bool(trajectory.solved[0])
+    assert trajectory.length[0] == 1
+    np.testing.assert_array_equal(trajectory.length[1:] == CONFIG.max_steps, ~trajectory.solved[1:])
+
+
+def test_every_observation_has_its_own_features(played):
+    _, agent, params, _, trajectory = played
+    observations = trajectory.observations()
+    plain = jax.vmap(lambda rows: agent.encode(params, rows))(observations)
+    np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
+
+
+def test_network_saw_the_episodes_in_order(played):
+    _, agent, params, _, trajectory = played
+    embedding, _ = agent.unroll(params, trajectory.features, trajectory.action, trajectory.reward)
+    np.testing.assert_allclose(trajectory.embedding, embedding, rtol=1e-4, atol=1e-5)
+    value = agent.act(params, embedding).value
+    np.testing.assert_allclose(trajectory.value, value, rtol=1e-4, atol=1e-4)
+
+
+def test_observation_ids_are_equal_for_equal_observations_alone(played):
+    trajectory: Trajectory = played[-1]
+    ids = np.asarray(ppo.observation_ids(trajectory)).reshape(-1)
+    boards = np.asarray(trajectory.observations()).reshape(len(ids), -1)
+    _, first = np.unique(boards, axis=0, return_inverse=True)
+    # Different ids may show one board: the agent over the food, say. Never the reverse.
+    for identity in set(ids.tolist()):
+        assert len(set(first[ids == identity].tolist())) == 1
+
+
+def test_first_visits():
+    ids = jnp.array([[0, 5], [1, 5], [0, 5], [2, 6]])
+    np.testing.assert_array_equal(ppo.first_visits(ids), [[1, 1], [1, 0], [0, 0], [1, 1]])
+
+
+@pytest.mark.parametrize("curiosity", ["icm", "icm-detached", "rnd", "none"])
+def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played, curiosity):
+    _, _, _, _, trajectory = played
+    config = Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity})
+    agent = Agent(config)
+    params = agent.init(jax.random.key(3))
+    state = ppo.make_train(config).init(jax.random.key(4))
+    features = jax.vmap(lambda rows: agent.encode(params, rows))(trajectory.observations())
+    batch, _, _ = ppo.prepare(
+        agent, config, state._replace(params=params), trajectory._replace(features=features)
+    )
+
+    def plain_encoding(params, agent, config, batch):
+        del config
+        boards = trajectory._replace(layout=batch.layout, cells=batch.cells).observations()
+        return jax.vmap(lambda rows: agent.encode(params, rows))(boards)
+
+    gradient = jax.jit(jax.grad(lambda params: ppo.loss(params, agent, config, batch)[0]))
+    fast = gradient(params)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ppo, "encode_batch", plain_encoding)
+        plain = jax.jit(jax.grad(lambda p: ppo.loss(p, agent, config, batch)[0]))(params)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), fast, plain)
+
+
+def test_gradient_of_the_whole_loss_by_finite_differences(played):
+    """Along the gradient, with the paper's curiosity, whose losses stop no gradient."""
+    _, _, _, _, trajectory = played
+    config = Config.from_dict({**CONFIG.to_dict(), "curiosity": "icm"})
+    agent = Agent(config)
+    state = ppo.make_train(config).init(jax.random.key(4))
+    params = state.params
+    features = jax.vmap(lambda rows: agent.encode(params, rows))(trajectory.observations())
+    batch, _, _ = ppo.prepare(agent, config, state, trajectory._replace(features=features))
+    total = jax.jit(lambda params: ppo.loss(params, agent, config, batch)[0])
+    gradient = jax.jit(jax.grad(total))(params)
+    norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+    step = 1e-2 / norm
+    ahead = total(jax.tree.map(lambda p, g: p + step * g, params, gradient))
+    behind = total(jax.tree.map(lambda p, g: p - step * g, params, gradient))
+    np.testing.assert_allclose((ahead - behind) / (2 * step), norm**2, rtol=2e-2)
