@@ -124,7 +124,11 @@ class Session:
         self._every = checkpoint_every
         self._train = make_train(run.config)
         self._checkpoints = Checkpoints(folder.checkpoints, keep=keep)
-        self._state, self._progress = self._start()
+        try:
+            self._state, self._progress = self._start()
+        except ValueError:
+            self.close()
+            raise
         self.saved = self._progress.iteration
         self._log = MetricsLog(folder.metrics, last_iteration=self.saved)
 

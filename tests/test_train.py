@@ -1,0 +1,319 @@
+import csv
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from agents import compilation_cache, evaluate
+from agents.checkpoint import Checkpoints, digest
+from agents.config import Config
+from agents.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
+from agents.ppo import make_train
+from agents.run_folder import Run, RunFolder
+from agents.session import Progress, make_advance
+from agents.train import main, parse
+
+ROOT = Path(__file__).parent.parent
+TINY = [
+    *("--episodes", "8", "--minibatch", "4", "--epochs", "1", "--max-steps", "6", "--chunk", "8"),
+    *("--filters", "2", "2", "--hidden", "4", "--embedding", "2", "--eval-episodes", "2"),
+]
+ITERATIONS = 30
+
+
+def start(module, *arguments, cache):
+    """A real process of a command line, warnings being errors."""
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", module, *map(str, arguments)],
+        cwd=ROOT,
+        env={
+            **os.environ,
+            "XDG_CACHE_HOME": str(cache),
+            "JAX_NUMPY_RANK_PROMOTION": "raise",
+            "JAX_PLATFORMS": "cpu",
+        },
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(module, *arguments, cache):
+    process = start(module, *arguments, cache=cache)
+    output, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert not errors
+    return output
+
+
+def read_iterations(process, count):
+    """Reads the output up to the line of the count-th iteration, or to its end."""
+    lines = []
+    while count and (line := process.stdout.readline()):
+        lines.append(line)
+        count -= bool(re.match(r"\s+\d+ .*left at most", line))
+    return "".join(lines)
+
+
+def untimed(folder):
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    return [{k: v for k, v in row.items() if k not in TIMING_COLUMNS} for row in rows]
+
+
+def final_state(folder):
+    with Checkpoints(folder / "checkpoints") as checkpoints:
+        arrays, record = checkpoints.load()
+    return record["iteration"], digest(arrays)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, cache):
+    """The folder and the output of a run that nothing interrupts."""
+    out = tmp_path_factory.mktemp("runs")
+    arguments = [*TINY, "--iterations", ITERATIONS, "--name", "whole", "--out", out]
+    return out / "whole", run("agents.train", *arguments, cache=cache)
+
+
+def test_a_run_leaves_its_results_and_says_where(whole):
+    folder, output = whole
+    names = ["config.json", "metrics.csv", "checkpoints", "curves.png", "evaluation.json"]
+    for name in [*names, "summary.json"]:
+        assert (folder / name).exists()
+        assert str(folder / name) in output
+    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    rows = untimed(folder)
+    assert [row["iteration"] for row in rows] == [str(i + 1) for i in range(ITERATIONS)]
+    assert [row["episodes"] for row in rows] == [str(8 * i + 8) for i in range(ITERATIONS)]
+    (policy,) = json.loads((folder / "evaluation.json").read_text())
+    assert [score["set"] for score in policy["sets"]] == list(evaluate.ALL_SETS)
+    assert [score["tasks"] for score in policy["sets"]] == [1] + 7 * [2]
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["env_id"] == "TrapTube-v0"
+    assert summary["seeds"] == [{"seed": 0, "episodes": 8 * ITERATIONS, "first_solved": None}]
+    assert summary["compile_seconds"] > 0
+    assert output.count("left at most") == ITERATIONS
+
+
+def test_killed_runs_continue_to_the_same_bits(whole, tmp_path, cache):
+    """Killed at moments that differ every time: a line is printed just before its save."""
+    out = ["--name", "killed", "--out", tmp_path]
+    arguments = [*TINY, "--iterations", ITERATIONS, *out, "--checkpoint-every", 1]
+    for num_iterations in (1, 2, 2):
+        process = start("agents.train", *arguments, cache=cache)
+        read_iterations(process, num_iterations)
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        arguments = ["--resume", *out, "--checkpoint-every", 1]
+    output = run("agents.train", *arguments, cache=cache)
+    assert re.search(r"parameters, from iteration [1-9]", output)
+    assert final_state(tmp_path / "killed") == final_state(whole[0])
+    assert untimed(tmp_path / "killed") == untimed(whole[0])
+    for name in ("config.json", "evaluation.json"):
+        assert (tmp_path / "killed" / name).read_text() == (whole[0] / name).read_text()
+
+
+def test_ctrl_c_saves_and_says_how_to_continue(tmp_path, cache):
+    out = ["--name", "stopped", "--out", tmp_path]
+    process = start("agents.train", *TINY, "--iterations", 100_000, *out, cache=cache)
+    read_iterations(process, 3)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate()
+    assert (process.returncode, errors) == (130, "")
+    match = re.search(r"Stopped at iteration (\d+)\. Continue with: (.*)", output)
+    assert match
+    assert match[2] == f"python -m agents.train --resume --name stopped --out {tmp_path}"
+    iteration = int(match[1])
+    assert iteration >= 3
+    assert final_state(tmp_path / "stopped")[0] == iteration
+    assert len(untimed(tmp_path / "stopped")) == iteration
+
+
+def test_evaluate_command_line(whole, tmp_path, cache):
+    folder, _ = whole
+    arguments = [folder, "--sets", "base", "PerceptualTrapTube-v0", "--episodes", 3]
+    output = run(
+        "agents.evaluate", *arguments, "--json", tmp_path / "x.json", "--optimality", cache=cache
+    )
+    (policy,) = json.loads((tmp_path / "x.json").read_text())
+    assert policy["iteration"] == ITERATIONS
+    assert [(score["set"], score["tasks"]) for score in policy["sets"]] == [("base", 1), ("p", 3)]
+    assert policy["sets"][0]["optimality"]["solvable"] == 0  # 11 steps, of which it has 6
+    assert "{P} (p)" in output
+    assert str(tmp_path / "x.json") in output
+
+
+def refused(capsys, *arguments, command=main):
+    """What a command line says that it refuses."""
+    with pytest.raises(SystemExit) as exit_info:
+        command([str(argument) for argument in arguments])
+    assert exit_info.value.code == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err
+    return " ".join(re.sub("[│╭╰─╮╯]", " ", captured.err + captured.out).split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--preset slow", "unknown preset 'slow'; allowed: paper, fast"),
+        ("--env q", "unknown task set 'q'; allowed: TrapTube-v0 (base), "),
+        ("--env p --env-id st", "--env p contradicts --env-id st"),
+        ("--minibatch 3 --episodes 8", "minibatch must divide episodes=8, got 3; allowed: 1, 2"),
+        ("--episodess 8", "Unrecognized options: --episodess, 8"),
+        ("--curiosity icmm", "Expected one of ('icm', 'icm-detached', 'rnd', 'none')"),
+        ("--discount 2", "discount must lie in [0, 1], got 2"),
+        ("--seed -1", "seed must be an integer >= 0, got -1"),
+        ("--seeds 0", "seeds must be an integer >= 1, got 0"),
+        ("--seed 2147483647 --seeds 2", "seeds must be at most 2147483647, got 2147483648"),
+        ("--keep 0", "keep must be >= 1, got 0"),
+        ("--checkpoint-every 0", "checkpoint_every must be >= 1, got 0"),
+        ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
+        ("--resume --name no", "no holds no run; runs in "),
+    ],
+)
+def test_impossible_settings_are_refused(capsys, tmp_path, arguments, message):
+    assert message in refused(capsys, *arguments.split(), "--no-cache", "--out", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_is_not_overwritten(capsys, whole):
+    folder, _ = whole
+    out = ["--no-cache", "--out", folder.parent, "--name", "whole"]
+    assert "give --resume to continue the run in it, or another --name" in refused(capsys, *out)
+    message = refused(capsys, *out, "--resume", "--hidden", 8)
+    assert "the run has hidden=4, not 8; --resume may change iterations and" in message
+    assert "the run has seed=0, not 1" in refused(capsys, *out, "--resume", "--seed", 1)
+
+
+def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
+    RunFolder.create(tmp_path / "foreign", Run(Config()))
+    shutil.copytree(whole[0] / "checkpoints", tmp_path / "foreign" / "checkpoints")
+    out = ["--resume", "--no-cache", "--name", "foreign", "--out", tmp_path]
+    assert "does not fit the run's settings" in refused(capsys, *out)
+    message = refused(capsys, tmp_path / "foreign", "--no-cache", command=evaluate.main)
+    assert f"checkpoint {tmp_path}/foreign/checkpoints/{ITERATIONS} does not fit" in message
+    assert "holds no run" in refused(capsys, tmp_path / "none", command=evaluate.main)
+
+
+def test_defaults_and_overrides(tmp_path):
+    options, stored = parse(["--out", str(tmp_path)])
+    assert (options.name, options.seed, options.seeds, stored) == ("fast-base-0", 0, 1, None)
+    assert options.config == Config.preset("fast")
+    arguments = "--preset paper --env psy --seed 3 --seeds 2 --hidden 32 --curiosity none"
+    options, _ = parse([*arguments.split(), "--out", str(tmp_path)])
+    expected = Config.preset(
+        "paper", env_id="PerceptualSymbolicTrapTube-v0", hidden=32, curiosity="none"
+    )
+    assert options.config == expected
+    assert options.name == "paper-psy-3to4"
+
+
+def test_resumed_runs_keep_their_settings(tmp_path):
+    stored = Run(Config.preset("paper", hidden=32), preset="paper", seed=5, seeds=2)
+    RunFolder.create(tmp_path / "x", stored)
+    arguments = ["--resume", "--name", "x", "--out", str(tmp_path)]
+    options, found = parse(arguments)
+    assert found == stored
+    assert (options.config, options.seed, options.seeds) == (stored.config, 5, 2)
+    options, _ = parse([*arguments, "--iterations", "999"])
+    assert options.config == dataclasses.replace(stored.config, iterations=999)
+
+
+def test_help_documents_every_setting(capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--help"])
+    assert exit_info.value.code == 0
+    text = " ".join(re.sub("[│╭╰─╮╯]", " ", capsys.readouterr().out).split())
+    for field in dataclasses.fields(Config):
+        assert f"--{field.name.replace('_', '-')}" in text
+    assert "half-width of PPO's interval of probability ratios" in text
+    assert "--preset paper|fast" in text
+
+
+def test_metrics_lose_nothing_but_what_comes_after_the_checkpoint(tmp_path):
+    path = tmp_path / "metrics.csv"
+
+    def row(iteration):
+        return {
+            "seed": 0,
+            "iteration": iteration,
+            "episodes": 8 * iteration,
+            "transitions": np.float32(0.1) * iteration,
+            "loss": np.float32(1 / 3),
+            "seconds": 0.5,
+            "transitions_per_second": 2.0,
+        }
+
+    log = MetricsLog(path)
+    for iteration in (1, 2, 3):
+        log.append([row(iteration)])
+    with path.open("a") as file:
+        file.write("0,2,1")  # what a kill in mid-write leaves
+    log = MetricsLog(path, last_iteration=2)
+    log.append([row(3)])
+    assert [entry["iteration"] for entry in log.rows] == [1, 2, 3]
+    assert read_metrics(path) == log.rows
+    assert np.float32(read_metrics(path)[0]["loss"]) == np.float32(1 / 3)
+    assert MetricsLog(path).rows == []
+
+
+def test_solved_seeds_stay_as_they_are():
+    """Two seeds side by side, the second one solved."""
+    config = Config(max_steps=6, filters=(2, 2), hidden=4, embedding=2, eval_episodes=2)
+
+    def iterate(state):
+        state = state._replace(
+            params=jax.tree.map(lambda x: x + 1, state.params),
+            iteration=state.iteration + 1,
+            episodes=state.episodes + 8,
+            transitions=state.transitions + 48,
+        )
+        return state, {"loss": jnp.float32(1)}
+
+    real = make_train(config)
+    keys = jax.random.split(jax.random.key(0), 2)
+    shapes = jax.eval_shape(jax.vmap(real.init), keys)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
+    state, train = zeros._replace(key=keys), real._replace(iterate=iterate)
+    after, metrics = jax.jit(make_advance(train, 2))(state, jnp.array([True, False]))
+    assert after.iteration.tolist() == [1, 0]
+    assert metrics["steps"].tolist() == [48, 48]
+    for leaf in jax.tree.leaves(after.params):
+        assert np.all(np.asarray(leaf[0]) == 1)
+        assert np.all(np.asarray(leaf[1]) == 0)
+
+
+def test_training_goes_on_until_every_seed_is_solved():
+    config = Config(iterations=10, stop_when_solved=1.0)
+    first = FirstSolved(iteration=2, episodes=16, transitions=90, seconds=1.5)
+    progress = Progress(3, 1.0, 2.0, (None, first))
+    assert progress.active(config).tolist() == [True, False]
+    assert not progress._replace(solved=(first, first)).active(config).any()
+    assert not progress._replace(iteration=10).active(config).any()
+    never = dataclasses.replace(config, stop_when_solved=0.0)
+    assert progress.active(never).all()
+    assert Progress.from_dict(json.loads(json.dumps(progress.to_dict()))) == progress
+
+
+def test_cache_follows_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert compilation_cache.default_folder() == tmp_path / "trap_tube_jax" / "jax"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert compilation_cache.default_folder() == Path.home() / ".cache" / "trap_tube_jax" / "jax"
