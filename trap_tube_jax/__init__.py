@@ -23,6 +23,7 @@ from trap_tube_jax.rendering import render, save_gif
 from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
+from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 
 # Gymnasium's convention: importing a package registers its environments.
@@ -43,6 +44,8 @@ __all__ = [
     "TaskSet",
     "TimeStep",
     "Transfer",
+    "VectorEnvironment",
+    "VectorState",
     "action_from_index",
     "action_to_index",
     "base_palette",
