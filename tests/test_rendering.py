@@ -154,9 +154,17 @@ def test_gif_holds_the_frames(tmp_path):
         for index, frame in enumerate(frames):
             gif.seek(index)
             durations.append(gif.info["duration"])
-            written = np.asarray(gif.convert("RGB")).astype(int)
-            assert abs(written - frame).mean() < 2
+            np.testing.assert_array_equal(np.asarray(gif.convert("RGB")), frame)
     assert durations == [100, 100, 600]
+
+
+def test_gif_of_more_colors_than_it_can_hold(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3)).astype(np.uint8)
+    tt.save_gif(noise, tmp_path / "noise.gif")
+    with Image.open(tmp_path / "noise.gif") as gif:
+        assert getattr(gif, "n_frames", 1) == 2
+        difference = abs(np.asarray(gif.convert("RGB")).astype(int) - noise[0])
+        assert 0 < difference.mean() < 40
 
 
 @pytest.mark.parametrize(

@@ -132,8 +132,6 @@ def save_gif(
     Raises:
       ValueError: naming the value and what is allowed.
     """
-    from PIL import Image  # noqa: PLC0415  importing the environment must stay light
-
     pictures = np.asarray(frames)
     if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[-1] != 3:
         raise ValueError(
@@ -147,12 +145,28 @@ def save_gif(
         raise ValueError(f"hold must be a number of seconds >= 0, got {hold}")
     durations = [round(1000 / fps)] * len(pictures)
     durations[-1] += round(1000 * hold)
-    # Dithering would speckle plain colours and double the size of the file.
-    first, *rest = (
-        Image.fromarray(picture).quantize(dither=Image.Dither.NONE) for picture in pictures
-    )
+    first, *rest = _indexed(pictures)
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
     first.save(path, format="GIF", duration=durations, loop=0, **options)
+
+
+def _indexed(pictures: np.ndarray) -> list[Any]:
+    """Pillow images of at most 256 colours: the exact ones where they are no more."""
+    from PIL import Image  # noqa: PLC0415  importing the environment must stay light
+
+    red, green, blue = np.moveaxis(pictures.astype(np.uint32), -1, 0)
+    packed = red << 16 | green << 8 | blue
+    colors = np.unique(packed)
+    if len(colors) > 256:
+        # Dithering would speckle plain colours and double the size of the file.
+        return [Image.fromarray(each).quantize(dither=Image.Dither.NONE) for each in pictures]
+    palette = np.stack([colors >> 16, colors >> 8 & 255, colors & 255], axis=-1)
+    images = []
+    for indices in np.searchsorted(colors, packed).astype(np.uint8):
+        image = Image.fromarray(indices).convert("P")
+        image.putpalette(palette.astype(np.uint8).tobytes())
+        images.append(image)
+    return images
 
 
 @functools.partial(jax.jit, static_argnames=("cell_size", "grid"))

@@ -1,6 +1,8 @@
-"""The batch behind the Gymnasium adapter equals the vmapped single environment."""
+"""The adapters without their libraries, and the batch behind the Gymnasium adapter."""
 
 import functools
+import importlib
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -71,3 +73,12 @@ def test_next_step_spends_a_step_on_the_reset(env, start):
     assert not timestep.done.any()
     assert timestep.discount.all()
     assert not timestep.reward.any()
+
+
+@pytest.mark.parametrize("library", ["gymnasium", "gymnax"])
+def test_an_adapter_without_its_library_says_what_to_install(library, monkeypatch):
+    name = f"trap_tube_jax.adapters.to_{library}"
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.raises(ImportError, match=r"pip install 'trap-tube-jax\[interop\]'"):
+        importlib.import_module(name)
