@@ -1,0 +1,427 @@
+"""Plants single faults in the environment, one at a time, and asks the tests to catch each.
+
+    python tests/mutation_check.py            # every fault
+    python tests/mutation_check.py tool wrap  # those whose line in the table has a word
+
+Package and tests are copied for it; the working tree is not touched. Exits with 1 if the
+tests pass in spite of a fault, if a fault's text is not found exactly once, or if the tests
+fail without any.
+"""
+
+import concurrent.futures
+import os
+import pathlib
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from typing import NamedTuple
+
+ROOT = pathlib.Path(__file__).parent.parent
+PACKAGE = "trap_tube_jax"
+# The child must import the copy, not an installed package.
+CHILD = """
+import pathlib, sys
+import trap_tube_jax
+assert pathlib.Path(trap_tube_jax.__file__).is_relative_to(pathlib.Path.cwd())
+import pytest
+sys.exit(pytest.main(["-x", "--no-header", "-p", "no:cacheprovider", *sys.argv[1:]]))
+"""
+# Of the exhaustive comparison the base task and its swaps are enough here.
+STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-70 and not psy-30")
+OBSERVE = ("tests/test_observation.py", "tests/test_golden.py")
+TIME = ("tests/test_environment.py", "-k", "limit or last_step or auto or statistics")
+PERCEPTUAL = ("tests/test_transfers.py", "-k", "perceptual")
+STRUCTURAL = ("tests/test_transfers.py", "-k", "structural")
+SYMBOLIC = ("tests/test_transfers.py", "-k", "symbolic")
+COMPOSE = ("tests/test_transfers.py", "-k", "compose or then")
+
+
+class Fault(NamedTuple):
+    """A change of one place in one module, and the tests that should see it."""
+
+    module: str
+    description: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+FAULTS = (
+    Fault(
+        "dynamics",
+        "the agent grasps from above the tool",
+        "on_tool(agent + grasp) & ~on_tool(agent)",
+        "on_tool(agent + grasp)",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "the agent walks into the trap",
+        "static_object(board, agent + move) == GROUND",
+        "static_object(board, agent + move) <= 1",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "food is behind, not ahead",
+        "on_tool(food - move)",
+        "on_tool(food + move) ",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "food under the tool is pushed by it",
+        "on_tool(food - move) & ~on_tool(food)",
+        "on_tool(food - move)",
+        STEP,
+    ),
+    Fault("dynamics", "the exit blocks food", " | (beyond_food == EXIT)", "", STEP),
+    Fault(
+        "dynamics", "the trap lets food in", "(beyond_food == EXIT)", "(beyond_food <= EXIT)", STEP
+    ),
+    Fault(
+        "dynamics",
+        "food moves where the agent cannot",
+        "food_moves = grasped & agent_free &",
+        "food_moves = grasped &",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "the tool's end leaves the board",
+        " & is_on_board(tool + move + extent - 1)",
+        "",
+        STEP,
+    ),
+    Fault("dynamics", "the tool runs over food", "(~food_ahead | food_moves) & ", "", STEP),
+    Fault(
+        "dynamics",
+        "the tool waits for moving food",
+        "(~food_ahead | food_moves)",
+        "~food_ahead",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "the tool moves where the agent cannot",
+        "tool_moves = grasped & agent_free &",
+        "tool_moves = grasped &",
+        STEP,
+    ),
+    Fault(
+        "dynamics", "nothing holds the agent", "held = grasped & ~tool_moves", "held = False", STEP
+    ),
+    Fault(
+        "dynamics",
+        "the tool's old place blocks the agent",
+        "bar_covers(new_tool, extent, agent + move)",
+        "bar_covers(tool, extent, agent + move)",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "food in the exit is out of reach",
+        "(agent_free | reaches_food)",
+        "agent_free",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "success counts one step late",
+        "same_cell(new_agent, new_food)",
+        "same_cell(agent, food)",
+        STEP,
+    ),
+    Fault(
+        "dynamics",
+        "a truncated episode goes on",
+        "~(state.terminated | state.truncated)",
+        "~state.terminated",
+        ("tests/test_dynamics.py", "-k", "absorb"),
+    ),
+    Fault(
+        "dynamics",
+        "the board has no edge",
+        ".astype(jnp.int32), -1)",
+        ".astype(jnp.int32), 0)",
+        STEP,
+    ),
+    Fault(
+        "geometry",
+        "left and right are swapped",
+        "(direction == RIGHT).astype(jnp.int32) - (direction == LEFT)",
+        "(direction == LEFT).astype(jnp.int32) - (direction == RIGHT)",
+        STEP,
+    ),
+    Fault(
+        "geometry",
+        "a bar is one cell longer",
+        "(cell < corner + extent)",
+        "(cell <= corner + extent)",
+        STEP,
+    ),
+    Fault(
+        "geometry",
+        "the board has a column more",
+        "(cell[1] < BOARD_SIZE)",
+        "(cell[1] <= BOARD_SIZE)",
+        STEP,
+    ),
+    Fault("geometry", "one row is one cell", " & (cell[1] == other[1])", "", STEP),
+    Fault("geometry", "a drawn bar is wider", "(end[1] > COLUMNS)", "(end[1] >= COLUMNS)", OBSERVE),
+    Fault(
+        "observation",
+        "the tool hides the agent",
+        "_at(state.agent), jnp.uint8(AGENT), objects)",
+        "_at(state.agent) & ~tool, jnp.uint8(AGENT), objects)",
+        OBSERVE,
+    ),
+    Fault(
+        "observation",
+        "food lies above the tool",
+        "jnp.where(tool, jnp.uint8(TOOL), objects)",
+        "jnp.where(tool & ~_at(state.food), jnp.uint8(TOOL), objects)",
+        OBSERVE,
+    ),
+    Fault(
+        "environment",
+        "the limit is one step longer",
+        "time >= self.max_steps",
+        "time > self.max_steps",
+        TIME,
+    ),
+    Fault(
+        "environment",
+        "success at the limit is a truncation",
+        "truncated = ~state.terminated & ",
+        "truncated = ",
+        TIME,
+    ),
+    Fault(
+        "environment",
+        "success pays again",
+        "(state.terminated & ~was_done)",
+        "(state.terminated)",
+        TIME,
+    ),
+    Fault(
+        "environment",
+        "time runs on after the end",
+        "state.time + ~was_done",
+        "state.time + 1",
+        TIME,
+    ),
+    Fault(
+        "wrappers",
+        "every episode draws the same task",
+        "AutoResetState(inner, next_key)",
+        "AutoResetState(inner, key)",
+        TIME,
+    ),
+    Fault(
+        "wrappers",
+        "the last observation is lost",
+        "final_observation=timestep.observation",
+        "final_observation=observation",
+        TIME,
+    ),
+    Fault(
+        "transfers", "features are rounded", "jnp.floor((points", "jnp.round((points", STRUCTURAL
+    ),
+    Fault(
+        "transfers",
+        "features reach 256",
+        "points + 1) / 2 * 255",
+        "points + 1) / 2 * 256",
+        STRUCTURAL,
+    ),
+    Fault(
+        "transfers",
+        "points crowd in the cube's corners",
+        "jax.random.normal(key, (5, num_features))",
+        "jax.random.uniform(key, (5, num_features), minval=-1)",
+        STRUCTURAL,
+    ),
+    Fault("transfers", "food changes its color", "(AGENT, FOOD)", "(AGENT,)", STRUCTURAL),
+    Fault(
+        "transfers",
+        "the tool is never drawn",
+        "randint(key, (), 0, len(SYMBOLIC_OBJECTS))",
+        "randint(key, (), 1, len(SYMBOLIC_OBJECTS))",
+        SYMBOLIC,
+    ),
+    Fault(
+        "transfers", "colors stay at a swap", "state.palette[looks_of]", "state.palette", SYMBOLIC
+    ),
+    Fault(
+        "transfers",
+        "the new tool lies across",
+        "jnp.where(horizontal, jnp.stack([1, length])",
+        "jnp.where(~horizontal, jnp.stack([1, length])",
+        SYMBOLIC,
+    ),
+    Fault(
+        "transfers",
+        "the swapped object stays as well",
+        "jnp.where(state.board == code, jnp.uint8(GROUND), state.board)",
+        "state.board",
+        SYMBOLIC,
+    ),
+    Fault(
+        "transfers",
+        "a tool of one cell is horizontal",
+        "(length > 1) & (second",
+        "(second",
+        SYMBOLIC,
+    ),
+    Fault("transfers", "transfers share a key", "jax.random.fold_in(key, index)", "key", COMPOSE),
+    Fault(
+        "transfers",
+        "the last transfer comes first",
+        "in enumerate(transfers):",
+        "in enumerate(transfers[::-1]):",
+        COMPOSE,
+    ),
+    Fault(
+        "transfers",
+        "the openings depend on the outline",
+        "layout // NUM_FRAMES % NUM_ASSIGNMENTS",
+        "layout % NUM_ASSIGNMENTS",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "transfers",
+        "some tool places are left out",
+        "tool %= tables.num_tools[frame]",
+        "tool %= tables.num_tools[frame] - 1",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "layouts",
+        "narrow tubes are less likely",
+        "((3, 4), (3, 5), (4, 4), (4, 4))",
+        "((3, 4), (4, 4), (4, 4), (4, 4))",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "layouts",
+        "the trap is always first",
+        "(openings, openings[::-1])",
+        "(openings, openings)",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "layouts",
+        "the agent may start on the tool",
+        "~tool_corners & ~tool)",
+        "~tool_corners)",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "layouts",
+        "the agent may start where the tool could",
+        "~center & ~tool_corners & ~tool",
+        "~center & ~tool",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "layouts",
+        "the tool may start nearer to the tube",
+        "top + height - 1, left + width + 1)",
+        "top + height - 1, left + width)",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "layouts",
+        "the tool may reach the last row",
+        "_box(0, 0, BOARD_SIZE - 1 - height,",
+        "_box(0, 0, BOARD_SIZE - height,",
+        PERCEPTUAL,
+    ),
+    Fault(
+        "layouts",
+        "the central block is smaller",
+        "CENTER_LAST = 4, 8",
+        "CENTER_LAST = 4, 7",
+        PERCEPTUAL,
+    ),
+)
+
+
+class Verdict(NamedTuple):
+    """pytest's exit code, or 2 for whatever is neither a pass nor a failing test; and words."""
+
+    code: int
+    words: str
+
+
+def main() -> int:
+    words = sys.argv[1:]
+    lines = {fault: f"{fault.module:12} {fault.description:42}" for fault in FAULTS}
+    faults = [f for f in FAULTS if not words or any(word in lines[f] for word in words)]
+    with tempfile.TemporaryDirectory() as directory:
+        # All runs start from one snapshot, whatever is edited meanwhile.
+        snapshot = _copy(ROOT, pathlib.Path(directory) / "snapshot")
+        misplaced = [f for f in faults if _module(snapshot, f).read_text().count(f.old) != 1]
+        for fault in misplaced:
+            print(f"not exactly once in {fault.module}.py: {fault.old!r}")
+        if misplaced:
+            return 1
+        with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+            control = sorted({fault.tests for fault in faults})
+            unchanged = pool.map(lambda tests: _run(snapshot, tests), control)
+            for tests, verdict in zip(control, unchanged, strict=True):
+                if verdict.code != 0:
+                    print(f"without a fault, {' '.join(tests)}: {verdict.words}")
+                    return 1
+            survivors = 0
+            changed = pool.map(lambda fault: _run(snapshot, fault.tests, fault), faults)
+            for fault, verdict in zip(faults, changed, strict=True):
+                survivors += verdict.code != 1
+                print(lines[fault], verdict.words, flush=True)
+    print(f"{len(faults) - survivors} of {len(faults)} faults caught")
+    return int(survivors > 0)
+
+
+def _copy(source: pathlib.Path, target: pathlib.Path) -> pathlib.Path:
+    without_caches = shutil.ignore_patterns("__pycache__")
+    for name in (PACKAGE, "tests"):
+        shutil.copytree(source / name, target / name, ignore=without_caches)
+    shutil.copy(source / "pyproject.toml", target)
+    return target.resolve()
+
+
+def _module(root: pathlib.Path, fault: Fault) -> pathlib.Path:
+    return root / PACKAGE / f"{fault.module}.py"
+
+
+def _run(snapshot: pathlib.Path, tests: tuple[str, ...], fault: Fault | None = None) -> Verdict:
+    """Runs the tests on a copy of the snapshot with the fault planted."""
+    start = time.monotonic()
+    with tempfile.TemporaryDirectory() as directory:
+        copy = _copy(snapshot, pathlib.Path(directory) / "copy")
+        if fault:
+            module = _module(copy, fault)
+            module.write_text(module.read_text().replace(fault.old, fault.new))
+        result = subprocess.run(
+            [sys.executable, "-c", CHILD, *tests],
+            cwd=copy,
+            env=os.environ | {"PYTHONPATH": str(copy)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    seconds = f"({time.monotonic() - start:.0f} s)"
+    failed = re.search(r"^(?:FAILED|ERROR) \S+?(\w+\.py::\S+)", result.stdout, re.MULTILINE)
+    if result.returncode == 1 and failed:
+        return Verdict(1, f"caught by {failed[1]} {seconds}")
+    if result.returncode == 0:
+        return Verdict(0, f"passes {seconds}")
+    return Verdict(2, f"BROKEN RUN {seconds}: {(result.stdout + result.stderr)[-500:]}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
