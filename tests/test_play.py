@@ -1,6 +1,11 @@
 """Playing by hand: keys, hints, recordings and the screen, without a terminal."""
 
 import functools
+import os
+import pty
+import select
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -175,3 +180,38 @@ def test_without_a_terminal_the_command_line_says_so(monkeypatch):
 def test_seeds_draw_the_environments_tasks():
     expected, _ = jax.jit(tt.make("st").reset)(jax.random.key(4))
     np.testing.assert_array_equal(play.new_game("st", 4).state.palette, expected.palette)
+
+
+def read_until(terminal, text):
+    """What the terminal shows up to and including `text`."""
+    shown = ""
+    while text not in shown:
+        ready, _, _ = select.select([terminal], [], [], 120)
+        assert ready, f"nothing more after {shown!r}"
+        shown += os.read(terminal, 65536).decode()
+    return shown
+
+
+def test_in_a_real_terminal(tmp_path):
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "trap_tube_jax.play", "base", "--out", str(tmp_path)],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        env=os.environ | {"TERM": "xterm-256color", "LINES": "24", "COLUMNS": "80"},
+    )
+    os.close(theirs)
+    try:
+        screen = read_until(ours, "quit")
+        assert "TrapTube-v0   seed 0" in screen
+        assert "\x1b[" in screen
+        for keys, answer in ((b"k", "holds the tool"), (b"z", "saved"), (b"u", "empty")):
+            os.write(ours, keys)
+            read_until(ours, answer)
+        os.write(ours, b"q")
+        assert process.wait(timeout=120) == 0
+    finally:
+        process.kill()
+        os.close(ours)
+    assert [path.name for path in tmp_path.iterdir()] == ["TrapTube-v0-seed0.npz"]

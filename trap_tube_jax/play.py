@@ -222,6 +222,9 @@ def main(arguments: Arguments) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     game = new_game(arguments.task_set, arguments.seed)
     try:
+        curses.setupterm()
+        if not curses.tigetstr("cup"):
+            raise curses.error("it cannot place its cursor")
         curses.wrapper(_run, game, arguments.out)
     except curses.error as error:
         terminal = os.environ.get("TERM", "")
