@@ -19,6 +19,7 @@ from trap_tube_jax.rendering import save_gif
 from trap_tube_jax.state import State
 
 LIVE_ROWS = 10
+LIVE_WIDTH = 10  # characters of a column; a narrow terminal shows the first columns only
 CELL_SIZE = 24  # pixels
 
 
@@ -123,11 +124,12 @@ class LiveReport:
         self._console.print(Text(f"{text}  {rest}".rstrip()), soft_wrap=True)
 
     def _table(self) -> Table:
+        columns = self._columns()[: self._console.width // LIVE_WIDTH]
         table = Table(box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
-        for entry in self._columns():
+        for entry in columns:
             table.add_column(entry.title, justify="right", no_wrap=True)
         for row in self._rows:
-            table.add_row(*(entry.show(row[entry.metric]) for entry in self._columns()))
+            table.add_row(*(entry.show(row[entry.metric]) for entry in columns))
         return table
 
     def _status(self, mean: Row, num_solved: int) -> Text:
@@ -238,6 +240,8 @@ def save_curves(rows: Sequence[Row], path: Path, title: str) -> None:
         _draw_panel(axis, rows, metrics)
         axis.set_title(name, loc="left", fontsize="medium")
         axis.set_ylabel(unit, fontsize="small")
+        if unit.startswith("share"):
+            axis.set_ylim(-0.03, 1.03)
     for axis in axes[-1]:
         axis.set_xlabel("episodes")
     figure.savefig(path, format="png", dpi=110)

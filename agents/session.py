@@ -272,6 +272,7 @@ class Session:
             f"curiosity {run.config.curiosity}, seed {seeds}, {count:,} parameters, {begin}, "
             f"on {jax.devices()[0].platform}",
             soft_wrap=True,
+            highlight=False,
         )
 
     def _say_where(self) -> None:
