@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity import ICM, RND, DetachedICM, Prediction, Transition
-from agents.network import Core, Encoder, Heads, Outputs
+from agents.network import Core, Encoder, Heads, Outputs, draw
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
@@ -29,27 +29,32 @@ class Agent:
         self._num_features = config.num_features
         self._policy_width = config.filters[1]
         self._hidden = config.hidden
+        self._action_width = 2 * config.embedding
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters."""
-        encoder_key, core_key, heads_key, curiosity_key = jax.random.split(key, 4)
+        return draw(key, self._deviations())
+
+    def _deviations(self) -> Params:
+        """The deviation of every parameter; the modules' own keys are not used."""
+        key = jax.random.key(0)
         observation = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self._num_features), jnp.uint8)
         embedding = jnp.zeros((1, self._hidden))
         params: Params = {
-            "encoder": self.encoder.init(encoder_key, observation),
-            "core": self.core.init(core_key, method=_touch_core, width=self._policy_width),
-            "heads": self.heads.init(heads_key, embedding),
+            "encoder": self.encoder.init(key, observation),
+            "core": self.core.init(key, method=_touch_core, width=self._policy_width),
+            "heads": self.heads.init(key, embedding),
         }
         if self.curiosity is not None:
             action = jnp.zeros((1, 2), jnp.int32)
-            action_embedding = _apply(self.core, params["core"], action, method=Core.embed_action)
+            action_embedding = jnp.zeros((1, self._action_width))
             params["curiosity"] = self.curiosity.init(
-                curiosity_key,
+                key,
                 observation,
                 (embedding, embedding, action_embedding, action),
                 method=_touch_curiosity,
             )
-        return jax.tree.map(jnp.asarray, params)
+        return params
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features f32[M, F] of observations u8[M, 12, 12, N]; needs `encoding_params` only."""
@@ -156,6 +161,7 @@ def _make_curiosity(config: Config) -> nn.Module | None:
         "icm": lambda: ICM(config.hidden),
         "icm-detached": lambda: DetachedICM(config.hidden, config.filters),
         "rnd": lambda: RND(config.hidden, config.filters),
+        "counts": lambda: None,
         "none": lambda: None,
     }[config.curiosity]()
 

@@ -7,7 +7,7 @@ import dataclasses
 import difflib
 from typing import Any, Literal, Self, get_args
 
-Curiosity = Literal["icm", "icm-detached", "rnd", "none"]
+Curiosity = Literal["icm", "icm-detached", "rnd", "counts", "none"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,8 @@ class Config:
       max_gradient_norm: global norm to which gradients are clipped.
       curiosity: source of the intrinsic reward. `icm`: the paper's, forward and inverse
         models over the policy's GRU outputs. `icm-detached`: an encoder of its own, trained
-        by the inverse loss alone. `rnd`: imitation of a random network. `none`: plain PPO.
+        by the inverse loss alone. `rnd`: imitation of a random network. `counts`: how seldom
+        training has seen an observation. `none`: plain PPO.
       intrinsic_scale: weight of the normalised intrinsic reward.
       curiosity_coef: weight of the curiosity's losses.
       episodic_novelty: pay the intrinsic reward only for observations that are new in

@@ -5,7 +5,8 @@ A curiosity is a flax module with two methods, both pure functions of arrays:
 `predict`, its prediction error and inverse model on a batch of transitions.
 
 Source: agent specification "Network" and "ICM"; Pathak et al. (2017) for `icm`,
-Burda et al. (2019a) for the detached encoder's rationale, Burda et al. (2019b) for `rnd`.
+Burda et al. (2019a) for the detached encoder's rationale, Burda et al. (2019b) for `rnd`,
+Tang et al. (2017) for `counts`.
 """
 
 from typing import NamedTuple
@@ -154,6 +155,23 @@ class RND(nn.Module):
         """Errors on the next observation; there is no inverse model."""
         predicted, target = jnp.split(transition.next_features, 2, axis=-1)
         return Prediction(jnp.square(predicted - target), None, None)
+
+
+def visit_bonus(visits: jax.Array, slot: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The novelty of observations by how often training has seen them (Tang et al., 2017).
+
+      n(o) <- n(o) + visits of o in this batch,  bonus = n(o)^(-1/2).
+
+    Args:
+      visits: f32[S], visits so far, by slot of a hash table.
+      slot: i32[...], the slot of every observation.
+      mask: f32[...], 1 where an observation counts.
+
+    Returns:
+      The bonus f32[...], 0 where masked out, and the new visits f32[S].
+    """
+    visits = visits.at[slot.reshape(-1)].add(mask.reshape(-1))
+    return mask / jnp.sqrt(jnp.maximum(visits[slot], 1.0)), visits
 
 
 def intrinsic_reward(prediction: Prediction) -> jax.Array:

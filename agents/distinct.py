@@ -68,16 +68,20 @@ def layout_ids(state: State) -> jax.Array:
     Args:
       state: B states.
     """
-    batch = state.board.shape[0]
-    parts = (state.board, state.palette, state.tool_extent.astype(jnp.uint8))
-    content = jnp.concatenate([part.reshape(batch, -1) for part in parts], axis=1)
-    weights = np.random.default_rng(0).integers(1, 2**32, content.shape[1], np.uint32)
-    code = jnp.sum(content.astype(jnp.uint32) * weights[None], axis=1, dtype=jnp.uint32)
-    code, order = jax.lax.sort((code, jnp.arange(batch)), num_keys=1)
+    content = _layout_content(state)
+    batch = len(content)
+    _, order = jax.lax.sort((layout_hash(state), jnp.arange(batch)), num_keys=1)
     content = content[order]
     differs = jnp.any(content[1:] != content[:-1], axis=1)
     number = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(differs, dtype=jnp.int32)])
     return jnp.zeros(batch, jnp.int32).at[order].set(number, unique_indices=True)
+
+
+def layout_hash(state: State) -> jax.Array:
+    """A hash u32[B] of the boards, palettes and tool extents of B states."""
+    content = _layout_content(state)
+    weights = np.random.default_rng(0).integers(1, 2**32, content.shape[1], np.uint32)
+    return jnp.sum(content.astype(jnp.uint32) * weights[None], axis=1, dtype=jnp.uint32)
 
 
 def position_id(state: State) -> jax.Array:
@@ -160,6 +164,12 @@ def shared_maximum(x: jax.Array) -> jax.Array:
 def _(axis_size: int, in_batched: list[bool], x: jax.Array) -> tuple[jax.Array, bool]:
     del axis_size, in_batched
     return shared_maximum(jnp.max(x)), False
+
+
+def _layout_content(state: State) -> jax.Array:
+    """u8[B, ...]: all that an episode keeps, one row each."""
+    parts = (state.board, state.palette, state.tool_extent.astype(jnp.uint8))
+    return jnp.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
 
 def _num_chunks(count: jax.Array, chunk: int) -> jax.Array:

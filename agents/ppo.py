@@ -14,12 +14,14 @@ import trap_tube_jax as tt
 from agents import distinct, losses, returns
 from agents.agent import Agent, Params
 from agents.config import Config
-from agents.curiosity import Prediction, forward_loss, intrinsic_reward
+from agents.curiosity import Prediction, forward_loss, intrinsic_reward, visit_bonus
 from agents.optimizer import adam
 from agents.rollout import Trajectory, action_log_prob, place, rollout, sample_action
 from trap_tube_jax.environment import Environment
 
 Metrics = dict[str, jax.Array]
+
+VISIT_SLOTS = 2**20
 
 
 class TrainState(NamedTuple):
@@ -30,6 +32,8 @@ class TrainState(NamedTuple):
       opt_state: the optimiser's state.
       extrinsic: moments of the extrinsic reward.
       intrinsic: moments of the intrinsic reward.
+      visits: f32[S], how often observations were seen, by slot of a hash table; one unused
+        slot without the curiosity `counts`.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
@@ -40,6 +44,7 @@ class TrainState(NamedTuple):
     opt_state: Any
     extrinsic: returns.Moments
     intrinsic: returns.Moments
+    visits: jax.Array
     key: jax.Array
     iteration: jax.Array
     episodes: jax.Array
@@ -119,6 +124,7 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             opt_state=optimizer.init(params),
             extrinsic=returns.Moments.zero(),
             intrinsic=returns.Moments.zero(),
+            visits=jnp.zeros(VISIT_SLOTS if config.curiosity == "counts" else 1),
             key=key,
             iteration=zero,
             episodes=zero,
@@ -138,16 +144,13 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             choose=sample_action,
             chunk=config.chunk,
         )
-        batch, moments, play_metrics = prepare(agent, config, state, trajectory)
+        batch, state, play_metrics = prepare(agent, config, state, trajectory)
         params, opt_state, loss_metrics = optimize(
             agent, config, optimizer, (state.params, state.opt_state), batch, update_key
         )
-        extrinsic, intrinsic = moments
-        state = TrainState(
+        state = state._replace(
             params=params,
             opt_state=opt_state,
-            extrinsic=extrinsic,
-            intrinsic=intrinsic,
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + config.episodes,
@@ -168,19 +171,23 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
 
 def prepare(
     agent: Agent, config: Config, state: TrainState, trajectory: Trajectory
-) -> tuple[Batch, tuple[returns.Moments, returns.Moments], Metrics]:
+) -> tuple[Batch, TrainState, Metrics]:
     """Turns episodes into what the gradient steps learn from, under the acting parameters.
 
     Returns:
-      The batch of all episodes, the moments of both rewards, and metrics of play.
+      The batch of all episodes, the state with the rewards' moments and the visits brought
+      up to date, and metrics of play.
     """
     mask = trajectory.mask
     observation_id = observation_ids(trajectory)
     extrinsic = state.extrinsic.update(trajectory.reward, mask, config.reward_rate)
     reward = trajectory.reward / extrinsic.deviation
-    curiosity, intrinsic = jnp.zeros_like(mask), state.intrinsic
-    if agent.curiosity is not None:
-        curiosity = mask * _curiosity_reward(agent, state.params, trajectory)
+    curiosity, intrinsic, visits = jnp.zeros_like(mask), state.intrinsic, state.visits
+    if config.curiosity != "none":
+        if config.curiosity == "counts":
+            curiosity, visits = visit_bonus(visits, visit_slots(trajectory)[1:], mask)
+        else:
+            curiosity = mask * _curiosity_reward(agent, state.params, trajectory)
         if config.episodic_novelty:
             curiosity = curiosity * first_visits(observation_id)[1:]
         intrinsic = intrinsic.update(curiosity, mask, config.reward_rate)
@@ -210,7 +217,8 @@ def prepare(
         "intrinsic_reward": jnp.sum(curiosity) / jnp.sum(mask),
         "distinct_observations": jnp.max(observation_id) + 1,
     }
-    return batch, (extrinsic, intrinsic), metrics
+    state = state._replace(extrinsic=extrinsic, intrinsic=intrinsic, visits=visits)
+    return batch, state, metrics
 
 
 def optimize(
@@ -306,6 +314,18 @@ def observation_ids(trajectory: Trajectory) -> jax.Array:
     layout_id = jnp.broadcast_to(layout_id, position.shape)
     groups = distinct.group(layout_id.reshape(-1), position.reshape(-1))
     return groups.number.reshape(position.shape)
+
+
+def visit_slots(trajectory: Trajectory) -> jax.Array:
+    """i32[T + 1, B]: the slot of every observation in a table of `VISIT_SLOTS`."""
+    place_all = jax.vmap(jax.vmap(place), in_axes=(None, 0))
+    states = place_all(trajectory.layout, trajectory.cells)
+    position = jax.vmap(jax.vmap(distinct.position_id))(states)
+    code = distinct.layout_hash(trajectory.layout)[None] + position.astype(jnp.uint32)
+    # The finaliser of MurmurHash3: every bit of the code moves every bit of the slot.
+    code = (code ^ (code >> 16)) * jnp.uint32(0x85EBCA6B)
+    code = (code ^ (code >> 13)) * jnp.uint32(0xC2B2AE35)
+    return ((code ^ (code >> 16)) % VISIT_SLOTS).astype(jnp.int32)
 
 
 def first_visits(observation_id: jax.Array) -> jax.Array:

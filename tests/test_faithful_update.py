@@ -39,7 +39,8 @@ def ours(recording: Recording) -> dict[str, Any]:
         prediction = agent.predict(
             params, trajectory.embedding, next_embedding, trajectory.features, trajectory.action
         )
-        batch, moments, _ = ppo.prepare(agent, CONFIG, state, trajectory)
+        batch, state, _ = ppo.prepare(agent, CONFIG, state, trajectory)
+        moments = (state.extrinsic, state.intrinsic)
         return trajectory, next_embedding, prediction, batch, moments
 
     names = ("trajectory", "next_embedding", "prediction", "batch", "moments")
