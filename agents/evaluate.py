@@ -296,7 +296,8 @@ class Options:
       json: write the results to this file.
       optimality: compare with shortest plans, which are searched for first (a second for
         each task of a perceptual set).
-      cache: keep compiled programs for the next time.
+      no_cache: compile everything anew, instead of keeping compiled programs in
+        ~/.cache/trap_tube_jax from one time to the next.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -306,13 +307,13 @@ class Options:
     gif: Path | None = None
     json: Path | None = None
     optimality: Flag = False
-    cache: Flag = True
+    no_cache: Flag = False
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m agents.evaluate")
-    if options.cache:
+    if not options.no_cache:
         compilation_cache.enable()
     try:
         _evaluate_run(options)

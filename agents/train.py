@@ -55,13 +55,14 @@ class Options(Selection):
     Attributes:
       checkpoint_every: iterations from one checkpoint to the next.
       keep: how many checkpoints to keep, the newest.
-      cache: keep compiled programs for the next time.
+      no_cache: compile everything anew, instead of keeping compiled programs in
+        ~/.cache/trap_tube_jax from one time to the next.
       config: the settings of training.
     """
 
     checkpoint_every: int = 10
     keep: int = 3
-    cache: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    no_cache: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
     def __post_init__(self) -> None:
@@ -77,12 +78,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console = Console()
     try:
         options, stored = parse(arguments)
-        if options.cache:
+        if not options.no_cache:
             compilation_cache.enable()
         folder, run = open_run(options, stored)
         session = Session(
             folder, run, console, checkpoint_every=options.checkpoint_every, keep=options.keep
         )
+        write_json(folder.config, run.to_dict())  # more iterations, once the run has been taken up
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
@@ -159,10 +161,7 @@ def open_run(options: Options, stored: Run | None) -> tuple[RunFolder, Run]:
     path = run_path(options, options.config.env_id)
     if stored is None:
         return RunFolder.create(path, run), run
-    folder = RunFolder(path)
-    if run != stored:
-        write_json(folder.config, run.to_dict())
-    return folder, run
+    return RunFolder(path), run
 
 
 def how_to_resume(folder: RunFolder) -> str:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ import pytest
 
 from agents import compilation_cache, evaluate
 from agents.checkpoint import Checkpoints, digest
-from agents.config import Config
+from agents.config import PRESETS, Config, Curiosity
 from agents.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
 from agents.ppo import make_train
 from agents.run_folder import Run, RunFolder
@@ -173,12 +174,12 @@ def refused(capsys, *arguments, command=main):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--preset slow", "unknown preset 'slow'; allowed: paper, fast"),
+        ("--preset slow", f"unknown preset 'slow'; allowed: {', '.join(PRESETS)}"),
         ("--env q", "unknown task set 'q'; allowed: TrapTube-v0 (base), "),
         ("--env p --env-id st", "--env p contradicts --env-id st"),
         ("--minibatch 3 --episodes 8", "minibatch must divide episodes=8, got 3; allowed: 1, 2"),
         ("--episodess 8", "Unrecognized options: --episodess, 8"),
-        ("--curiosity icmm", "Expected one of ('icm', 'icm-detached', 'rnd', 'none')"),
+        ("--curiosity icmm", f"Expected one of {get_args(Curiosity)}"),
         ("--discount 2", "discount must lie in [0, 1], got 2"),
         ("--seed -1", "seed must be an integer >= 0, got -1"),
         ("--seeds 0", "seeds must be an integer >= 1, got 0"),
@@ -207,7 +208,9 @@ def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
     RunFolder.create(tmp_path / "foreign", Run(Config()))
     shutil.copytree(whole[0] / "checkpoints", tmp_path / "foreign" / "checkpoints")
     out = ["--resume", "--no-cache", "--name", "foreign", "--out", tmp_path]
-    assert "does not fit the run's settings" in refused(capsys, *out)
+    settings = (tmp_path / "foreign" / "config.json").read_bytes()
+    assert "does not fit the run's settings" in refused(capsys, *out, "--iterations", 999)
+    assert (tmp_path / "foreign" / "config.json").read_bytes() == settings
     message = refused(capsys, tmp_path / "foreign", "--no-cache", command=evaluate.main)
     assert f"checkpoint {tmp_path}/foreign/checkpoints/{ITERATIONS} does not fit" in message
     assert "holds no run" in refused(capsys, tmp_path / "none", command=evaluate.main)
@@ -245,7 +248,7 @@ def test_help_documents_every_setting(capsys):
     for field in dataclasses.fields(Config):
         assert f"--{field.name.replace('_', '-')}" in text
     assert "half-width of PPO's interval of probability ratios" in text
-    assert "--preset paper|fast" in text
+    assert f"--preset {'|'.join(PRESETS)}" in text
 
 
 def test_metrics_lose_nothing_but_what_comes_after_the_checkpoint(tmp_path):
