@@ -1,6 +1,5 @@
-"""The adapters without their libraries, and the batch behind the Gymnasium adapter."""
+"""The adapters without their libraries, and the batch that resets in a step of its own."""
 
-import functools
 import importlib
 import sys
 
@@ -10,28 +9,15 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from trap_tube_jax.adapters.batch import CHUNK, reset_batch, step_batch
+from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
-SIZE = CHUNK + 8  # so that ends fill more than one chunk
+SIZE = 20
 
 
 def wander(key, state):
     """A cheap transfer that tells tasks apart."""
     column = jax.random.randint(key, (), 6, 12)
     return state.replace(agent=jnp.stack([jnp.int32(9), column]))
-
-
-@pytest.fixture(scope="module")
-def env():
-    return tt.Environment((wander,), max_steps=4)
-
-
-@pytest.fixture(scope="module")
-def start(env):
-    """States of all ages, so that few, many, all and no episodes end at a step."""
-    state, observation = reset_batch(env, jax.random.split(jax.random.key(0), SIZE))
-    ages = jnp.arange(SIZE, dtype=jnp.int32) % 2 * 2
-    return state.replace(inner=state.inner.replace(time=ages)), observation
 
 
 ACTIONS = np.random.default_rng(0).integers(0, 4, (6, SIZE, 2), np.int32)
@@ -45,31 +31,28 @@ def assert_same(one, other):
         np.testing.assert_array_equal(bits(left), bits(right))
 
 
-def test_same_step_is_the_vmapped_auto_reset(env, start):
-    batched = jax.jit(functools.partial(step_batch, env, same_step=True))
-    single = jax.jit(jax.vmap(tt.AutoReset(env).step))
-    state = expected = start[0]
-    ends = []
-    for actions in ACTIONS:
-        state, timestep = batched(state, actions)
-        expected, expected_timestep = single(expected, actions)
-        assert_same((state, timestep), (expected, expected_timestep))
-        ends.append(int(timestep.done.sum()))
-    assert ends == [0, SIZE // 2, 0, SIZE // 2, 0, SIZE // 2]
+def test_next_step_spends_a_step_on_the_reset():
+    # Fewer at a time than end together, so that the resets take more than one round.
+    batch = NextStepVectorEnvironment(tt.Environment((wander,), max_steps=4), chunk_size=8)
+    reset, step = jax.jit(batch.reset), jax.jit(batch.step)
+    state, _ = reset(jax.random.split(jax.random.key(0), SIZE))
+    old = slice(1, None, 2)
+    inner = state.episodes.inner
+    inner = inner.replace(time=inner.time.at[old].set(2))
+    state = state.replace(episodes=state.episodes.replace(inner=inner))
 
-
-def test_next_step_spends_a_step_on_the_reset(env, start):
-    batched = jax.jit(functools.partial(step_batch, env, same_step=False))
-    old = slice(1, None, 2)  # at time 2 of 4
-    state, _ = batched(start[0], ACTIONS[0])
-    state, timestep = batched(state, ACTIONS[0])
+    state, _ = step(state, ACTIONS[0])
+    state, timestep = step(state, ACTIONS[1])
     assert timestep.truncated[old].all()
     assert timestep.truncated.sum() == SIZE // 2
     np.testing.assert_array_equal(timestep.observation, timestep.final_observation)
-    fresh, observation = reset_batch(env, state.key)
-    state, timestep = batched(state, ACTIONS[1])
-    np.testing.assert_array_equal(timestep.observation[old], observation[old])
+    np.testing.assert_array_equal(timestep.observation, jax.vmap(tt.observe)(state.episodes.inner))
+
+    fresh, first = reset(state.episodes.key)
+    state, timestep = step(state, ACTIONS[2])
+    np.testing.assert_array_equal(timestep.observation[old], first.observation[old])
     assert_same(jax.tree.map(lambda x: x[old], state), jax.tree.map(lambda x: x[old], fresh))
+    assert state.episodes.inner.time[::2].tolist() == [3] * (SIZE // 2)
     assert not timestep.done.any()
     assert timestep.discount.all()
     assert not timestep.reward.any()

@@ -15,12 +15,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from trap_tube_jax.adapters.batch import reset_batch, step_batch
+from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS, NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, registered_ids
 from trap_tube_jax.rendering import render
+from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoReset, AutoResetState
 
 try:
@@ -186,7 +187,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._programs = _batch_programs(self.env, self.autoreset_mode == AutoresetMode.SAME_STEP)
-        self._state: AutoResetState | None = None
+        self._state: VectorState | None = None
 
     def reset(
         self,
@@ -207,9 +208,9 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         if seed is not None or self._state is None:
             keys = _keys(self._seeds(seed))
         else:
-            keys = self._state.key
-        self._state, observations = self._programs.reset(keys)
-        return np.array(observations), {}
+            keys = self._state.episodes.key
+        self._state, timestep = self._programs.reset(keys)
+        return np.array(timestep.observation), {}
 
     def step(
         self, actions: Any
@@ -240,7 +241,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         if self.render_mode is None:
             gymnasium.logger.warn("render does nothing: the environment has no render_mode")
             return None
-        states = self._started().inner
+        states = self._started().episodes.inner
         if self.render_mode == "ansi":
             return tuple(
                 render_ascii(jax.tree.map(lambda x, i=index: x[i], states))
@@ -258,7 +259,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         super().reset(seed=seed[0])
         return list(seed)
 
-    def _started(self) -> AutoResetState:
+    def _started(self) -> VectorState:
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step and render")
         return self._state
@@ -291,8 +292,8 @@ def _single_programs(env: Environment) -> _Programs:
 
 @functools.lru_cache(maxsize=32)
 def _batch_programs(env: Environment, same_step: bool) -> _Programs:
-    step = functools.partial(step_batch, env, same_step=same_step)
-    return _Programs(jax.jit(functools.partial(reset_batch, env)), jax.jit(step, donate_argnums=0))
+    batch = VectorEnvironment(env) if same_step else NextStepVectorEnvironment(env)
+    return _Programs(jax.jit(batch.reset), jax.jit(batch.step, donate_argnums=0))
 
 
 def _environment(task_set: str | Environment, num_features: int, max_steps: int) -> Environment:
