@@ -157,7 +157,7 @@ def evaluation_table(scores: Sequence[Score], title: str) -> Table:
     heads = ["tasks", "solved %", "95 % interval", "mean steps"]
     with_optimality = any(score.optimality is not None for score in scores)
     if with_optimality:
-        heads += ["of solvable %", "shortest / taken", "worst"]
+        heads += ["of solvable %", "optimality", "worst"]
     for head in heads:
         table.add_column(head, justify="right")
     for score in scores:
