@@ -18,6 +18,7 @@ from trap_tube_jax.gallery import episode_frames
 from trap_tube_jax.rendering import save_gif
 from trap_tube_jax.state import State
 
+TABLE_STYLE: dict[str, Any] = {"box": SIMPLE_HEAD, "padding": (0, 0, 0, 1), "pad_edge": False}
 LIVE_ROWS = 10
 LIVE_WIDTH = 10  # characters of a column; a narrow terminal shows the first columns only
 CELL_SIZE = 24  # pixels
@@ -125,7 +126,7 @@ class LiveReport:
 
     def _table(self) -> Table:
         columns = self._columns()[: self._console.width // LIVE_WIDTH]
-        table = Table(box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
+        table = Table(**TABLE_STYLE)
         for entry in columns:
             table.add_column(entry.title, justify="right", no_wrap=True)
         for row in self._rows:
@@ -152,14 +153,15 @@ def duration(seconds: float) -> str:
 
 def evaluation_table(scores: Sequence[Score], title: str) -> Table:
     """The scores of a policy, one set per row."""
-    table = Table(title=f"Greedy evaluation: {title}", box=SIMPLE_HEAD, title_justify="left")
-    table.add_column("set")
-    heads = ["tasks", "solved %", "95 % interval", "mean steps"]
+    table = Table(title=f"Greedy evaluation: {title}", title_justify="left", **TABLE_STYLE)
+    table.add_column("set", no_wrap=True)
+    heads = ["tasks", "solved %", "95 % interval", "steps"]
     with_optimality = any(score.optimality is not None for score in scores)
     if with_optimality:
-        heads += ["of solvable %", "optimality", "worst"]
+        heads += ["of solvable", "optimal", "worst"]
     for head in heads:
-        table.add_column(head, justify="right")
+        # Heads break between words; nothing in a narrow terminal breaks within one.
+        table.add_column(head, justify="right", min_width=max(map(len, head.split())))
     for score in scores:
         table.add_row(*_score_cells(score, with_optimality))
     if any(score.interval is None for score in scores):
@@ -169,7 +171,7 @@ def evaluation_table(scores: Sequence[Score], title: str) -> Table:
 
 
 def _score_cells(score: Score, with_optimality: bool) -> list[str]:
-    interval = "–" if score.interval is None else "{:.1f} to {:.1f}".format(*score.interval)
+    interval = "–" if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval)
     cells = [
         f"{score.label} ({score.set})" if score.label != score.set else score.label,
         str(score.tasks),
@@ -190,7 +192,7 @@ def _optional(value: float | None, form: str) -> str:
 
 def summary_table(solved: Mapping[int, FirstSolved | None], env: str) -> Table:
     """When each seed was first solved."""
-    table = Table(title=f"First solved on {env}", box=SIMPLE_HEAD, title_justify="left")
+    table = Table(title=f"First solved on {env}", title_justify="left", **TABLE_STYLE)
     for head in ("seed", "iteration", "episodes", "transitions", "training time"):
         table.add_column(head, justify="right")
     for seed, first in solved.items():
