@@ -16,12 +16,19 @@ from agents.agent import Agent, Params
 from agents.config import Config
 from agents.curiosity import Prediction, forward_loss, intrinsic_reward, visit_bonus
 from agents.optimizer import adam
+from agents.replay import Replay
 from agents.rollout import Trajectory, action_log_prob, place, rollout, sample_action
 from trap_tube_jax.environment import Environment
 
 Metrics = dict[str, jax.Array]
 
 VISIT_SLOTS = 2**20
+
+# Over [T, B] arrays.
+discounted_returns = jax.vmap(returns.discounted_returns, in_axes=(1, None), out_axes=1)
+generalized_advantages = jax.vmap(
+    returns.generalized_advantages, in_axes=(1, 1, 0, 1, None, None), out_axes=1
+)
 
 
 class TrainState(NamedTuple):
@@ -34,6 +41,7 @@ class TrainState(NamedTuple):
       intrinsic: moments of the intrinsic reward.
       visits: f32[S], how often observations were seen, by slot of a hash table; one unused
         slot without the curiosity `counts`.
+      replay: the newest solved episodes; never filled without imitation.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
@@ -45,6 +53,7 @@ class TrainState(NamedTuple):
     extrinsic: returns.Moments
     intrinsic: returns.Moments
     visits: jax.Array
+    replay: Replay
     key: jax.Array
     iteration: jax.Array
     episodes: jax.Array
@@ -125,6 +134,7 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             extrinsic=returns.Moments.zero(),
             intrinsic=returns.Moments.zero(),
             visits=jnp.zeros(VISIT_SLOTS if config.curiosity == "counts" else 1),
+            replay=Replay.empty(env.base, config.imitation_episodes, config.max_steps),
             key=key,
             iteration=zero,
             episodes=zero,
@@ -145,8 +155,10 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             chunk=config.chunk,
         )
         batch, state, play_metrics = prepare(agent, config, state, trajectory)
+        if config.imitation_coef:
+            state = state._replace(replay=state.replay.remember(trajectory))
         params, opt_state, loss_metrics = optimize(
-            agent, config, optimizer, (state.params, state.opt_state), batch, update_key
+            agent, config, optimizer, state, batch, update_key
         )
         state = state._replace(
             params=params,
@@ -179,7 +191,7 @@ def prepare(
       up to date, and metrics of play.
     """
     mask = trajectory.mask
-    observation_id = observation_ids(trajectory)
+    observation_id = observation_ids(trajectory.layout, trajectory.cells)
     extrinsic = state.extrinsic.update(trajectory.reward, mask, config.reward_rate)
     reward = trajectory.reward / extrinsic.deviation
     curiosity, intrinsic, visits = jnp.zeros_like(mask), state.intrinsic, state.visits
@@ -194,11 +206,8 @@ def prepare(
         reward = reward + config.intrinsic_scale * curiosity / intrinsic.deviation
 
     discount, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
-    advantage = jax.vmap(
-        returns.generalized_advantages, in_axes=(1, 1, 0, 1, None, None), out_axes=1
-    )(reward, trajectory.value, trajectory.value[-1], mask, discount, lambda_)
-    value_target = jax.vmap(returns.discounted_returns, in_axes=(1, None), out_axes=1)(
-        reward, discount
+    advantage = generalized_advantages(
+        reward, trajectory.value, trajectory.value[-1], mask, discount, lambda_
     )
     batch = Batch(
         observation_id=observation_id,
@@ -209,7 +218,7 @@ def prepare(
         mask=mask,
         log_prob=trajectory.log_prob,
         advantage=returns.normalize(advantage, mask),
-        value_target=value_target,
+        value_target=discounted_returns(reward, discount),
     )
     metrics = {
         "success": jnp.mean(trajectory.solved.astype(jnp.float32)),
@@ -225,7 +234,7 @@ def optimize(
     agent: Agent,
     config: Config,
     optimizer: optax.GradientTransformation,
-    start: tuple[Params, Any],
+    state: TrainState,
     batch: Batch,
     key: jax.Array,
 ) -> tuple[Params, Any, Metrics]:
@@ -236,7 +245,7 @@ def optimize(
     ) -> tuple[tuple[Params, Any], Metrics]:
         params, opt_state = carry
         gradient, metrics = jax.grad(loss, has_aux=True)(
-            params, agent, config, batch.take(episodes)
+            params, agent, config, batch.take(episodes), state.replay
         )
         updates, opt_state = optimizer.update(gradient, opt_state, params)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
@@ -249,17 +258,21 @@ def optimize(
 
     minibatches = jax.vmap(permute)(jax.random.split(key, config.epochs))
     (params, opt_state), metrics = jax.lax.scan(
-        update, start, minibatches.reshape(-1, config.minibatch)
+        update, (state.params, state.opt_state), minibatches.reshape(-1, config.minibatch)
     )
     return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
 
-def loss(params: Params, agent: Agent, config: Config, batch: Batch) -> tuple[jax.Array, Metrics]:
+def loss(
+    params: Params, agent: Agent, config: Config, batch: Batch, replay: Replay
+) -> tuple[jax.Array, Metrics]:
     """The total loss f32[] and its terms, weighted as they enter it.
 
-    L = policy + value - entropy + curiosity_coef * (forward + inverse)
+    L = policy + value - entropy + curiosity_coef * (forward + inverse) + imitation
     """
-    features = encode_batch(params, agent, config, batch)
+    features = encode_episodes(
+        params, agent, config, batch.observation_id, batch.layout, batch.cells
+    )
     embedding, next_embedding = agent.unroll(params, features, batch.action, batch.reward)
     outputs = agent.act(params, embedding)
     log_prob = action_log_prob(outputs, batch.action)
@@ -274,6 +287,8 @@ def loss(params: Params, agent: Agent, config: Config, batch: Batch) -> tuple[ja
     if agent.curiosity is not None:
         prediction = agent.predict(params, embedding, next_embedding, features, batch.action)
         terms |= curiosity_losses(config, prediction, batch)
+    if config.imitation_coef:
+        terms["imitation_loss"] = imitation_loss(params, agent, config, replay)
     total = sum(terms.values(), jnp.zeros(()))
     mean_entropy = jnp.sum(entropy * batch.mask) / jnp.sum(batch.mask)
     return total, {**terms, "loss": total, "entropy": mean_entropy}
@@ -290,14 +305,49 @@ def curiosity_losses(config: Config, prediction: Prediction, batch: Batch) -> Me
     return terms
 
 
-def encode_batch(params: Params, agent: Agent, config: Config, batch: Batch) -> jax.Array:
-    """The features f32[T + 1, B, F] of a batch, each distinct observation encoded once."""
-    shape = batch.observation_id.shape
-    groups = distinct.group(batch.observation_id.reshape(-1))
+def imitation_loss(params: Params, agent: Agent, config: Config, replay: Replay) -> jax.Array:
+    """Minus the log-likelihood of remembered successes, each step weighted by its return.
+
+      imitation_coef * mean over steps of -G_t log pi(a_t | o_t)
+
+    Returns:
+      f32[], 0 while nothing is remembered.
+    """
+    observation_id = observation_ids(replay.layout, replay.cells)
+    features = encode_episodes(params, agent, config, observation_id, replay.layout, replay.cells)
+    embedding, _ = agent.unroll(params, features, replay.action, replay.reward)
+    log_prob = action_log_prob(agent.act(params, embedding), replay.action)
+    weight = discounted_returns(replay.reward, jnp.float32(config.discount)) * replay.mask
+    return (
+        -config.imitation_coef
+        * jnp.sum(weight * log_prob)
+        / jnp.sum(jnp.maximum(replay.mask, 1e-6))
+    )
+
+
+def encode_episodes(
+    params: Params,
+    agent: Agent,
+    config: Config,
+    observation_id: jax.Array,
+    layout: tt.State,
+    cells: jax.Array,
+) -> jax.Array:
+    """The features f32[T + 1, B, F] of episodes, each distinct observation encoded once.
+
+    Args:
+      params: the parameters.
+      agent: the network.
+      config: the settings.
+      observation_id: i32[T + 1, B], equal only for equal observations.
+      layout: B states.
+      cells: u8[T + 1, B, 3, 2]; with the layouts, the observations.
+    """
+    shape = observation_id.shape
+    groups = distinct.group(observation_id.reshape(-1))
     time, episode = groups.representative // shape[1], groups.representative % shape[1]
-    layout = jax.tree.map(lambda x: x[episode], batch.layout)
     rows = jax.vmap(lambda layout, cells: tt.observe(place(layout, cells)))(
-        layout, batch.cells[time, episode]
+        jax.tree.map(lambda x: x[episode], layout), cells[time, episode]
     )
     features = distinct.map_rows(
         agent.encode, config.chunk, agent.encoding_params(params), rows, groups.total
@@ -305,22 +355,17 @@ def encode_batch(params: Params, agent: Agent, config: Config, batch: Batch) -> 
     return features[groups.number].reshape(*shape, -1)
 
 
-def observation_ids(trajectory: Trajectory) -> jax.Array:
+def observation_ids(layout: tt.State, cells: jax.Array) -> jax.Array:
     """i32[T + 1, B]: equal only for equal observations, numbered from 0."""
-    layout_id = distinct.layout_ids(trajectory.layout)
-    place_all = jax.vmap(jax.vmap(place), in_axes=(None, 0))
-    states = place_all(trajectory.layout, trajectory.cells)
-    position = jax.vmap(jax.vmap(distinct.position_id))(states)
-    layout_id = jnp.broadcast_to(layout_id, position.shape)
+    position = _position_ids(layout, cells)
+    layout_id = jnp.broadcast_to(distinct.layout_ids(layout), position.shape)
     groups = distinct.group(layout_id.reshape(-1), position.reshape(-1))
     return groups.number.reshape(position.shape)
 
 
 def visit_slots(trajectory: Trajectory) -> jax.Array:
     """i32[T + 1, B]: the slot of every observation in a table of `VISIT_SLOTS`."""
-    place_all = jax.vmap(jax.vmap(place), in_axes=(None, 0))
-    states = place_all(trajectory.layout, trajectory.cells)
-    position = jax.vmap(jax.vmap(distinct.position_id))(states)
+    position = _position_ids(trajectory.layout, trajectory.cells)
     code = distinct.layout_hash(trajectory.layout)[None] + position.astype(jnp.uint32)
     # The finaliser of MurmurHash3: every bit of the code moves every bit of the slot.
     code = (code ^ (code >> 16)) * jnp.uint32(0x85EBCA6B)
@@ -334,6 +379,12 @@ def first_visits(observation_id: jax.Array) -> jax.Array:
     same = observation_id[:, None] == observation_id[None]
     earlier = (time[:, None] > time[None])[..., None]
     return 1.0 - jnp.any(same & earlier, axis=1)
+
+
+def _position_ids(layout: tt.State, cells: jax.Array) -> jax.Array:
+    """i32[T + 1, B]: the ids of where agent, tool and food are."""
+    states = jax.vmap(jax.vmap(place), in_axes=(None, 0))(layout, cells)
+    return jax.vmap(jax.vmap(distinct.position_id))(states)
 
 
 def _curiosity_reward(agent: Agent, params: Params, trajectory: Trajectory) -> jax.Array:

@@ -41,9 +41,9 @@ def ours(recording: Recording) -> dict[str, Any]:
         )
         batch, state, _ = ppo.prepare(agent, CONFIG, state, trajectory)
         moments = (state.extrinsic, state.intrinsic)
-        return trajectory, next_embedding, prediction, batch, moments
+        return trajectory, next_embedding, prediction, batch, moments, state.replay
 
-    names = ("trajectory", "next_embedding", "prediction", "batch", "moments")
+    names = ("trajectory", "next_embedding", "prediction", "batch", "moments", "replay")
     return {"agent": agent, "params": params, **dict(zip(names, run(params), strict=True))}
 
 
@@ -55,7 +55,9 @@ def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
 
     @jax.jit
     def update(params, opt_state):
-        gradient, terms = jax.grad(ppo.loss, has_aux=True)(params, agent, CONFIG, batch)
+        gradient, terms = jax.grad(ppo.loss, has_aux=True)(
+            params, agent, CONFIG, batch, ours["replay"]
+        )
         step, opt_state = optimizer.update(gradient, opt_state, params)
         clipped, _ = clip.update(gradient, clip.init(params))
         params = optax.apply_updates(params, step)

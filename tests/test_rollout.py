@@ -73,7 +73,7 @@ def test_network_saw_the_episodes_in_order(played):
 
 def test_observation_ids_are_equal_for_equal_observations_alone(played):
     trajectory: Trajectory = played[-1]
-    ids = np.asarray(ppo.observation_ids(trajectory)).reshape(-1)
+    ids = np.asarray(ppo.observation_ids(trajectory.layout, trajectory.cells)).reshape(-1)
     boards = np.asarray(trajectory.observations()).reshape(len(ids), -1)
     _, first = np.unique(boards, axis=0, return_inverse=True)
     # Different ids may show one board: the agent over the food, say. Never the reverse.
@@ -98,16 +98,20 @@ def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played
         agent, config, state._replace(params=params), trajectory._replace(features=features)
     )
 
-    def plain_encoding(params, agent, config, batch):
-        del config
-        boards = trajectory._replace(layout=batch.layout, cells=batch.cells).observations()
+    def plain_encoding(params, agent, config, observation_id, layout, cells):
+        del config, observation_id
+        boards = trajectory._replace(layout=layout, cells=cells).observations()
         return jax.vmap(lambda rows: agent.encode(params, rows))(boards)
 
-    gradient = jax.jit(jax.grad(lambda params: ppo.loss(params, agent, config, batch)[0]))
+    gradient = jax.jit(
+        jax.grad(lambda params: ppo.loss(params, agent, config, batch, state.replay)[0])
+    )
     fast = gradient(params)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ppo, "encode_batch", plain_encoding)
-        plain = jax.jit(jax.grad(lambda p: ppo.loss(p, agent, config, batch)[0]))(params)
+        patch.setattr(ppo, "encode_episodes", plain_encoding)
+        plain = jax.jit(jax.grad(lambda p: ppo.loss(p, agent, config, batch, state.replay)[0]))(
+            params
+        )
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), fast, plain)
 
 
@@ -120,7 +124,7 @@ def test_gradient_of_the_whole_loss_by_finite_differences(played):
     params = state.params
     features = jax.vmap(lambda rows: agent.encode(params, rows))(trajectory.observations())
     batch, _, _ = ppo.prepare(agent, config, state, trajectory._replace(features=features))
-    total = jax.jit(lambda params: ppo.loss(params, agent, config, batch)[0])
+    total = jax.jit(lambda params: ppo.loss(params, agent, config, batch, state.replay)[0])
     gradient = jax.jit(jax.grad(total))(params)
     norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
     step = 1e-2 / norm
