@@ -45,7 +45,7 @@ class TrainState(NamedTuple):
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
-      transitions: f32[], environment steps taken.
+      transitions: i32[], environment steps taken.
     """
 
     params: Params
@@ -138,7 +138,7 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             key=key,
             iteration=zero,
             episodes=zero,
-            transitions=jnp.zeros((), jnp.float32),
+            transitions=zero,
         )
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
@@ -166,7 +166,7 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + config.episodes,
-            transitions=state.transitions + jnp.sum(trajectory.mask),
+            transitions=state.transitions + jnp.sum(trajectory.length),
         )
         return state, {**play_metrics, **loss_metrics}
 
@@ -318,11 +318,8 @@ def imitation_loss(params: Params, agent: Agent, config: Config, replay: Replay)
     embedding, _ = agent.unroll(params, features, replay.action, replay.reward)
     log_prob = action_log_prob(agent.act(params, embedding), replay.action)
     weight = discounted_returns(replay.reward, jnp.float32(config.discount)) * replay.mask
-    return (
-        -config.imitation_coef
-        * jnp.sum(weight * log_prob)
-        / jnp.sum(jnp.maximum(replay.mask, 1e-6))
-    )
+    steps = jnp.maximum(jnp.sum(replay.mask), 1.0)
+    return -config.imitation_coef * jnp.sum(weight * log_prob) / steps
 
 
 def encode_episodes(

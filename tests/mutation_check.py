@@ -27,7 +27,7 @@ import pathlib, sys
 import trap_tube_jax
 assert pathlib.Path(trap_tube_jax.__file__).is_relative_to(pathlib.Path.cwd())
 import pytest
-sys.exit(pytest.main(["-x", "--no-header", "-p", "no:cacheprovider", *sys.argv[1:]]))
+sys.exit(pytest.main(["-x", "--no-header", "-p", "no:cacheprovider", "-n0", *sys.argv[1:]]))
 """
 # Of the exhaustive comparison the base task and its swaps are enough here.
 STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-70 and not psy-30")

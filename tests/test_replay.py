@@ -71,14 +71,19 @@ def test_imitation_loss_is_the_weighted_log_likelihood(empty):
     agent = Agent(CONFIG)
     params = agent.init(jax.random.key(0))
     replay = empty.remember(played([3, 1], [True, False]))
-    loss = ppo.imitation_loss(params, agent, CONFIG, replay)
+    loss = jax.jit(lambda params: ppo.imitation_loss(params, agent, CONFIG, replay))(params)
 
     boards = jax.vmap(lambda cells: tt.observe(ppo.place(tt.base_state(), cells)))(
         replay.cells[:, 0]
     )
-    features = agent.encode(params, boards)[:, None]
-    embedding, _ = agent.unroll(params, features, replay.action[:, :1], replay.reward[:, :1])
-    log_prob = ppo.action_log_prob(agent.act(params, embedding), replay.action[:, :1])[:, 0]
+
+    @jax.jit
+    def log_probs(params):
+        features = agent.encode(params, boards)[:, None]
+        embedding, _ = agent.unroll(params, features, replay.action[:, :1], replay.reward[:, :1])
+        return ppo.action_log_prob(agent.act(params, embedding), replay.action[:, :1])[:, 0]
+
+    log_prob = log_probs(params)
     expected = -2.0 * (0.5 * log_prob[0] + 1.0 * log_prob[1]) / 2
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
@@ -86,7 +91,8 @@ def test_imitation_loss_is_the_weighted_log_likelihood(empty):
 def test_nothing_remembered_nothing_imitated(empty):
     agent = Agent(CONFIG)
     params = agent.init(jax.random.key(0))
-    loss, gradient = jax.value_and_grad(ppo.imitation_loss)(params, agent, CONFIG, empty)
+    imitate = jax.jit(lambda params: ppo.imitation_loss(params, agent, CONFIG, empty))
+    loss, gradient = imitate(params), jax.jit(jax.grad(imitate))(params)
     assert loss == 0
     assert all(bool(jnp.all(leaf == 0)) for leaf in jax.tree.leaves(gradient))
 
