@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity import ICM, RND, DetachedICM, Prediction, Transition
-from agents.network import Core, Encoder, Heads, Outputs, draw
+from agents.network import Core, Encoder, Heads, Outputs, RelationalEncoder, draw
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
@@ -22,18 +22,24 @@ class Agent:
     """
 
     def __init__(self, config: Config):
-        self.encoder = Encoder(config.filters)
+        encoders = {"paper": Encoder, "relational": RelationalEncoder}
+        self.encoder = encoders[config.encoder](config.filters)
         self.core = Core(config.hidden, config.embedding)
         self.heads = Heads()
         self.curiosity = _make_curiosity(config)
         self._num_features = config.num_features
-        self._policy_width = config.filters[1]
+        self._policy_width = self._width_of_encoder()
         self._hidden = config.hidden
         self._action_width = 2 * config.embedding
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters."""
         return draw(key, self._deviations())
+
+    def _width_of_encoder(self) -> int:
+        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self._num_features), jnp.uint8)
+        features, _ = jax.eval_shape(self.encoder.init_with_output, jax.random.key(0), board)
+        return features.shape[-1]
 
     def _deviations(self) -> Params:
         """The deviation of every parameter; the modules' own keys are not used."""
@@ -92,8 +98,22 @@ class Agent:
 
     def unroll(
         self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
+    ) -> jax.Array:
+        """The GRU's outputs h at every step, f32[T, B, hidden].
+
+        Args:
+          params: the parameters.
+          features: f32[T + 1, B, F].
+          action: i32[T, B, 2].
+          reward: f32[T, B].
+        """
+        inputs = self._unroll_inputs(params, features, action, reward)[:-1]
+        return _apply(self.core, params["core"], inputs, method=Core.unroll)
+
+    def unroll_both(
+        self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The GRU's outputs at every step and after it.
+        """The GRU's outputs at every step and after it, as curiosity compares them.
 
         The second sequence starts from the initial state at the second observation, with
         the action and reward just taken as the previous ones.
@@ -107,13 +127,19 @@ class Agent:
         Returns:
           h and h', each f32[T, B, hidden].
         """
-        action_tm1 = jnp.concatenate([jnp.zeros_like(action[:1]), action])
-        reward_tm1 = jnp.concatenate([jnp.zeros_like(reward[:1]), reward])
-        inputs = self.core_inputs(params, features, action_tm1, reward_tm1)
+        inputs = self._unroll_inputs(params, features, action, reward)
         both = jnp.concatenate([inputs[:-1], inputs[1:]], axis=1)
         embeddings = _apply(self.core, params["core"], both, method=Core.unroll)
         now, after = jnp.split(embeddings, 2, axis=1)
         return now, after
+
+    def _unroll_inputs(
+        self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
+    ) -> jax.Array:
+        """The GRU's inputs at all observations, f32[T + 1, B, 3 * hidden]."""
+        action_tm1 = jnp.concatenate([jnp.zeros_like(action[:1]), action])
+        reward_tm1 = jnp.concatenate([jnp.zeros_like(reward[:1]), reward])
+        return self.core_inputs(params, features, action_tm1, reward_tm1)
 
     def predict(
         self,

@@ -8,6 +8,7 @@ import difflib
 from typing import Any, Literal, Self, get_args
 
 Curiosity = Literal["icm", "icm-detached", "rnd", "counts", "none"]
+EncoderName = Literal["paper", "relational"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Config:
       value_coef: weight of the squared error of the value.
       entropy_coef: weight of the entropy bonus, summed over grasp and move.
       learning_rate: Adam's step size.
+      cooldown: share of the iterations, the last ones, over which the step size falls
+        linearly to nothing.
       adam_epsilon: Adam's epsilon.
       max_gradient_norm: global norm to which gradients are clipped.
       curiosity: source of the intrinsic reward. `icm`: the paper's, forward and inverse
@@ -42,8 +45,16 @@ class Config:
         their episode.
       imitation_coef: weight of imitating the agent's own solved episodes; 0 for none.
       imitation_episodes: the newest solved episodes that are remembered and imitated.
+      restarts: share of the episodes that start inside a success of a random walk,
+        some steps before its end, instead of at a fresh task; 0 for none.
+      restart_memory: how many such successes are rehearsed at a time.
+      walk_sets: task sets on which random walks look for successes, by id or short name.
+      walks: walks per iteration on each of them, while there is room in the memory.
+      walk_steps: steps of each.
       reward_rate: weight of the past in the moving moments that normalise both rewards.
-      filters: channels of the first convolution, and of all later ones.
+      encoder: `paper`, or `relational`: less arithmetic, and an input that says how cells
+        relate to each other, to the agent and to the food.
+      filters: channels of the first convolutions, and of all later ones.
       hidden: units of the GRU, of the layer before it and of the inverse model.
       embedding: units of each action embedding and of the reward's.
       eval_episodes: fixed evaluation tasks per task set.
@@ -64,6 +75,7 @@ class Config:
     value_coef: float = 0.01
     entropy_coef: float = 1e-4
     learning_rate: float = 1e-3
+    cooldown: float = 0.0
     adam_epsilon: float = 1e-7
     max_gradient_norm: float = 1.0
     curiosity: Curiosity = "icm"
@@ -72,7 +84,13 @@ class Config:
     episodic_novelty: bool = False
     imitation_coef: float = 0.0
     imitation_episodes: int = 16
+    restarts: float = 0.0
+    restart_memory: int = 2048
+    walk_sets: tuple[str, ...] = ()
+    walks: tuple[int, ...] = ()
+    walk_steps: int = 400
     reward_rate: float = 0.9
+    encoder: EncoderName = "paper"
     filters: tuple[int, int] = (32, 64)
     hidden: int = 64
     embedding: int = 8
@@ -92,9 +110,19 @@ class Config:
             for value in values if isinstance(values, tuple) else (values,):
                 if not low <= value <= high:
                     raise ValueError(f"{name} must lie in [{low}, {high}], got {value}")
-        if self.curiosity not in get_args(Curiosity):
-            allowed = ", ".join(get_args(Curiosity))
-            raise ValueError(f"curiosity must be one of {allowed}, got {self.curiosity!r}")
+        for name, choices in (("curiosity", Curiosity), ("encoder", EncoderName)):
+            if getattr(self, name) not in get_args(choices):
+                allowed = ", ".join(get_args(choices))
+                raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}")
+        if len(self.walks) != len(self.walk_sets):
+            raise ValueError(
+                f"walks must be one number for each of walk_sets={self.walk_sets}, got {self.walks}"
+            )
+        if bool(self.restarts) != bool(self.walks):
+            raise ValueError(
+                f"restarts={self.restarts} and walks={self.walks} go together: restarts begin "
+                "in what walks find"
+            )
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
             raise ValueError(
@@ -156,6 +184,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "value_coef": (0, _INFINITY),
     "entropy_coef": (0, _INFINITY),
     "learning_rate": (0, _INFINITY),
+    "cooldown": (0, 1),
     "adam_epsilon": (0, _INFINITY),
     "max_gradient_norm": (0, _INFINITY),
     "intrinsic_scale": (0, _INFINITY),
@@ -163,6 +192,10 @@ _RANGES: dict[str, tuple[float, float]] = {
     "imitation_coef": (0, _INFINITY),
     "imitation_episodes": (1, _INFINITY),
     "reward_rate": (0, 1),
+    "restarts": (0, 1),
+    "restart_memory": (1, _INFINITY),
+    "walks": (1, _INFINITY),
+    "walk_steps": (1, 10_000),
     "filters": (1, 4096),
     "hidden": (1, 65_536),
     "embedding": (1, 65_536),
@@ -187,6 +220,24 @@ PRESETS: dict[str, dict[str, Any]] = {
         "intrinsic_scale": 0.3,
         "imitation_coef": 1.0,
     },
+    # Learns all task sets from {P, St, Sy}: random walks find what to rehearse, and the
+    # encoder is told which cells look alike.
+    "best": {
+        "env_id": "pstsy",
+        "iterations": 2000,
+        "curiosity": "none",
+        "discount": 0.98,
+        "value_coef": 0.02,
+        "entropy_coef": 3e-3,
+        "cooldown": 0.25,
+        "epochs": 3,
+        "encoder": "relational",
+        "filters": (32, 48),
+        "hidden": 128,
+        "restarts": 0.6,
+        "walk_sets": ("pst", "pstsy"),
+        "walks": (8192, 1024),
+    },
 }
 
 
@@ -197,13 +248,15 @@ def _check_type(field: dataclasses.Field, value: Any) -> None:
     elif isinstance(default, float):
         matches = isinstance(value, int | float)
     elif isinstance(default, tuple):
+        kind = str if field.name == "walk_sets" else int
         matches = (
             isinstance(value, tuple)
-            and len(value) == len(default)
-            and all(isinstance(item, int) for item in value)
+            and len(value) == (len(default) or len(value))
+            and all(isinstance(item, kind) for item in value)
         )
     else:
         matches = isinstance(value, type(default))
     if not matches:
-        kind = f"{len(default)} integers" if isinstance(default, tuple) else type(default).__name__
-        raise ValueError(f"{field.name} must be {kind}, got {value!r}")
+        names = {"filters": "2 integers", "walks": "integers", "walk_sets": "names of task sets"}
+        wanted = names.get(field.name, type(default).__name__)
+        raise ValueError(f"{field.name} must be {wanted}, got {value!r}")

@@ -18,6 +18,7 @@ from agents.curiosity import Prediction, forward_loss, intrinsic_reward, visit_b
 from agents.optimizer import adam
 from agents.replay import Replay
 from agents.rollout import Trajectory, action_log_prob, place, rollout, sample_action
+from agents.starts import FRESH, Successes, explore, walk_environments
 from trap_tube_jax.environment import Environment
 
 Metrics = dict[str, jax.Array]
@@ -42,10 +43,12 @@ class TrainState(NamedTuple):
       visits: f32[S], how often observations were seen, by slot of a hash table; one unused
         slot without the curiosity `counts`.
       replay: the newest solved episodes; never filled without imitation.
+      successes: where restarts begin; never filled without them.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
-      transitions: i32[], environment steps taken.
+      transitions: i32[], environment steps taken with the network.
+      steps_walked: f32[], environment steps of random walks.
     """
 
     params: Params
@@ -54,10 +57,12 @@ class TrainState(NamedTuple):
     intrinsic: returns.Moments
     visits: jax.Array
     replay: Replay
+    successes: Successes
     key: jax.Array
     iteration: jax.Array
     episodes: jax.Array
     transitions: jax.Array
+    steps_walked: jax.Array
 
 
 class Batch(NamedTuple):
@@ -123,6 +128,7 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
     env = _environment(config, env)
     agent = Agent(config)
     optimizer = make_optimizer(config)
+    walk_envs = walk_environments(config)
 
     def init(key: jax.Array) -> TrainState:
         params_key, key = jax.random.split(key)
@@ -135,16 +141,27 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             intrinsic=returns.Moments.zero(),
             visits=jnp.zeros(VISIT_SLOTS if config.curiosity == "counts" else 1),
             replay=Replay.empty(env.base, config.imitation_episodes, config.max_steps),
+            successes=Successes.empty(config, env.base),
             key=key,
             iteration=zero,
             episodes=zero,
             transitions=zero,
+            steps_walked=jnp.zeros(()),
         )
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
         reset_keys = jax.random.split(reset_key, config.episodes)
         initial, _ = jax.vmap(env.reset)(reset_keys)
+        origin = jnp.full(config.episodes, FRESH)
+        if config.restarts:
+            walk_key, choice_key = jax.random.split(jax.random.fold_in(reset_key, 0))
+            successes, steps_walked = explore(walk_key, walk_envs, state.successes)
+            state = state._replace(
+                successes=successes, steps_walked=state.steps_walked + steps_walked
+            )
+            origin = successes.choose(choice_key, config)
+            initial = successes.place(origin, initial, config.max_steps)
         trajectory = rollout(
             agent,
             state.params,
@@ -157,6 +174,10 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
         batch, state, play_metrics = prepare(agent, config, state, trajectory)
         if config.imitation_coef:
             state = state._replace(replay=state.replay.remember(trajectory))
+        if config.restarts:
+            play_metrics |= start_metrics(state.successes, origin, trajectory.solved)
+            rehearsed = state.successes.rehearsed(origin, trajectory.solved)
+            state = state._replace(successes=rehearsed)
         params, opt_state, loss_metrics = optimize(
             agent, config, optimizer, state, batch, update_key
         )
@@ -248,6 +269,7 @@ def optimize(
             params, agent, config, batch.take(episodes), state.replay
         )
         updates, opt_state = optimizer.update(gradient, opt_state, params)
+        updates = jax.tree.map(lambda update: rate * update, updates)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
         params: Any = optax.apply_updates(params, updates)
         return (params, opt_state), metrics
@@ -256,11 +278,30 @@ def optimize(
         order = jax.random.permutation(epoch_key, config.episodes)
         return order.reshape(-1, config.minibatch)
 
+    rate = cooldown(config, state.iteration)
     minibatches = jax.vmap(permute)(jax.random.split(key, config.epochs))
     (params, opt_state), metrics = jax.lax.scan(
         update, (state.params, state.opt_state), minibatches.reshape(-1, config.minibatch)
     )
     return params, opt_state, jax.tree.map(jnp.mean, metrics)
+
+
+def cooldown(config: Config, iteration: jax.Array) -> jax.Array:
+    """f32[]: the factor of the step size, 1 until the last iterations and 0 after them."""
+    if not config.cooldown:
+        return jnp.ones(())
+    left = (config.iterations - iteration) / (config.cooldown * config.iterations)
+    return jnp.clip(left, 0.0, 1.0)
+
+
+def start_metrics(successes: Successes, origin: jax.Array, solved: jax.Array) -> Metrics:
+    """How the agent does at fresh tasks, and how far it has come in rehearsing successes."""
+    is_fresh = origin == FRESH
+    return {
+        "fresh_success": jnp.sum(solved & is_fresh) / jnp.maximum(jnp.sum(is_fresh), 1),
+        "rehearsed": successes.number,
+        "reach": successes.mean_reach,
+    }
 
 
 def loss(
@@ -273,7 +314,13 @@ def loss(
     features = encode_episodes(
         params, agent, config, batch.observation_id, batch.layout, batch.cells
     )
-    embedding, next_embedding = agent.unroll(params, features, batch.action, batch.reward)
+    curiosity_terms: Metrics = {}
+    if agent.curiosity is None:
+        embedding = agent.unroll(params, features, batch.action, batch.reward)
+    else:
+        embedding, following = agent.unroll_both(params, features, batch.action, batch.reward)
+        prediction = agent.predict(params, embedding, following, features, batch.action)
+        curiosity_terms = curiosity_losses(config, prediction, batch)
     outputs = agent.act(params, embedding)
     log_prob = action_log_prob(outputs, batch.action)
     surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
@@ -284,9 +331,7 @@ def loss(
         "value_loss": config.value_coef * losses.masked_mean(value_error, batch.mask),
         "entropy_loss": -config.entropy_coef * losses.masked_mean(entropy, batch.mask),
     }
-    if agent.curiosity is not None:
-        prediction = agent.predict(params, embedding, next_embedding, features, batch.action)
-        terms |= curiosity_losses(config, prediction, batch)
+    terms |= curiosity_terms
     if config.imitation_coef:
         terms["imitation_loss"] = imitation_loss(params, agent, config, replay)
     total = sum(terms.values(), jnp.zeros(()))
@@ -315,7 +360,7 @@ def imitation_loss(params: Params, agent: Agent, config: Config, replay: Replay)
     """
     observation_id = observation_ids(replay.layout, replay.cells)
     features = encode_episodes(params, agent, config, observation_id, replay.layout, replay.cells)
-    embedding, _ = agent.unroll(params, features, replay.action, replay.reward)
+    embedding = agent.unroll(params, features, replay.action, replay.reward)
     log_prob = action_log_prob(agent.act(params, embedding), replay.action)
     weight = discounted_returns(replay.reward, jnp.float32(config.discount)) * replay.mask
     steps = jnp.maximum(jnp.sum(replay.mask), 1.0)
@@ -386,7 +431,7 @@ def _position_ids(layout: tt.State, cells: jax.Array) -> jax.Array:
 
 def _curiosity_reward(agent: Agent, params: Params, trajectory: Trajectory) -> jax.Array:
     """The raw intrinsic reward f32[T, B]."""
-    _, next_embedding = agent.unroll(
+    _, next_embedding = agent.unroll_both(
         params, trajectory.features, trajectory.action, trajectory.reward
     )
     prediction = agent.predict(

@@ -153,7 +153,7 @@ def rollout(
         state, timestep = jax.vmap(env.step)(carry.state, action)
         alive = ~(carry.state.terminated | carry.state.truncated)
         record = {
-            "cells": _cells(carry.state),
+            "cells": cells_of(carry.state),
             "action": action,
             "reward": timestep.reward,
             "mask": alive.astype(jnp.float32),
@@ -177,7 +177,7 @@ def rollout(
     times = jnp.arange(env.max_steps)
     end, record = jax.lax.scan(step, start, (times, jax.random.split(key, env.max_steps)))
     _, memory = encode(end.state, end.memory, env.max_steps)
-    record["cells"] = jnp.concatenate([record["cells"], _cells(end.state)[None]])
+    record["cells"] = jnp.concatenate([record["cells"], cells_of(end.state)[None]])
     return Trajectory(layout=initial, features=memory.features, **record)
 
 
@@ -187,6 +187,6 @@ def action_log_prob(outputs: Outputs, action: jax.Array) -> jax.Array:
     return log_prob(outputs.grasp_logits, grasp) + log_prob(outputs.move_logits, move)
 
 
-def _cells(state: State) -> jax.Array:
+def cells_of(state: State) -> jax.Array:
     """u8[B, 3, 2]: the cells of agent, tool and food."""
     return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)

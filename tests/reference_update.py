@@ -108,7 +108,7 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
     reward = jnp.asarray(recording.steps("batch/reward"))
     cells = replay(initial, action)
     features = jax.vmap(lambda image: agent.encode(params, image))(jnp.asarray(images))
-    embedding, _ = agent.unroll(params, features, action, reward)
+    embedding = agent.unroll(params, features, action, reward)
     outputs = agent.act(params, embedding)
     return Trajectory(
         layout=initial,

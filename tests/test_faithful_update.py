@@ -33,7 +33,7 @@ def ours(recording: Recording) -> dict[str, Any]:
         trajectory = make_trajectory(agent, params, recording)
         train = ppo.make_train(CONFIG)
         state = train.init(jax.random.key(0))._replace(params=params)
-        _, next_embedding = agent.unroll(
+        _, next_embedding = agent.unroll_both(
             params, trajectory.features, trajectory.action, trajectory.reward
         )
         prediction = agent.predict(

@@ -80,7 +80,7 @@ def test_imitation_loss_is_the_weighted_log_likelihood(empty):
     @jax.jit
     def log_probs(params):
         features = agent.encode(params, boards)[:, None]
-        embedding, _ = agent.unroll(params, features, replay.action[:, :1], replay.reward[:, :1])
+        embedding = agent.unroll(params, features, replay.action[:, :1], replay.reward[:, :1])
         return ppo.action_log_prob(agent.act(params, embedding), replay.action[:, :1])[:, 0]
 
     log_prob = log_probs(params)

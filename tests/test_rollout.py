@@ -65,7 +65,7 @@ def test_every_observation_has_its_own_features(played):
 
 def test_network_saw_the_episodes_in_order(played):
     _, agent, params, _, trajectory = played
-    embedding, _ = agent.unroll(params, trajectory.features, trajectory.action, trajectory.reward)
+    embedding = agent.unroll(params, trajectory.features, trajectory.action, trajectory.reward)
     np.testing.assert_allclose(trajectory.embedding, embedding, rtol=1e-4, atol=1e-5)
     value = agent.act(params, embedding).value
     np.testing.assert_allclose(trajectory.value, value, rtol=1e-4, atol=1e-4)

@@ -1,0 +1,266 @@
+"""Where the time of one training iteration goes: `python -m benchmarks.train_throughput`.
+
+Times a whole iteration, then its parts by themselves on the same episodes, and compares the
+arithmetic of the encoder, which is nearly all there is, with a large matrix product. The
+parts are separate programs, so they add up to the iteration only roughly.
+"""
+
+import dataclasses
+import math
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import tyro
+from jax.extend.core import ClosedJaxpr, Jaxpr
+from rich.console import Console
+from rich.table import Table
+
+from agents import Config, make_train
+from agents.agent import Params
+from agents.config import PRESETS
+from agents.ppo import Batch, Train, TrainState, encode_episodes, make_optimizer, prepare
+from agents.rollout import Trajectory, rollout, sample_action
+from benchmarks import harness
+from trap_tube_jax import task_set
+
+MATRIX = 4096
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """What to measure.
+
+    Attributes:
+      preset: the settings, those of `agents.train`.
+      env: task sets to train on, by id or short name.
+      warm: iterations of training before the clock starts.
+      repeats: timed calls; the median counts.
+      json: file to write the results to.
+    """
+
+    preset: str = "paper"
+    env: tuple[str, ...] = ("base", "pstsy")
+    warm: int = 0
+    repeats: int = 3
+    json: pathlib.Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses unknown presets."""
+        if self.preset not in PRESETS:
+            raise ValueError(f"unknown preset {self.preset!r}; allowed: {', '.join(PRESETS)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of the iteration, or all of it.
+
+    Attributes:
+      env: short name of the task set.
+      name: what is timed.
+      timing: of one iteration's worth of it.
+      encoder_flop: the encoder's useful floating-point operations in it: each distinct
+        observation once per minibatch and derivative, nothing recomputed, no padding.
+    """
+
+    env: str
+    name: str
+    timing: harness.Timing
+    encoder_flop: float
+
+    @property
+    def flops(self) -> float:
+        """The encoder's useful operations per second."""
+        return self.encoder_flop / self.timing.median_s
+
+
+def measure(env: str, arguments: Arguments) -> list[Part]:
+    """The iteration and its parts, on one task set."""
+    config = Config.preset(arguments.preset, env_id=env)
+    train = make_train(config)
+    state = jax.jit(train.init)(jax.random.key(0))
+    iterate = jax.jit(train.iterate)
+    for _ in range(arguments.warm):
+        state, _ = iterate(state)
+    play = jax.jit(lambda state: _play(train, state))
+    trajectory = play(state)
+    batch, _, _ = jax.jit(lambda *x: prepare(train.agent, config, *x))(state, trajectory)
+    per_observation = matrix_flop(
+        jax.make_jaxpr(train.agent.encode)(state.params, trajectory.observations()[0, :1])
+    )
+    distinct = jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch)
+    play_flop = per_observation * float(jnp.max(batch.observation_id) + 1)
+    # One pass forward, and one each for the derivatives by inputs and by kernels.
+    learn_flop = 3 * per_observation * config.epochs * float(distinct)
+    parts: list[tuple[str, Callable[[], Any], float]] = [
+        ("iteration", lambda: iterate(state), play_flop + learn_flop),
+        ("rollout", lambda: play(state), play_flop),
+        ("encoder", _jitted(_encoder_only, train, state, batch), learn_flop),
+        ("recurrent part and heads", _jitted(_core_only, train, state, batch, trajectory), 0.0),
+        ("optimiser", _jitted(_optimizer_only, train, state), 0.0),
+    ]
+    short = task_set(env).short
+    return [
+        Part(short, name, harness.measure(lambda _, run=run: run(), arguments.repeats), flop)
+        for name, run, flop in parts
+    ]
+
+
+def matrix_flop(jaxpr: ClosedJaxpr | Jaxpr) -> float:
+    """Floating-point operations of all matrix products in a function's jaxpr."""
+    inner = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+    total = 0.0
+    for equation in inner.eqns:
+        if equation.primitive.name == "dot_general":
+            (contracted, _), _ = equation.params["dimension_numbers"]
+            operand: Any = equation.invars[0].aval
+            result: Any = equation.outvars[0].aval
+            depth = math.prod(operand.shape[axis] for axis in contracted)
+            total += 2.0 * depth * math.prod(result.shape)
+        for value in equation.params.values():
+            if isinstance(value, ClosedJaxpr | Jaxpr):
+                total += matrix_flop(value)
+    return total
+
+
+def matrix_product_flops(repeats: int = 5) -> float:
+    """Floating-point operations per second of a large float32 matrix product."""
+    matrix = jnp.ones((MATRIX, MATRIX))
+    multiply = jax.jit(jnp.matmul)
+    timing = harness.measure(lambda _: multiply(matrix, matrix), repeats)
+    return 2.0 * MATRIX**3 / timing.median_s
+
+
+def _play(train: Train, state: TrainState) -> Trajectory:
+    config = train.config
+    reset_key, action_key = jax.random.split(state.key)
+    initial, _ = jax.vmap(train.env.reset)(jax.random.split(reset_key, config.episodes))
+    return rollout(
+        train.agent,
+        state.params,
+        train.env,
+        initial,
+        action_key,
+        choose=sample_action,
+        chunk=config.chunk,
+    )
+
+
+def _minibatches(config: Config) -> jax.Array:
+    """i32[epochs * minibatches, minibatch]: episodes, shuffled anew in each epoch."""
+    keys = jax.random.split(jax.random.key(0), config.epochs)
+    orders = jax.vmap(lambda key: jax.random.permutation(key, config.episodes))(keys)
+    return orders.reshape(-1, config.minibatch)
+
+
+def _distinct_per_epoch(config: Config, batch: Batch) -> jax.Array:
+    """f32[]: distinct observations summed over an epoch's minibatches, on average."""
+
+    def count(episodes: jax.Array) -> jax.Array:
+        names = jnp.sort(batch.observation_id[:, episodes].reshape(-1))
+        return 1 + jnp.sum(names[1:] != names[:-1])
+
+    return jnp.sum(jax.lax.map(count, _minibatches(config))) / config.epochs
+
+
+def _accumulate(config: Config, gradient: Callable[[jax.Array], Params], params: Params) -> Params:
+    """The sum of a gradient over all minibatches of all epochs."""
+
+    def add(total: Params, episodes: jax.Array) -> tuple[Params, None]:
+        return jax.tree.map(jnp.add, total, gradient(episodes)), None
+
+    zero = jax.tree.map(jnp.zeros_like, params)
+    return jax.lax.scan(add, zero, _minibatches(config))[0]
+
+
+def _encoder_only(train: Train, state: TrainState, batch: Batch) -> Params:
+    def total(params: Params, part: Batch) -> jax.Array:
+        where = (part.observation_id, part.layout, part.cells)
+        features = encode_episodes(params, train.agent, train.config, *where)
+        return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
+
+    return _accumulate(
+        train.config,
+        lambda episodes: jax.grad(total)(state.params, batch.take(episodes)),
+        state.params,
+    )
+
+
+def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajectory) -> Params:
+    agent = train.agent
+
+    def total(params: Params, features: jax.Array, part: Batch) -> jax.Array:
+        embedding, following = agent.unroll(params, features, part.action, part.reward)
+        outputs = agent.act(params, embedding)
+        everything = [*outputs, following]
+        if agent.curiosity is not None:
+            prediction = agent.predict(params, embedding, following, features, part.action)
+            everything += jax.tree.leaves(prediction)
+        return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
+
+    def gradient(episodes: jax.Array) -> Params:
+        features = trajectory.features[:, episodes]
+        by_params, by_features = jax.grad(total, (0, 1))(
+            state.params, features, batch.take(episodes)
+        )
+        # The derivative by the features is part of the work, so something must need it.
+        return jax.tree.map(lambda x: x + 1e-30 * jnp.sum(by_features), by_params)
+
+    return _accumulate(train.config, gradient, state.params)
+
+
+def _optimizer_only(train: Train, state: TrainState) -> Params:
+    optimizer = make_optimizer(train.config)
+
+    def update(carry: Any, _: jax.Array) -> tuple[Any, None]:
+        params, opt_state = carry
+        updates, opt_state = optimizer.update(params, opt_state, params)
+        return (jax.tree.map(jnp.add, params, updates), opt_state), None
+
+    steps = train.config.epochs * (train.config.episodes // train.config.minibatch)
+    return jax.lax.scan(update, (state.params, state.opt_state), jnp.arange(steps))[0][0]
+
+
+def _jitted(function: Callable[..., Any], train: Train, *arrays: Any) -> Callable[[], Any]:
+    compiled = jax.jit(lambda *x: function(train, *x))
+    return lambda: compiled(*arrays)
+
+
+def main(arguments: Arguments) -> list[Part]:
+    """Measures, prints a table, and writes JSON if asked to."""
+    console = Console()
+    console.print(harness.machine())
+    peak = matrix_product_flops()
+    console.print(f"matrix product {MATRIX} x {MATRIX}: {peak / 1e9:.0f} GFLOP/s")
+    columns = ("set", "part", "seconds", "share", "compile, s", "encoder GFLOP/s", "of peak")
+    table = Table(*columns, title=f"preset {arguments.preset}")
+    results: list[Part] = []
+    for env in arguments.env:
+        parts = measure(env, arguments)
+        results += parts
+        for part in parts:
+            table.add_row(
+                part.env,
+                part.name,
+                f"{part.timing.median_s:.2f}",
+                f"{part.timing.median_s / parts[0].timing.median_s:.0%}",
+                f"{part.timing.compile_s - part.timing.median_s:.1f}",
+                f"{part.flops / 1e9:.0f}" if part.encoder_flop else "",
+                f"{part.flops / peak:.0%}" if part.encoder_flop else "",
+            )
+    console.print(table)
+    if arguments.json is not None:
+        harness.write_json(
+            arguments.json,
+            results,
+            preset=arguments.preset,
+            warm=arguments.warm,
+            matrix_product_flops=peak,
+        )
+    return results
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
