@@ -19,7 +19,7 @@ from rich.console import Console
 
 import trap_tube_jax as tt
 from agents import checkpoint, compilation_cache, report
-from agents.agent import Agent, Params
+from agents.agent import Agent, Params, Policy
 from agents.config import Config
 from agents.metrics import Optimality, Score
 from agents.rollout import greedy_action, rollout
@@ -49,22 +49,6 @@ class Evaluation(NamedTuple):
     solved: jax.Array
     length: jax.Array
     action: jax.Array
-
-
-class Policy(NamedTuple):
-    """A trained network: what evaluation needs of a run, wherever it comes from.
-
-    Attributes:
-      name: what to call it in tables.
-      config: the settings that it was trained with.
-      params: its parameters.
-      iteration: iterations trained.
-    """
-
-    name: str
-    config: Config
-    params: Params
-    iteration: int
 
 
 def evaluation_tasks(
