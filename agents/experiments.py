@@ -281,6 +281,7 @@ def report(root: Path, protocol: Protocol, options: Options, console: Console) -
     record = {
         "experiment": options.experiment,
         **{name: getattr(protocol, name) for name in FIXED},
+        "ranked": EXPERIMENTS[options.experiment].ranked,
         "command": command(options.experiment, protocol, list(grouped)),
         "algorithms": [
             results.algorithm_record(name, entries, shortest) for name, entries in grouped.items()

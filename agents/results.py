@@ -125,6 +125,7 @@ def aggregate(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "episodes_to_solve": mean_sd([first["episodes"] for first in solved]),
         "transitions": mean_sd([seed["transitions"] for seed in seeds]),
         "training_seconds": mean_sd([seed["training_seconds"] for seed in seeds]),
+        "process_seconds": mean_sd([seed.get("process_seconds") for seed in seeds]),
         "overall": mean_sd([entry["overall"] for entry in best]),
         "sets": [_aggregate_set(scores) for scores in by_set],
     }

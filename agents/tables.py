@@ -103,39 +103,38 @@ def tables(record: Record) -> list[Table]:
 
 
 def solved_table(record: Record) -> Table:
-    """The paper's Table 1 with our rows."""
+    """Our rows above those of the paper's Table 1."""
     rows = []
     for entry in record["algorithms"]:
-        found, paper = entry["aggregate"], PAPER_SOLVED.get(entry["name"])
-        rows.append(
-            (
-                _label(record, entry),
-                f"{found['solved']} / {found['trials']}",
-                _thousands(found["episodes_to_solve"]),
-                f"{paper.solved} / {paper.trials}" if paper else NOTHING,
-                _thousands(paper.episodes._asdict() if paper and paper.episodes else None),
-            )
-        )
-    heads = ("algorithm", "trials solved", "episodes to solve", "paper: trials", "paper: episodes")
-    return Table("Training set solved, mean ± sd over the trials that did", heads, tuple(rows))
+        found = entry["aggregate"]
+        trials = f"{found['solved']} / {found['trials']}"
+        rows.append((_label(record, entry), trials, _thousands(found["episodes_to_solve"])))
+    for name, paper in PAPER_SOLVED.items():
+        episodes = paper.episodes._asdict() if paper.episodes else None
+        trials = f"{paper.solved} / {paper.trials}"
+        rows.append((f"{LABELS[name]}, paper", trials, _thousands(episodes)))
+    heads = ("algorithm", "trials solved", "episodes to solve")
+    title = "Base task solved; episodes to solve it, mean ± sd over the trials that did"
+    return Table(title, heads, tuple(rows))
 
 
 def percent_table(record: Record) -> Table:
-    """Percent of tasks solved of each set; for experiment 2 the paper's Table 2 beside it."""
+    """Percent of tasks solved of each set; for experiment 2 with the columns of Table 2."""
+    ranked = f"mean of {len(record['ranked'])}"
     columns: dict[str, dict[str, str]] = {}
     labels: dict[str, str] = {}
     for entry in record["algorithms"]:
         scores = {score["set"]: score for score in entry["aggregate"]["sets"]}
         labels |= {name: score["label"] for name, score in scores.items()}
-        label = _label(record, entry)
-        columns[label] = {name: _spread(score["percent"]) for name, score in scores.items()}
-        paper = PAPER_PERCENT.get(entry["name"])
-        if paper and record["experiment"] == "exp2":
-            cells = {name: _spread(spread._asdict()) for name, spread in paper.items()}
-            columns[f"{label}, paper"] = cells
+        cells = {name: _spread(score["percent"]) for name, score in scores.items()}
+        columns[_label(record, entry)] = {**cells, ranked: _spread(entry["aggregate"]["overall"])}
+    for name, paper in PAPER_PERCENT.items() if record["experiment"] == "exp2" else ():
+        columns[f"{LABELS[name]}, paper"] = {
+            name: _spread(spread._asdict()) for name, spread in paper.items()
+        }
     rows = [
         (label, *(cells.get(name, NOTHING) for cells in columns.values()))
-        for name, label in labels.items()
+        for name, label in {**labels, ranked: ranked}.items()
     ]
     title = "Tasks solved at the best overall evaluation, %, mean ± sd over trials"
     return Table(title, ("set", *columns), tuple(rows))
@@ -161,32 +160,36 @@ def quality_table(record: Record, entry: Record) -> Table:
 
 def cost_table(record: Record) -> Table:
     """How long the training was."""
+    whole = any(entry["aggregate"].get("process_seconds") for entry in record["algorithms"])
     rows = []
     for entry in record["algorithms"]:
-        found, runs = entry["aggregate"], entry["runs"]
-        iterations = sorted({run["iterations"] for run in runs})
-        rows.append(
-            (
-                _label(record, entry),
-                str(found["trials"]),
-                "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
-                f"{found['transitions']['mean']:,.0f}",
-                duration(found["training_seconds"]["mean"]),
-            )
-        )
+        found = entry["aggregate"]
+        iterations = sorted({run["iterations"] for run in entry["runs"]})
+        cells = [
+            _label(record, entry),
+            str(found["trials"]),
+            "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
+            f"{found['transitions']['mean']:,.0f}",
+            duration(found["training_seconds"]["mean"]),
+        ]
+        if whole:
+            process = found.get("process_seconds")
+            cells.append(duration(process["mean"]) if process else NOTHING)
+        rows.append(tuple(cells))
     heads = ("algorithm", "trials", "iterations", "transitions", "training time")
+    heads = (*heads, "with start-up") if whole else heads
     return Table("What a trial took, on average", heads, tuple(rows))
 
 
 def notes(record: Record) -> list[str]:
-    """What has to be said beside the tables: how far unfinished seeds got, and on what."""
-    lines = []
+    """What has to be said beside the tables: the command, where it ran, what is unfinished."""
+    lines = [f"`{record['command']}`", *provenance(record)]
     for entry in record["algorithms"]:
         for run in entry["runs"]:
             if not run["finished"]:
                 far = f"{run['iterations']} of {run['of']} iterations"
                 lines.append(f"Unfinished: {entry['name']}, seed {run['seed']}, {far}.")
-    return [*lines, *provenance(record)]
+    return lines
 
 
 def provenance(record: Record) -> list[str]:
