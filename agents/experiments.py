@@ -147,7 +147,7 @@ def open_experiment(options: Options) -> tuple[Path, Protocol]:
     if stored is not None:
         if stored.pop("experiment", None) != options.experiment:
             raise ValueError(f"{root} holds another experiment than {options.experiment}")
-        defaults = Protocol.from_dict(stored)
+        defaults = Protocol.from_dict({**stored, "seed": defaults.seed})
     protocol = dataclasses.replace(defaults, **_given(options))
     for field in FIXED if stored is not None else ():
         before, now = getattr(defaults, field), getattr(protocol, field)
@@ -282,7 +282,7 @@ def report(root: Path, protocol: Protocol, options: Options, console: Console) -
         "experiment": options.experiment,
         **{name: getattr(protocol, name) for name in FIXED},
         "ranked": EXPERIMENTS[options.experiment].ranked,
-        "command": command(options.experiment, protocol, list(grouped)),
+        "command": command(options.experiment, whole_protocol(protocol, runs), list(grouped)),
         "algorithms": [
             results.algorithm_record(name, entries, shortest) for name, entries in grouped.items()
         ],
@@ -341,6 +341,17 @@ def find_shortest(path: Path, tasks: Mapping[str, State], console: Console) -> d
                 write_json(path, found)
                 bar.advance(task, len(block))
     return found
+
+
+def whole_protocol(protocol: Protocol, runs: Sequence[AlgorithmRun]) -> Protocol:
+    """The protocol that comes to all these runs at once."""
+    seeds = [seed for entry in runs for seed in entry.run.seed_range]
+    return dataclasses.replace(
+        protocol,
+        iterations=max(entry.run.config.iterations for entry in runs),
+        seed=min(seeds),
+        seeds=max(seeds) - min(seeds) + 1,
+    )
 
 
 def command(experiment: str, protocol: Protocol, algorithms: Sequence[str]) -> str:

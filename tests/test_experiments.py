@@ -14,7 +14,17 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import evaluate, experiments, figures, pretrained, results, session, tables, tracking
+from agents import (
+    evaluate,
+    experiments,
+    figures,
+    pretrained,
+    report,
+    results,
+    session,
+    tables,
+    tracking,
+)
 from agents.checkpoint import Checkpoints, digest, to_arrays
 from agents.metrics import TIMING_COLUMNS, MetricsLog
 from agents.ppo import make_train
@@ -84,6 +94,7 @@ def lab():
         patch.setitem(EXPERIMENTS, "exp1", EXPERIMENTS["exp1"]._replace(ranked=tuple(tasks)))
         patch.setattr(session, "make_train", fake_train)
         patch.setattr(session, "evaluate", unsolved)
+        patch.setattr(report, "save_curves", lambda *args: None)
         patch.setattr(tracking, "Evaluator", lambda config, tasks: evaluator(config))
         patch.setattr(experiments, "draw_tasks", lambda config: tasks)
         one_step = lambda states: np.ones(len(states.time), np.int32)  # noqa: E731
@@ -218,25 +229,27 @@ def kill_after(patch, owner, name, is_moment):
     patch.setattr(owner, name, wrapped)
 
 
-@pytest.mark.parametrize(("seed", "moment"), [(0, "outcomes"), (0, "best"), (1, "metrics")])
-def test_killed_experiments_continue_to_the_same_bits(whole, tmp_path, seed, moment):
-    """Killed in the fourth iteration, one past a checkpoint, at each of its writes.
+def test_killed_experiments_continue_to_the_same_bits(whole, tmp_path):
+    """Killed in a fourth iteration, one past a checkpoint, after each of its writes.
 
     The evaluation of the fourth iteration is the best of seed 0, and not of seed 1.
     """
 
-    def appended(log, rows):
-        is_metrics = "success" in rows[0]
-        now = (rows[0]["seed"], rows[0]["iteration"], "metrics" if is_metrics else "outcomes")
-        return now == (seed, 4, moment)
+    def appended(column, seed):
+        return lambda log, rows: (
+            column in rows[0] and (rows[0]["seed"], rows[0]["iteration"]) == (seed, 4)
+        )
 
-    with pytest.MonkeyPatch.context() as patch:
-        kill_after(patch, MetricsLog, "append", appended)
-        if moment == "best":
-            kill_after(patch, pretrained, "save", lambda path, policy: policy.iteration == 4)
-        with pytest.raises(Killed):
-            run(tmp_path)
-    assert not (tmp_path / "x" / f"ppo-seed{seed}" / "summary.json").exists()
+    moments = [
+        (MetricsLog, "append", appended("p/00000", seed=0)),
+        (pretrained, "save", lambda path, policy: policy.iteration == 4),
+        (MetricsLog, "append", appended("success", seed=1)),
+    ]
+    for moment in moments:
+        with pytest.MonkeyPatch.context() as patch:
+            kill_after(patch, *moment)
+            with pytest.raises(Killed):
+                run(tmp_path)
     run(tmp_path)
     for name in ("ppo-seed0", "ppo-seed1"):
         assert contents(tmp_path / "x" / name) == contents(whole / name)
@@ -245,11 +258,13 @@ def test_killed_experiments_continue_to_the_same_bits(whole, tmp_path, seed, mom
 def test_more_seeds_and_iterations_add_to_what_is_there(whole, tmp_path):
     shutil.copytree(whole, tmp_path / "x")
     kept = (whole / "ppo-seed0" / "metrics.csv").read_bytes()
-    root = run(tmp_path, seeds=3)
+    root = run(tmp_path, "--seed", 2, seeds=1)
     assert sorted(path.name for path in root.glob("ppo-*")) == [f"ppo-seed{i}" for i in range(3)]
     assert (root / "ppo-seed0" / "metrics.csv").read_bytes() == kept
     run(tmp_path, seeds=1, iterations=8)
-    (entry,) = json.loads((root / "summary.json").read_text())["algorithms"]
+    summary = json.loads((root / "summary.json").read_text())
+    assert "--seeds 3 --iterations 8" in summary["command"]
+    (entry,) = summary["algorithms"]
     far = [(trial["seed"], trial["iterations"], trial["finished"]) for trial in entry["runs"]]
     assert far == [(0, 8, True), (1, 6, True), (2, 6, True)]
     assert (root / "ppo-seed0" / "metrics.csv").read_bytes().startswith(kept)
