@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import Progress as Bar
 
+import trap_tube_jax as tt
 from agents import compilation_cache, figures, results, tables
 from agents.config import PRESETS, Config
 from agents.evaluate import ALL_SETS, evaluation_tasks, shortest_lengths
@@ -270,9 +272,10 @@ def report(root: Path, protocol: Protocol, options: Options, console: Console) -
     runs = [entry for entry in results.find_runs(root) if entry.rows]
     if not runs:
         raise ValueError(f"{root} holds no run with a first iteration yet")
+    tasks = draw_tasks(runs[0].run.config)
     shortest = None
     if not options.no_optimality:
-        shortest = find_shortest(root / SHORTEST_FILE, draw_tasks(runs[0].run.config), console)
+        shortest = find_shortest(root / SHORTEST_FILE, tasks, console)
     grouped = {
         name: [entry for entry in runs if entry.algorithm == name]
         for name in ALGORITHMS
@@ -282,6 +285,7 @@ def report(root: Path, protocol: Protocol, options: Options, console: Console) -
         "experiment": options.experiment,
         **{name: getattr(protocol, name) for name in FIXED},
         "ranked": EXPERIMENTS[options.experiment].ranked,
+        "equal_to_base": {name: equal_to_base(states) for name, states in tasks.items()},
         "command": command(options.experiment, whole_protocol(protocol, runs), list(grouped)),
         "algorithms": [
             results.algorithm_record(name, entries, shortest) for name, entries in grouped.items()
@@ -341,6 +345,17 @@ def find_shortest(path: Path, tasks: Mapping[str, State], console: Console) -> d
                 write_json(path, found)
                 bar.advance(task, len(block))
     return found
+
+
+def equal_to_base(tasks: State) -> float:
+    """The percentage of tasks that equal the base task."""
+    base = tt.base_state(tasks.palette.shape[-1])
+    same = jax.tree.map(
+        lambda x, y: np.all(np.asarray(x) == np.asarray(y), axis=tuple(range(1, x.ndim))),
+        tasks,
+        base,
+    )
+    return 100 * float(np.mean(np.all(jax.tree.leaves(same), axis=0)))
 
 
 def whole_protocol(protocol: Protocol, runs: Sequence[AlgorithmRun]) -> Protocol:

@@ -97,7 +97,7 @@ def tables(record: Record) -> list[Table]:
     made += [
         quality_table(record, entry)
         for entry in evaluated
-        if any(score["optimality"] for score in entry["aggregate"]["sets"])
+        if any(score["percent_of_solvable"] for score in entry["aggregate"]["sets"])
     ]
     return [*made, cost_table(record)]
 
@@ -119,7 +119,11 @@ def solved_table(record: Record) -> Table:
 
 
 def percent_table(record: Record) -> Table:
-    """Percent of tasks solved of each set; for experiment 2 with the columns of Table 2."""
+    """Percent of tasks solved of each set; for experiment 2 with the columns of Table 2.
+
+    Of experiment 1 the paper says that agents solve what happens to equal the base task: the
+    share of such tasks stands beside theirs.
+    """
     ranked = f"mean of {len(record['ranked'])}"
     columns: dict[str, dict[str, str]] = {}
     labels: dict[str, str] = {}
@@ -132,6 +136,9 @@ def percent_table(record: Record) -> Table:
         columns[f"{LABELS[name]}, paper"] = {
             name: _spread(spread._asdict()) for name, spread in paper.items()
         }
+    if record["experiment"] == "exp1":
+        equal = record["equal_to_base"].items()
+        columns["equal to base"] = {name: f"{percent:.1f}" for name, percent in equal}
     rows = [
         (label, *(cells.get(name, NOTHING) for cells in columns.values()))
         for name, label in {**labels, ranked: ranked}.items()

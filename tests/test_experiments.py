@@ -1,5 +1,4 @@
 import csv
-import functools
 import json
 import os
 import re
@@ -26,7 +25,7 @@ from agents import (
     tracking,
 )
 from agents.checkpoint import Checkpoints, digest, to_arrays
-from agents.metrics import TIMING_COLUMNS, MetricsLog
+from agents.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
 from agents.ppo import make_train
 from agents.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
 from agents.run_folder import Run, RunFolder
@@ -35,22 +34,25 @@ from benchmarks import readme_tables
 ROOT = Path(__file__).parent.parent
 SMALL = ["filters=[2,2]", "hidden=4", "embedding=2"]
 ITERATIONS = 6
-# Beside the agent, in every direction: a random policy solves some of these tasks.
-FOOD_BESIDE = [(8, 1), (10, 1), (9, 0), (9, 2)]
+# By seed and iteration, the steps taken in the tasks of two sets, 0 where unsolved. The best
+# evaluation of seed 0 is its second one, of seed 1 its first.
+STEPS = {
+    (0, 2): {"base": [0], "p": [2, 0, 0, 0]},
+    (0, 4): {"base": [1], "p": [0, 1, 4, 0]},
+    (0, 6): {"base": [1], "p": [1, 1, 0, 0]},
+    (1, 2): {"base": [0], "p": [3, 3, 0, 0]},
+    (1, 4): {"base": [0], "p": [0, 0, 2, 0]},
+    (1, 6): {"base": [0], "p": [0, 0, 3, 3]},
+}
+NOTHING_SOLVED = {"base": [0], "p": [0, 0, 0, 0]}
 
 
 class Killed(BaseException):
     """Nothing in the way of a process that is killed catches it."""
 
 
-def food_beside(cells):
-    base = tt.base_state()
-    states = [base.replace(food=jnp.array(cell, jnp.int32)) for cell in cells]
-    return jax.tree.map(lambda *x: jnp.stack(x), *states)
-
-
 def fake_train(config):
-    """Training that draws new parameters in each iteration, and compiles at once."""
+    """Training at once: every parameter becomes 100 * seed + iteration."""
     real = make_train(config)
     shapes = jax.eval_shape(real.init, jax.random.key(0))._replace(key=None)
 
@@ -59,14 +61,9 @@ def fake_train(config):
         return zeros._replace(key=key)
 
     def iterate(state):
-        leaves, structure = jax.tree.flatten(state.params)
         iteration, seed = state.iteration + 1, jax.random.key_data(state.key)[-1]
-        params = [
-            2 * jnp.sin((3.1 + seed) * iteration * jnp.arange(1, x.size + 1)).reshape(x.shape)
-            for x in leaves
-        ]
         state = state._replace(
-            params=structure.unflatten(params),
+            params=jax.tree.map(lambda x: jnp.zeros_like(x) + 100 * seed + iteration, state.params),
             iteration=iteration,
             episodes=state.episodes + 8,
             transitions=state.transitions + 48,
@@ -76,26 +73,40 @@ def fake_train(config):
     return real._replace(init=init, iterate=iterate)
 
 
+class FakeEvaluator:
+    def __init__(self, config, tasks):
+        self.tasks = tasks
+
+    def __call__(self, params):
+        number = int(np.ravel(jax.tree.leaves(params)[0])[0])
+        steps = STEPS.get(divmod(number, 100), NOTHING_SOLVED)
+        played = {name: jnp.array(steps[name]) for name in self.tasks}
+        return {
+            name: evaluate.Evaluation(taken > 0, jnp.where(taken > 0, taken, 6), taken)
+            for name, taken in played.items()
+        }
+
+
+def fake_evaluate(agent, params, env, tasks, chunk):
+    nothing = jnp.zeros(len(tasks.time), jnp.int32)
+    return evaluate.Evaluation(nothing > 0, nothing, nothing)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def lab():
-    """Experiments in seconds: fake training, two sets of own tasks, one evaluator for all."""
-    tasks = {"base": food_beside(FOOD_BESIDE[:2]), "p": food_beside(FOOD_BESIDE)}
-
-    def unsolved(agent, params, env, tasks, chunk):
-        count = len(tasks.time)
-        steps = jnp.zeros(count, jnp.int32)
-        return evaluate.Evaluation(steps > 0, steps, jnp.zeros((count, 6, 2), jnp.int32))
-
-    @functools.cache
-    def evaluator(config):
-        return evaluate.Evaluator(config, tasks)
-
+    """Experiments in seconds: training, evaluation and solver are fakes, and there are two sets."""
+    base = tt.base_state()
+    columns = [base.agent.at[1].add(step) for step in range(4)]
+    tasks = {
+        "base": jax.tree.map(lambda x: x[None], base),
+        "p": jax.tree.map(lambda *x: jnp.stack(x), *(base.replace(agent=x) for x in columns)),
+    }
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EXPERIMENTS, "exp1", EXPERIMENTS["exp1"]._replace(ranked=tuple(tasks)))
         patch.setattr(session, "make_train", fake_train)
-        patch.setattr(session, "evaluate", unsolved)
+        patch.setattr(session, "evaluate", fake_evaluate)
         patch.setattr(report, "save_curves", lambda *args: None)
-        patch.setattr(tracking, "Evaluator", lambda config, tasks: evaluator(config))
+        patch.setattr(tracking, "Evaluator", FakeEvaluator)
         patch.setattr(experiments, "draw_tasks", lambda config: tasks)
         one_step = lambda states: np.ones(len(states.time), np.int32)  # noqa: E731
         patch.setattr(experiments, "shortest_lengths", one_step)
@@ -141,32 +152,31 @@ def record(whole):
 
 
 def test_evaluations_are_in_the_metrics(whole):
-    rows = untimed(whole / "ppo-seed0" / "metrics.csv")
-    outcomes = untimed(whole / "ppo-seed0" / "outcomes.csv")
-    evaluated = [row for row in rows if row["greedy_overall"] != "nan"]
-    assert [row["iteration"] for row in rows] == [str(i + 1) for i in range(ITERATIONS)]
-    assert [row["iteration"] for row in evaluated] == ["2", "4", "6"]
-    assert [row["iteration"] for row in outcomes] == ["2", "4", "6"]
-    for row, steps in zip(evaluated, outcomes, strict=True):
-        shares = []
-        for name, count in (("base", 2), ("p", 4)):
-            taken = [int(steps[f"{name}/{index:05d}"]) for index in range(count)]
-            assert float(row[f"greedy_{name}"]) == np.mean(np.array(taken) > 0)
-            shares.append(float(row[f"greedy_{name}"]))
-        assert float(row["greedy_overall"]) == np.mean(shares)
-    assert len({row["greedy_overall"] for row in evaluated}) > 1, "nothing is the best of these"
+    for seed in (0, 1):
+        rows = untimed(whole / f"ppo-seed{seed}" / "metrics.csv")
+        assert [row["iteration"] for row in rows] == [str(i + 1) for i in range(ITERATIONS)]
+        for row in rows:
+            played = STEPS.get((seed, int(row["iteration"])), {"base": [np.nan], "p": [np.nan]})
+            shares = [np.mean(np.sign(played[name])) for name in ("base", "p")]
+            found = [float(row[f"greedy_{name}"]) for name in ("base", "p", "overall")]
+            np.testing.assert_array_equal(found, [*shares, np.mean(shares)])
+
+
+def test_the_steps_of_every_task_are_kept(whole):
+    for seed in (0, 1):
+        for row in read_metrics(whole / f"ppo-seed{seed}" / "outcomes.csv"):
+            played = tracking.outcome(row)
+            for name, steps in STEPS[seed, int(row["iteration"])].items():
+                solved, taken = played[name]
+                assert taken.tolist() == steps
+                assert solved.tolist() == [count > 0 for count in steps]
 
 
 def test_the_best_parameters_are_kept(whole):
-    rows = untimed(whole / "ppo-seed0" / "metrics.csv")
-    best = max(
-        (row for row in rows if row["greedy_overall"] != "nan"),
-        key=lambda row: float(row["greedy_overall"]),
-    )
-    policy = pretrained.load(whole / "ppo-seed0" / "best-seed0.npz")
-    assert policy.iteration == int(best["iteration"])
-    played = tracking.Evaluator(policy.config, {})(policy.params)
-    assert np.mean(played["p"].solved) == float(best["greedy_p"])
+    for seed, iteration in ((0, 4), (1, 2)):
+        policy = pretrained.load(whole / f"ppo-seed{seed}" / f"best-seed{seed}.npz")
+        assert policy.iteration == iteration
+        assert np.all(jax.tree.leaves(policy.params)[0] == 100 * seed + iteration)
 
 
 def test_the_record_says_how_good_the_best_evaluation_is(whole, record):
@@ -176,20 +186,13 @@ def test_the_record_says_how_good_the_best_evaluation_is(whole, record):
     assert (trial["episodes"], trial["transitions"]) == (48, 288)
     assert trial["first_solved"] is None
     assert trial["machines"][0]["jax"] == jax.__version__
-    scores = {score["set"]: score for score in trial["best"]["sets"]}
-    assert list(scores) == ["base", "p"]
-    steps = next(
-        row
-        for row in untimed(whole / "ppo-seed0" / "outcomes.csv")
-        if row["iteration"] == str(trial["best"]["iteration"])
-    )
-    taken = [int(steps[f"p/{index:05d}"]) for index in range(4)]
-    assert scores["p"]["percent"] == 25 * sum(count > 0 for count in taken)
-    # The food is one step away, so a shortest plan has one step.
-    assert json.loads((whole / "shortest.json").read_text()) == {"base": [1, 1], "p": [1, 1, 1, 1]}
-    ratios = [1 / count for count in taken if count]
-    assert scores["p"]["optimality"]["mean"] == pytest.approx(np.mean(ratios))
-    assert scores["p"]["optimality"]["worst"] == pytest.approx(min(ratios))
+    assert (trial["best"]["iteration"], trial["best"]["overall"]) == (4, 75)
+    base, p = trial["best"]["sets"]
+    assert (base["set"], base["percent"], base["interval"]) == ("base", 100, None)
+    assert (p["set"], p["percent"], p["mean_steps"]) == ("p", 50, 2.5)
+    assert (p["optimality"]["mean"], p["optimality"]["worst"]) == ((1 + 1 / 4) / 2, 1 / 4)
+    assert json.loads((whole / "shortest.json").read_text()) == {"base": [1], "p": [1, 1, 1, 1]}
+    assert record["equal_to_base"] == {"base": 100, "p": 25}
 
 
 def test_an_experiment_leaves_tables_and_figures(whole, record, capsys):
@@ -277,7 +280,7 @@ def test_seeds_side_by_side_are_those_one_after_another(whole, tmp_path):
         for seed in (0, 1):
             alone = untimed(whole / f"ppo-seed{seed}" / name)
             assert [row for row in rows if row["seed"] == str(seed)] == alone
-    assert [pretrained.load(folder / f"best-seed{seed}.npz").iteration for seed in (0, 1)] == [4, 2]
+    assert [pretrained.load(folder / f"best-seed{i}.npz").iteration for i in (0, 1)] == [4, 2]
 
 
 def refused(capsys, *arguments):
@@ -363,6 +366,7 @@ def test_tables_hold_means_and_deviations(tmp_path):
     entry = results.algorithm_record("ppo+icm", runs, shortest)
     record = {
         "experiment": "exp2",
+        "equal_to_base": {"p": 25},
         "preset": "paper",
         "ranked": ["p"],
         "command": "x",
@@ -383,8 +387,9 @@ def test_tables_hold_means_and_deviations(tmp_path):
     assert "Unfinished: ppo+icm, seed 0, 3 of 4 iterations." in text
     assert "Unfinished: ppo+icm, seed 1, 3 of 4 iterations." in text
     assert "seed 2" not in text
-    solved = tables.solved_table({**record, "experiment": "exp1"})
-    assert solved.rows[0] == ("PPO + ICM", "2 / 3", "3,072 ± 1,448")
+    record["experiment"] = "exp1"
+    assert tables.solved_table(record).rows[0] == ("PPO + ICM", "2 / 3", "3,072 ± 1,448")
+    assert tables.percent_table(record).rows[0] == ("{P}", "55.6 ± 19.2", "25.0")
 
 
 def test_curves_are_drawn_of_seeds_of_any_length(tmp_path):
