@@ -18,6 +18,7 @@ def machine() -> dict[str, Any]:
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
         "device": jax.devices()[0].device_kind,
+        "devices": jax.device_count(),
         "platform": platform.platform(),
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in VERSIONED},

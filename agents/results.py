@@ -162,17 +162,17 @@ def _best_record(
     best = best_row(rows)
     if best is None:
         return None
-    played = next(
-        row
-        for row in _of_seed(read_metrics(entry.folder.outcomes), seed)
-        if row["iteration"] == best["iteration"]
-    )
+    outcomes = _of_seed(read_metrics(entry.folder.outcomes), seed)
+    played = [row for row in outcomes if row["iteration"] == best["iteration"]]
+    if not played:
+        where, which = entry.folder.outcomes, best["iteration"]
+        raise ValueError(f"{where} lacks seed {seed}, iteration {which}, which the metrics have")
     scores = [
-        _score(name, *outcome, entry.run.config.max_steps, shortest)
-        for name, outcome in outcome(played).items()
+        _score(name, solved, steps, entry.run.config.max_steps, shortest)
+        for name, (solved, steps) in outcome(played[0]).items()
     ]
-    order = {entry.short: index for index, entry in enumerate(tt.PAPER_TASK_SETS)}
-    scores.sort(key=lambda score: order.get(score.set, len(order)))
+    order = [task_set.short for task_set in tt.PAPER_TASK_SETS]
+    scores.sort(key=lambda score: order.index(score.set))
     return {
         "iteration": int(best["iteration"]),
         "episodes": int(best["episodes"]),

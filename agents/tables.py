@@ -216,10 +216,9 @@ def markdown(record: Record) -> str:
 
 
 def _machine(machine: Mapping[str, Any]) -> str:
-    device = machine["device"]
     where = f"{machine['cores']} cores of {machine['processor']}"
-    if device.lower() != "cpu":
-        where = f"{device}, {where}"
+    if machine["device"].lower() != "cpu":
+        where = f"{machine['devices']} {machine['device']}, {where}"
     commit = machine["commit"] or "unknown"
     return f"Ran on {where}; jax {machine['jax']}, commit `{commit}`."
 

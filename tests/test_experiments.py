@@ -32,6 +32,7 @@ from agents.run_folder import Run, RunFolder
 from benchmarks import readme_tables
 
 ROOT = Path(__file__).parent.parent
+FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 SMALL = ["filters=[2,2]", "hidden=4", "embedding=2"]
 ITERATIONS = 6
 # By seed and iteration, the steps taken in the tasks of two sets, 0 where unsolved. The best
@@ -445,7 +446,7 @@ def test_the_quick_protocol_runs(tmp_path):
             **os.environ,
             "JAX_PLATFORMS": "cpu",
             "JAX_NUMPY_RANK_PROMOTION": "raise",
-            "XLA_FLAGS": "--xla_backend_optimization_level=0",
+            "XLA_FLAGS": FLAGS,
         },
         capture_output=True,
         text=True,
