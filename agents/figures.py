@@ -46,6 +46,7 @@ def save_success(curves: Curves, path: Path, title: str) -> None:
     panels |= {label: name for name, label in known.items() if name in columns}
     if OVERALL in columns:
         panels["overall"] = OVERALL
+    title = f"{title}: mean, ± sd, maximum (dotted)"
     _save(curves, panels, path, title, columns=5, draw=_draw_spread)
 
 
@@ -73,6 +74,7 @@ def _save(
     draw: Callable[..., None],
 ) -> None:
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+    from matplotlib.ticker import EngFormatter, MaxNLocator  # noqa: PLC0415
 
     columns = min(columns, len(panels))
     height = -(-len(panels) // columns)
@@ -90,6 +92,8 @@ def _save(
         axis.grid(alpha=0.3)
     for axis in axes[-1]:
         axis.set_xlabel("episodes")
+        axis.xaxis.set_major_locator(MaxNLocator(5))
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes[0, 0].legend(fontsize="small")
     figure.savefig(path, format="png", dpi=DPI)
 
