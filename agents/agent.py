@@ -1,6 +1,6 @@
 """The agent: policy network and curiosity together, as pure functions of parameters."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -12,6 +12,22 @@ from agents.network import Core, Encoder, Heads, Outputs, RelationalEncoder, dra
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
+
+
+class Policy(NamedTuple):
+    """A trained network: what evaluation needs of a run, wherever it comes from.
+
+    Attributes:
+      name: what to call it in tables.
+      config: the settings that it was trained with.
+      params: its parameters.
+      iteration: iterations trained.
+    """
+
+    name: str
+    config: Config
+    params: Params
+    iteration: int
 
 
 class Agent:

@@ -1,6 +1,7 @@
 """Greedy evaluation on fixed tasks that training never draws.
 
-On the command line, `python -m agents.evaluate runs/<name>`.
+On the command line, `python -m agents.evaluate runs/<name>`, or `--pretrained <name>` for
+parameters that are shipped.
 """
 
 import dataclasses
@@ -18,8 +19,8 @@ import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import checkpoint, compilation_cache, report
-from agents.agent import Agent, Params
+from agents import checkpoint, compilation_cache, pretrained, report
+from agents.agent import Agent, Params, Policy
 from agents.config import Config
 from agents.metrics import Optimality, Score
 from agents.rollout import greedy_action, rollout
@@ -49,22 +50,6 @@ class Evaluation(NamedTuple):
     solved: jax.Array
     length: jax.Array
     action: jax.Array
-
-
-class Policy(NamedTuple):
-    """A trained network: what evaluation needs of a run, wherever it comes from.
-
-    Attributes:
-      name: what to call it in tables.
-      config: the settings that it was trained with.
-      params: its parameters.
-      iteration: iterations trained.
-    """
-
-    name: str
-    config: Config
-    params: Params
-    iteration: int
 
 
 def evaluation_tasks(
@@ -285,10 +270,11 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Evaluates a trained run greedily, on fixed tasks that training never draws.
+    """Evaluates a trained agent greedily, on fixed tasks that training never draws.
 
     Attributes:
-      run: the run's folder.
+      run: a run's folder, or a file of parameters.
+      pretrained: the name of shipped parameters, instead of a run.
       sets: ids or short names of task sets.
       episodes: tasks per set; the run's `eval_episodes` if absent. The base set has one.
       iteration: the checkpoint to evaluate; the newest if absent.
@@ -300,7 +286,8 @@ class Options:
         ~/.cache/trap_tube_jax from one time to the next.
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    pretrained: str | None = None
     sets: tuple[str, ...] = ALL_SETS
     episodes: int | None = None
     iteration: int | None = None
@@ -323,7 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _evaluate_run(options: Options) -> None:
-    policies = load_run(options.run, options.iteration)
+    source, policies = _load(options)
     config = policies[0].config
     episodes = config.eval_episodes if options.episodes is None else options.episodes
     evaluator = Evaluator.of_sets(config, options.sets, episodes)
@@ -336,7 +323,7 @@ def _evaluate_run(options: Options) -> None:
     }
     console = Console()
     for policy in policies:
-        title = f"{options.run.name}, {policy.name}, iteration {policy.iteration}"
+        title = f"{source}, {policy.name}, iteration {policy.iteration}"
         console.print(report.evaluation_table(results[policy.name], title))
     if options.json is not None:
         write_json(options.json, results_json(policies, results))
@@ -348,6 +335,20 @@ def _evaluate_run(options: Options) -> None:
             shown = shown or save_solved_episode(options.gif, evaluator, outcome, prefer)
         message = f"solved episode of {shown}: {options.gif}" if shown else "no episode is solved"
         console.print(message, soft_wrap=True)
+
+
+def _load(options: Options) -> tuple[str, list[Policy]]:
+    """Where the policies come from, for people, and the policies."""
+    path = options.run
+    if (path is None) == (options.pretrained is None):
+        raise ValueError("give a run's folder or --pretrained NAME, one of them")
+    if path is not None and not path.is_file():
+        return path.name, load_run(path, options.iteration)
+    if options.iteration is not None:
+        raise ValueError("--iteration names a checkpoint of a run: a file of parameters has none")
+    if path is not None:
+        return path.parent.name, [pretrained.load(path)]
+    return "pretrained", [pretrained.load_shipped(str(options.pretrained))]
 
 
 def results_json(

@@ -46,7 +46,7 @@ class MetricsLog:
         if rows and not self._columns:
             self._columns = _columns(rows[0])
             writer.writerow(self._columns)
-        writer.writerows([_text(row[name]) for name in self._columns] for row in rows)
+        writer.writerows([_text(row.get(name, math.nan)) for name in self._columns] for row in rows)
         self.rows.extend(rows)
 
 
@@ -191,7 +191,11 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 def _columns(row: Row) -> list[str]:
     inner = sorted(set(row) - {*LEADING_COLUMNS, *TIMING_COLUMNS})
-    return [*LEADING_COLUMNS, *inner, *TIMING_COLUMNS]
+    return [
+        *(name for name in LEADING_COLUMNS if name in row),
+        *inner,
+        *(name for name in TIMING_COLUMNS if name in row),
+    ]
 
 
 def _text(value: float | int) -> str:

@@ -88,6 +88,15 @@ class RunFolder:
         return self.path / "metrics.csv"
 
     @property
+    def outcomes(self) -> Path:
+        """A row per evaluation on several sets: the steps of every task."""
+        return self.path / "outcomes.csv"
+
+    def best(self, seed: int) -> Path:
+        """The parameters of a seed's best evaluation on several sets."""
+        return self.path / f"best-seed{seed}.npz"
+
+    @property
     def checkpoints(self) -> Path:
         """One folder per checkpoint, named after its iteration."""
         return self.path / "checkpoints"
@@ -106,6 +115,11 @@ class RunFolder:
     def summary(self) -> Path:
         """When each seed was first solved, and what that took."""
         return self.path / "summary.json"
+
+    @property
+    def machines(self) -> Path:
+        """What it ran on, as far as an experiment noted it."""
+        return self.path / "machines.json"
 
     @property
     def animation(self) -> Path:
@@ -155,3 +169,17 @@ def write_json(path: Path, values: Any) -> None:
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     draft.write_text(json.dumps(values, indent=2) + "\n")
     draft.replace(path)
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds; None if there is no such file.
+
+    Raises:
+      ValueError: it is not JSON; the message names it.
+    """
+    if not path.exists():
+        return None
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error

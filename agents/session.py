@@ -14,13 +14,12 @@ from rich.console import Console
 
 import trap_tube_jax as tt
 from agents import report
-from agents.agent import num_parameters
+from agents.agent import Policy, num_parameters
 from agents.checkpoint import Checkpoints
 from agents.config import Config
 from agents.evaluate import (
     ALL_SETS,
     Evaluator,
-    Policy,
     evaluate,
     evaluation_tasks,
     results_json,
@@ -30,6 +29,7 @@ from agents.evaluate import (
 from agents.metrics import FirstSolved, MetricsLog, Row
 from agents.ppo import Train, TrainState, make_train
 from agents.run_folder import Run, RunFolder, write_json
+from agents.tracking import Tracker
 
 POLL_SECONDS = 0.005
 
@@ -106,7 +106,14 @@ class Session:
     """One process's part of a run: owns its state, its files and what is shown."""
 
     def __init__(
-        self, folder: RunFolder, run: Run, console: Console, *, checkpoint_every: int, keep: int
+        self,
+        folder: RunFolder,
+        run: Run,
+        console: Console,
+        *,
+        checkpoint_every: int,
+        keep: int,
+        tracker: Tracker | None = None,
     ):
         """Builds training and takes up the newest checkpoint.
 
@@ -116,12 +123,13 @@ class Session:
           console: where to show it.
           checkpoint_every: iterations from one checkpoint to the next.
           keep: how many checkpoints to keep.
+          tracker: what evaluates on further task sets as training goes, if anything does.
 
         Raises:
           ValueError: the settings cannot be trained with, or the checkpoint is unusable.
         """
         self.folder, self.run, self._console = folder, run, console
-        self._every = checkpoint_every
+        self._every, self._tracker = checkpoint_every, tracker
         self._train = make_train(run.config)
         self._checkpoints = Checkpoints(folder.checkpoints, keep=keep)
         try:
@@ -131,6 +139,8 @@ class Session:
             raise
         self.saved = self._progress.iteration
         self._log = MetricsLog(folder.metrics, last_iteration=self.saved)
+        if tracker is not None:
+            tracker.resume(self._log.rows, self.saved)
 
     def close(self) -> None:
         """Ends whatever works in the background."""
@@ -167,9 +177,7 @@ class Session:
         played = {policy.name: evaluator(policy.params) for policy in policies}
         results = {name: scores(outcome, run.config.max_steps) for name, outcome in played.items()}
         write_json(folder.evaluation, results_json(policies, results))
-        write_json(folder.summary, self._summary())
-        if self._log.rows:
-            report.save_curves(self._log.rows, folder.curves, folder.path.name)
+        self.summarize()
         env = tt.task_set(run.config.env_id)
         folder.animation.unlink(missing_ok=True)
         for outcome in played.values():
@@ -180,6 +188,12 @@ class Session:
         solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
         self._console.print(report.summary_table(solved, env.id))
         self._say_where()
+
+    def summarize(self) -> None:
+        """Writes the summary and the learning curves."""
+        write_json(self.folder.summary, self._summary())
+        if self._log.rows:
+            report.save_curves(self._log.rows, self.folder.curves, self.folder.path.name)
 
     def _start(self) -> tuple[TrainState, Progress]:
         keys = jax.vmap(jax.random.key)(np.array(self.run.seed_range, np.uint32))
@@ -223,10 +237,22 @@ class Session:
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        self._log.append(rows)
         solved = _first_solved(self.run, progress.solved, rows)
+        rows = self._track(rows, is_due=solved != progress.solved)
+        self._log.append(rows)
         self._progress = progress._replace(iteration=iteration, seconds=seconds, solved=solved)
         return rows
+
+    def _track(self, rows: list[Row], *, is_due: bool) -> list[Row]:
+        """The rows of an iteration with what the tracker adds to them."""
+        tracker = self._tracker
+        if tracker is None:
+            return rows
+        if not (is_due or tracker.is_due(int(rows[0]["iteration"]))):
+            return [{**row, **tracker.skip()} for row in rows]
+        policies = dict(zip(self.run.seed_range, self._policies(), strict=True))
+        by_seed = {int(row["seed"]): row for row in rows}
+        return [{**row, **tracker.evaluate(seed, policies[seed])} for seed, row in by_seed.items()]
 
     def _save(self) -> None:
         record = {**self._progress.to_dict(), "run": self.run.to_dict(), "version": tt.__version__}

@@ -1,19 +1,17 @@
 """What all benchmarks share: the machine's description, timing, and results as JSON."""
 
 import dataclasses
-import importlib.metadata
 import json
-import os
 import pathlib
-import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from agents.machine import machine
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,20 +139,6 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) ->
     return passes * num_bytes / measure(lambda _: rewrite(source), repeats).median_s
 
 
-def machine() -> dict[str, Any]:
-    """Hardware, versions and commit, for the record."""
-    return {
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
-        "device": jax.devices()[0].device_kind,
-        "platform": platform.platform(),
-        "python": platform.python_version(),
-        "jax": importlib.metadata.version("jax"),
-        "jaxlib": importlib.metadata.version("jaxlib"),
-        "commit": _commit(),
-    }
-
-
 def write_json(path: str | pathlib.Path, results: Sequence[Any], **extra: Any) -> None:
     """Writes the machine, `extra` and a list of dataclass results to `path`."""
     record = {
@@ -174,26 +158,3 @@ def _bits(observation: jax.Array) -> jax.Array:
         return flat.astype(jnp.uint8)
     unsigned = jnp.dtype(f"uint{8 * flat.dtype.itemsize}")
     return jax.lax.bitcast_convert_type(flat, unsigned)
-
-
-def _processor() -> str:
-    try:
-        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
-
-
-def _commit() -> str | None:
-    try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-            cwd=pathlib.Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return described.stdout.strip()

@@ -1,0 +1,118 @@
+"""The figures of the experiments.
+
+Source: the paper's figures of experiments 1 and 2.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import trap_tube_jax as tt
+from agents.metrics import Row
+from agents.tracking import OVERALL, PREFIX
+
+Curves = Mapping[str, Sequence[Row]]
+
+WIDTH = 3.2  # inches of a panel
+HEIGHT = 2.5
+DPI = 110
+
+
+def save_rewards(curves: Curves, path: Path, title: str) -> None:
+    """Experiment 1: training and evaluation reward over episodes, a thin line per seed.
+
+    Args:
+      curves: the rows of metrics of every algorithm, all seeds together.
+      path: the PNG to write.
+      title: over the panels.
+    """
+    panels = {"training reward": "success", "greedy evaluation reward": "evaluation"}
+    _save(curves, panels, path, title, columns=2, draw=_draw_seeds)
+
+
+def save_success(curves: Curves, path: Path, title: str) -> None:
+    """Experiment 2: mean ± sd and maximum over seeds, of training and of every set.
+
+    Args:
+      curves: the rows of metrics of every algorithm, all seeds together.
+      path: the PNG to write.
+      title: over the panels.
+    """
+    known = {PREFIX + entry.short: entry.label for entry in tt.PAPER_TASK_SETS}
+    columns = {name for rows in curves.values() for row in rows for name in row}
+    panels = {"training": "success"}
+    panels |= {label: name for name, label in known.items() if name in columns}
+    if OVERALL in columns:
+        panels["overall"] = OVERALL
+    title = f"{title}: mean, ± sd, maximum (dotted)"
+    _save(curves, panels, path, title, columns=5, draw=_draw_spread)
+
+
+def by_iteration(rows: Sequence[Row], metric: str) -> tuple[np.ndarray, np.ndarray]:
+    """The episodes f64[n] and the values f64[S, n] of a metric; iterations without it left out.
+
+    Seeds that have not come as far are NaN.
+    """
+    seeds = sorted({row["seed"] for row in rows})
+    known = [row for row in rows if not np.isnan(row.get(metric, np.nan))]
+    episodes = sorted({row["episodes"] for row in known})
+    values = np.full((len(seeds), len(episodes)), np.nan)
+    for row in known:
+        values[seeds.index(row["seed"]), episodes.index(row["episodes"])] = row[metric]
+    return np.array(episodes, np.float64), values
+
+
+def _save(
+    curves: Curves,
+    panels: Mapping[str, str],
+    path: Path,
+    title: str,
+    *,
+    columns: int,
+    draw: Callable[..., None],
+) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+    from matplotlib.ticker import EngFormatter, MaxNLocator  # noqa: PLC0415
+
+    columns = min(columns, len(panels))
+    height = -(-len(panels) // columns)
+    size = (max(WIDTH * columns, 2 * WIDTH), HEIGHT * height + 0.6)
+    figure = Figure(figsize=size, layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(height, columns, sharex=True, sharey=True, squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.remove()
+    for axis, (name, metric) in zip(axes.flat, panels.items(), strict=False):
+        for index, (algorithm, rows) in enumerate(curves.items()):
+            draw(axis, *by_iteration(rows, metric), color=f"C{index}", label=algorithm)
+        axis.set_title(name, loc="left", fontsize="medium")
+        axis.set_ylim(-0.03, 1.03)
+        axis.grid(alpha=0.3)
+    for axis in axes[-1]:
+        axis.set_xlabel("episodes")
+        axis.xaxis.set_major_locator(MaxNLocator(5))
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes[0, 0].legend(fontsize="small")
+    figure.savefig(path, format="png", dpi=DPI)
+
+
+def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
+    if len(values) > 1:
+        for row in values:
+            axis.plot(episodes, row, color=style["color"], linewidth=0.8, alpha=0.35)
+    axis.plot(episodes, np.nanmean(values, axis=0), linewidth=1.6, **style)
+
+
+def _draw_spread(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
+    """Mean as a line, one deviation on either side as a band, maximum dotted."""
+    mean, color = np.nanmean(values, axis=0), style["color"]
+    axis.plot(episodes, mean, linewidth=1.6, **style)
+    if len(values) > 1:
+        seeds = np.sum(~np.isnan(values), axis=0)
+        deviation = np.sqrt(np.nansum((values - mean) ** 2, axis=0) / np.maximum(seeds - 1, 1))
+        axis.fill_between(
+            episodes, mean - deviation, mean + deviation, color=color, alpha=0.2, linewidth=0
+        )
+        axis.plot(episodes, np.nanmax(values, axis=0), color=color, linewidth=0.9, linestyle=":")

@@ -1,0 +1,110 @@
+"""Exports a trained agent to a file of parameters: python -m agents.pretrained --help."""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from agents import pretrained
+from agents.agent import Policy
+from agents.evaluate import load_run
+from agents.run_folder import RunFolder
+
+PROGRAM = "python -m agents.pretrained"
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Writes the parameters of a run to a file that needs no run.
+
+    Within the package, the default, `agents.evaluate --pretrained NAME` finds it.
+
+    Attributes:
+      run: the run's folder.
+      name: the file's name, without its ending.
+      seed: which seed of the run; its first if absent.
+      iteration: the checkpoint to take; the newest if absent.
+      best: take the parameters of the best evaluation of an experiment's run instead.
+      half: round to float16, for half the size.
+      out: the folder to write to.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    name: str
+    seed: int | None = None
+    iteration: int | None = None
+    best: Flag = False
+    half: Flag = False
+    out: Path = Path(pretrained.__file__).parent
+
+
+@dataclasses.dataclass(frozen=True)
+class List:
+    """Lists the parameters that are shipped."""
+
+
+Command = (
+    Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[List, tyro.conf.subcommand("list")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line; `arguments` are those of the process if absent."""
+    command = tyro.cli(Command, args=arguments, prog=PROGRAM)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    try:
+        if isinstance(command, Export):
+            path = export(command)
+            print(f"{path}: {path.stat().st_size:,} bytes")
+        else:
+            for name in pretrained.names():
+                policy = pretrained.load_shipped(name)
+                print(f"{name}: {policy.config.env_id}, iteration {policy.iteration}")
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+
+
+def export(options: Export) -> Path:
+    """Writes the file that the options ask for, and returns its place.
+
+    Raises:
+      ValueError: there is no such run, seed or checkpoint, or the name is not one.
+    """
+    if Path(options.name).name != options.name:
+        raise ValueError(f"name must be that of a file, without a path, got {options.name!r}")
+    path = options.out / f"{options.name}{pretrained.SUFFIX}"
+    pretrained.save(path, find_policy(options), half=options.half)
+    return path
+
+
+def find_policy(options: Export) -> Policy:
+    """The policy that the options name.
+
+    Raises:
+      ValueError: there is no such run, seed or checkpoint.
+    """
+    folder, run = RunFolder.open(options.run)
+    seed = run.seed if options.seed is None else options.seed
+    if seed not in run.seed_range:
+        allowed = ", ".join(map(str, run.seed_range))
+        raise ValueError(f"{options.run} has no seed {seed}; allowed: {allowed}")
+    if not options.best:
+        return load_run(options.run, options.iteration)[run.seed_range.index(seed)]
+    if options.iteration is not None:
+        raise ValueError("--best and --iteration name different parameters; give one")
+    if not folder.best(seed).exists():
+        raise ValueError(
+            f"{folder.best(seed)} does not exist: only the runs of agents.experiments keep the "
+            "best parameters; without --best the newest checkpoint is exported"
+        )
+    return pretrained.load(folder.best(seed))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""Greedy play on several task sets as training goes: outcomes on disk, the best parameters."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from agents import pretrained
+from agents.agent import Policy
+from agents.evaluate import Evaluation, Evaluator
+from agents.metrics import MetricsLog, Row
+from agents.run_folder import Run, RunFolder
+from trap_tube_jax.state import State
+
+PREFIX = "greedy_"
+OVERALL = "greedy_overall"
+SEPARATOR = "/"
+
+
+class Tracker:
+    """Evaluates the seeds of a run on task sets, every so many iterations.
+
+    Each evaluation adds to the metrics the share of tasks solved of every set, `greedy_<set>`,
+    and their mean over the ranked sets, `greedy_overall`; in between these are NaN. The run's
+    `outcomes.csv` gets the steps taken in every task, 0 where it is not solved, and
+    `best-seed<seed>.npz` the parameters of the best overall evaluation so far.
+    """
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        run: Run,
+        tasks: Mapping[str, State],
+        *,
+        ranked: Sequence[str],
+        every: int = 1,
+    ):
+        """Prepares the evaluation.
+
+        Args:
+          folder: the run's files.
+          run: what is trained.
+          tasks: the tasks of each set, by name.
+          ranked: the sets that decide which evaluation is the best.
+          every: iterations from one evaluation to the next; an iteration that solves the
+            training set for the first time is evaluated in any case.
+        """
+        self._folder = folder
+        self._ranked, self._every = tuple(ranked), every
+        self._evaluator = Evaluator(run.config, tasks)
+        self._best = dict.fromkeys(run.seed_range, -math.inf)
+        self._log: MetricsLog | None = None
+
+    def resume(self, rows: Sequence[Row], iteration: int) -> None:
+        """Continues after these rows of metrics, the last of which is of `iteration`."""
+        self._log = MetricsLog(self._folder.outcomes, last_iteration=iteration)
+        for row in rows:
+            seed, overall = int(row["seed"]), float(row.get(OVERALL, math.nan))
+            self._best[seed] = max(self._best[seed], overall)
+
+    def is_due(self, iteration: int) -> bool:
+        """Whether this iteration is among those that are evaluated in any case."""
+        return iteration % self._every == 0
+
+    def skip(self) -> dict[str, float]:
+        """The columns of an iteration without evaluation."""
+        return {**{PREFIX + name: math.nan for name in self._evaluator.tasks}, OVERALL: math.nan}
+
+    def evaluate(self, seed: int, policy: Policy) -> dict[str, float]:
+        """Plays with the policy of one seed and returns the columns of its row."""
+        if self._log is None:
+            raise ValueError("call resume before evaluate")
+        played = self._evaluator(policy.params)
+        self._log.append([{"seed": seed, "iteration": policy.iteration, **_steps(played)}])
+        shares = {name: float(np.mean(outcome.solved)) for name, outcome in played.items()}
+        overall = float(np.mean([shares[name] for name in self._ranked]))
+        if overall > self._best[seed]:
+            self._best[seed] = overall
+            pretrained.save(self._folder.best(seed), policy)
+        return {**{PREFIX + name: share for name, share in shares.items()}, OVERALL: overall}
+
+
+def outcome(row: Row) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """What a row of `outcomes.csv` says of each set: solved bool[B] and steps i32[B]."""
+    steps: dict[str, list[Any]] = {}
+    for column in sorted(name for name in row if SEPARATOR in name):
+        steps.setdefault(column.split(SEPARATOR)[0], []).append(row[column])
+    counts = {name: np.array(values, np.int32) for name, values in steps.items()}
+    return {name: (values > 0, values) for name, values in counts.items()}
+
+
+def _steps(played: Mapping[str, Evaluation]) -> dict[str, int]:
+    """A column for each task, in the order of their names."""
+    return {
+        f"{name}{SEPARATOR}{index:05d}": int(steps)
+        for name, outcome in played.items()
+        for index, steps in enumerate(np.where(outcome.solved, outcome.length, 0))
+    }

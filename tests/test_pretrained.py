@@ -1,0 +1,186 @@
+import json
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from agents import evaluate, pretrained
+from agents.agent import Agent, Policy
+from agents.checkpoint import Checkpoints
+from agents.config import Config
+from agents.pretrained.__main__ import main
+from agents.run_folder import Run, RunFolder
+
+CONFIG = Config(
+    env_id="SymbolicTrapTube-v0",
+    max_steps=6,
+    filters=(2, 2),
+    hidden=4,
+    embedding=2,
+    eval_episodes=2,
+    curiosity="none",
+)
+SEEDS = (3, 4)
+
+
+def random_params(seed):
+    shapes = jax.eval_shape(Agent(CONFIG).init, jax.random.key(0))
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), shapes)
+
+
+def assert_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.fixture(scope="module")
+def run_path(tmp_path_factory):
+    """A run of two seeds with two checkpoints, and the best parameters of its first seed."""
+    path = tmp_path_factory.mktemp("runs") / "mine"
+    folder = RunFolder.create(path, Run(CONFIG, seed=SEEDS[0], seeds=2))
+    both = jax.tree.map(lambda *x: jnp.stack(x), *map(random_params, SEEDS))
+    with Checkpoints(folder.checkpoints, keep=2) as checkpoints:
+        for iteration in (5, 6):
+            params = jax.tree.map(lambda x, n=iteration: x * n, both)
+            state = {"params": params, "iteration": jnp.full(2, iteration)}
+            checkpoints.save(iteration, state, {})
+    pretrained.save(folder.best(3), Policy("any", CONFIG, random_params(9), 4))
+    return path
+
+
+@pytest.fixture
+def shipped(tmp_path, monkeypatch):
+    """A folder in the place of the package's own."""
+    monkeypatch.setattr(pretrained, "_folder", lambda: tmp_path)
+    return tmp_path
+
+
+def export(out, run_path, *arguments):
+    main(["export", str(run_path), "--name", "x", "--out", str(out), *map(str, arguments)])
+    return pretrained.load(out / "x.npz")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "iteration", "seed", "factor"),
+    [
+        ([], 6, 3, 6),
+        (["--seed", 4], 6, 4, 6),
+        (["--seed", 4, "--iteration", 5], 5, 4, 5),
+        (["--best"], 4, 9, 1),
+    ],
+)
+def test_a_run_is_exported(run_path, tmp_path, arguments, iteration, seed, factor):
+    policy = export(tmp_path, run_path, *arguments)
+    assert (policy.name, policy.config, policy.iteration) == ("x", CONFIG, iteration)
+    assert_equal(policy.params, jax.tree.map(lambda x: x * factor, random_params(seed)))
+
+
+def test_half_precision_is_half_the_size_and_close(run_path, tmp_path):
+    whole = export(tmp_path, run_path)
+    size = (tmp_path / "x.npz").stat().st_size
+    half = export(tmp_path, run_path, "--half")
+    assert (tmp_path / "x.npz").stat().st_size < size
+    for a, b in zip(jax.tree.leaves(half.params), jax.tree.leaves(whole.params), strict=True):
+        assert a.dtype == jnp.float32
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
+
+
+def test_shipped_parameters_are_evaluated(run_path, shipped, capsys):
+    export(shipped, run_path)
+    results = shipped / "results.json"
+    common = ["--sets", "base", "--no-cache", "--json", str(results)]
+    evaluate.main(["--pretrained", "x", *common])
+    assert "Greedy evaluation: pretrained, x, iteration 6" in capsys.readouterr().out
+    (policy,) = json.loads(results.read_text())
+    assert [(score["set"], score["tasks"]) for score in policy["sets"]] == [("base", 1)]
+    assert pretrained.names() == ("x",)
+    main(["list"])
+    assert "x: SymbolicTrapTube-v0, iteration 6" in capsys.readouterr().out
+
+
+def test_every_shipped_file_can_be_loaded():
+    total = 0
+    for name in pretrained.names():
+        assert pretrained.load_shipped(name).iteration > 0
+        total += len((pretrained._folder() / f"{name}.npz").read_bytes())
+    assert total < 4_000_000
+
+
+def refused(capsys, command, *arguments):
+    with pytest.raises(SystemExit) as exit_info:
+        command([str(argument) for argument in arguments])
+    assert exit_info.value.code == 2
+    captured = capsys.readouterr()
+    return " ".join(re.sub("[│╭╰─╮╯]", " ", captured.err + captured.out).split())
+
+
+def test_impossible_exports_are_refused(run_path, tmp_path, capsys):
+    for arguments, message in (
+        (["--seed", 5], "mine has no seed 5; allowed: 3, 4"),
+        (["--iteration", 7], "holds no checkpoint 7; allowed: 5, 6"),
+        (["--best", "--seed", 4], "best-seed4.npz does not exist"),
+        (["--best", "--iteration", 5], "--best and --iteration name different parameters"),
+    ):
+        given = ["export", run_path, "--name", "x", "--out", tmp_path, *arguments]
+        assert message in refused(capsys, main, *given)
+    message = refused(capsys, main, "export", run_path, "--name", "a/x", "--out", tmp_path)
+    assert "name must be that of a file, without a path, got 'a/x'" in message
+    assert "holds no run" in refused(capsys, main, "export", tmp_path / "no", "--name", "x")
+    assert not list(tmp_path.iterdir())
+
+
+def test_unknown_parameters_are_refused(run_path, shipped, capsys):
+    assert "unknown parameters 'q'; allowed: none" in refused(
+        capsys, evaluate.main, "--pretrained", "q", "--no-cache"
+    )
+    export(shipped, run_path)
+    message = refused(capsys, evaluate.main, "--pretrained", "q", "--no-cache")
+    assert "unknown parameters 'q'; allowed: x" in message
+    for arguments in ([], [run_path, "--pretrained", "x"]):
+        message = refused(capsys, evaluate.main, *arguments, "--no-cache")
+        assert "give a run's folder or --pretrained NAME, one of them" in message
+    message = refused(capsys, evaluate.main, "--pretrained", "x", "--iteration", 5, "--no-cache")
+    assert "--iteration names a checkpoint of a run" in message
+
+
+def rewritten(path, **changes):
+    """The file with some of its entries replaced; the header as a dictionary."""
+    with np.load(path) as archive:
+        entries = dict(archive)
+    header = {**json.loads(str(entries["header"])), **changes.pop("header", {})}
+    np.savez(path, **{**entries, "header": np.array(json.dumps(header)), **changes})
+
+
+def test_files_that_hold_no_parameters_are_refused(run_path, tmp_path):
+    path = tmp_path / "x.npz"
+    export(tmp_path, run_path)
+    good = path.read_bytes()
+
+    def refuses(words):
+        with pytest.raises(ValueError, match=words):
+            pretrained.load(path)
+        path.write_bytes(good)
+
+    for size in (0, 1, 100, len(good) // 2, len(good) - 1):
+        path.write_bytes(good[:size])
+        refuses("x.npz is .*not a file of parameters")
+    path.write_text("something else")
+    refuses("x.npz is not a file of parameters")
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    refuses("x.npz is not a file of parameters")
+    np.savez(path, a=np.zeros(3))
+    refuses("x.npz is not a file of parameters")
+    middle = len(good) // 2
+    path.write_bytes(good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :])
+    refuses("x.npz is damaged")
+    rewritten(path, **{"params": np.zeros(3)})
+    refuses("does not hold the numbers that were saved")
+    rewritten(path, header={"format": "trap-tube-jax parameters 99"})
+    refuses("x.npz is not a file of parameters")
+    rewritten(path, header={"config": {"colour": 1}})
+    refuses("does not fit this version: unknown setting 'colour'")
+    rewritten(path, header={"config": {**CONFIG.to_dict(), "hidden": 5}})
+    refuses("does not fit this version: ")
