@@ -88,10 +88,12 @@ def start_two(joint, *arguments):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    command = ["-m", "agents.train", "--name", folder.name, "--out", folder.parent, *arguments]
-    command += ["--checkpoint-every", 1, "--keep", 1]
-    command += ["--coordinator", address, "--processes", 2, "--process-id"]
-    return [start(*command, number, cache=cache) for number in range(2)]
+    command = ["-m", "agents.train", "--name", folder.name, *arguments, "--checkpoint-every", 1]
+    command += ["--keep", 1, "--coordinator", address, "--processes", 2]
+    return [
+        start(*command, "--process-id", number, "--out", out, cache=cache)
+        for number, out in enumerate((folder.parent, folder.parent / "unseen"))
+    ]
 
 
 def wait_for_iterations(process, count):
@@ -118,6 +120,7 @@ def test_two_processes_stop_together(joint):
     (output, errors), (silence, complaints) = first.communicate(), second.communicate()
     assert (first.returncode, second.returncode) == (143, 143), errors + complaints
     assert without_transport(silence + errors + complaints) == ""
+    assert not (joint[0].parent / "unseen").exists()
     match = re.search(r"Stopped at iteration (\d+)\. Continue with: ", output)
     assert match
     iteration = int(match[1])
