@@ -14,7 +14,6 @@ from agents.checkpoint import Checkpoints, digest, to_arrays
 from agents.config import Config
 from agents.evaluate import Evaluator, evaluation_tasks
 from agents.ppo import make_train
-from agents.session import make_advance
 from agents.sharding import Placement
 
 SEEDS = 2
@@ -36,20 +35,24 @@ CONFIG = Config.preset(
 
 
 class Trainer:
-    """Training of all seeds on a placement, from host arrays to host arrays."""
+    """Training with one seed a device, from the default device and back to it."""
 
     def __init__(self, placement, seeds):
-        self.placement, self.seeds = placement, seeds
+        self.placement = placement
         train = make_train(CONFIG, shards=placement.episodes)
         self.init = jax.jit(jax.vmap(train.init))
-        advance = make_advance(train, placement.local_seeds(seeds))
+        assert placement.local_seeds(seeds) == 1
+
+        def advance(state):
+            result = train.iterate(jax.tree.map(lambda x: x[0], state))
+            return jax.tree.map(lambda x: x[None], result)
+
         self.advance = jax.jit(placement.shard(advance))
-        self.active = np.ones(seeds, bool)
 
     def __call__(self, state, iterations):
         state, rows = self.placement.put(state), []
         for _ in range(iterations):
-            state, metrics = self.advance(state, self.active)
+            state, metrics = self.advance(state)
             rows.append(jax.tree.map(np.asarray, metrics))
         return self.placement.local(state), rows
 
