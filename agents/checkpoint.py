@@ -34,7 +34,7 @@ class Checkpoints:
         """Opens `folder`.
 
         Args:
-          folder: made on the first save.
+          folder: made if missing, unless it is for reading only.
           keep: how many to keep, the newest, at least 1; None opens it for reading only.
 
         Raises:
@@ -50,11 +50,14 @@ class Checkpoints:
         self._ocp = ocp
         self._manager = None
         if keep is not None or folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
             options = ocp.CheckpointManagerOptions(
                 max_to_keep=keep,
                 read_only=keep is None,
+                create=False,
                 cleanup_tmp_directories=keep is not None,
                 enable_async_checkpointing=False,
+                multiprocessing_options=_this_process_alone(ocp),
             )
             self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
 
@@ -191,6 +194,16 @@ def digest(arrays: Arrays) -> str:
         total.update(f"{name} {array.dtype} {array.shape}\n".encode())
         total.update(array.tobytes())
     return total.hexdigest()
+
+
+def _this_process_alone(ocp: Any) -> Any:
+    """Orbax waits for no other process: one of them reads and writes."""
+    if not jax.distributed.is_initialized():
+        return ocp.options.MultiprocessingOptions()
+    own = jax.process_index()
+    return ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+    )
 
 
 def _name(path: Any) -> str:

@@ -25,6 +25,7 @@ from agents.config import Config
 from agents.metrics import Optimality, Score
 from agents.rollout import greedy_action, rollout
 from agents.run_folder import RunFolder, write_json
+from agents.sharding import ALONE, DEFAULT_DEVICE, Placement, Shards
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.registry import PAPER_TASK_SETS
@@ -98,7 +99,12 @@ def evaluation_keys(name: str, num_tasks: int) -> jax.Array:
 
 
 def evaluate(
-    agent: Agent, params: Params, env: Environment, tasks: State, chunk: int
+    agent: Agent,
+    params: Params,
+    env: Environment,
+    tasks: State,
+    chunk: int,
+    shards: Shards = ALONE,
 ) -> Evaluation:
     """Plays every task once with the most probable actions. Pure; jit it.
 
@@ -108,24 +114,30 @@ def evaluate(
       env: the dynamics and the step limit; its transfers play no part.
       tasks: B states at time 0.
       chunk: distinct observations encoded at once; more than B are of no use.
+      shards: how devices divide the tasks among themselves, evenly or not.
     """
     num_tasks = tasks.time.shape[0]
+    if shards.count > 1:
+        tasks = _rows(tasks, shards.places(num_tasks)[0])
+    chunk = min(chunk, tasks.time.shape[0])
     unused_key = jax.random.key(0)
-    trajectory = rollout(
-        agent, params, env, tasks, unused_key, choose=greedy_action, chunk=min(chunk, num_tasks)
-    )
-    return Evaluation(trajectory.solved, trajectory.length, trajectory.action.swapaxes(0, 1))
+    played = rollout(agent, params, env, tasks, unused_key, choose=greedy_action, chunk=chunk)
+    outcome = Evaluation(played.solved, played.length, played.action.swapaxes(0, 1))
+    return outcome if shards.count == 1 else _rows(shards.whole(outcome), slice(num_tasks))
 
 
 class Evaluator:
     """Greedy play on the tasks of several sets, compiled once for any parameters."""
 
-    def __init__(self, config: Config, tasks: Mapping[str, State]):
+    def __init__(
+        self, config: Config, tasks: Mapping[str, State], placement: Placement = DEFAULT_DEVICE
+    ):
         """Prepares the play.
 
         Args:
           config: the settings of the policies to come.
           tasks: the tasks of each set, by any name; see `evaluation_tasks`.
+          placement: the devices that share the tasks.
         """
         self.tasks = dict(tasks)
         self._total = sum(len(states.time) for states in self.tasks.values())
@@ -136,12 +148,19 @@ class Evaluator:
         ]
         env = tt.Environment(base=tt.base_state(config.num_features), max_steps=config.max_steps)
         agent = Agent(config)
-        self._play = jax.jit(
-            lambda params, states: evaluate(agent, params, env, states, config.chunk)
+        shards = Shards(placement.num_devices)
+        self._play = placement.share(
+            lambda params, states: evaluate(agent, params, env, states, config.chunk, shards)
         )
 
     @classmethod
-    def of_sets(cls, config: Config, sets: Sequence[str], num_tasks: int) -> "Evaluator":
+    def of_sets(
+        cls,
+        config: Config,
+        sets: Sequence[str],
+        num_tasks: int,
+        placement: Placement = DEFAULT_DEVICE,
+    ) -> "Evaluator":
         """That of registered task sets.
 
         Raises:
@@ -156,7 +175,7 @@ class Evaluator:
             num_features=config.num_features,
             max_steps=config.max_steps,
         )
-        return cls(config, {name: make(name) for name in names})
+        return cls(config, {name: make(name) for name in names}, placement)
 
     def __call__(self, params: Params) -> dict[str, Evaluation]:
         """Outcomes as NumPy arrays, by the names of the tasks."""

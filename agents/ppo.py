@@ -18,6 +18,7 @@ from agents.curiosity import Prediction, forward_loss, intrinsic_reward, visit_b
 from agents.optimizer import adam
 from agents.replay import Replay
 from agents.rollout import Trajectory, action_log_prob, place, rollout, sample_action
+from agents.sharding import ALONE, Shards
 from agents.starts import FRESH, Successes, explore, walk_environments
 from trap_tube_jax.environment import Environment
 
@@ -106,6 +107,7 @@ class Train(NamedTuple):
       agent: the network's functions.
       env: the environment.
       config: the settings.
+      shards: how `iterate` divides its episodes over devices.
     """
 
     init: Callable[[jax.Array], TrainState]
@@ -113,14 +115,16 @@ class Train(NamedTuple):
     agent: Agent
     env: Environment
     config: Config
+    shards: Shards
 
 
-def make_train(config: Config, env: Environment | None = None) -> Train:
+def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Train:
     """Builds training from its settings.
 
     Args:
       config: the settings.
       env: an environment of your own; that of `config.env_id` if absent.
+      shards: how to divide the episodes; more than one only within `Placement.shard`.
 
     Raises:
       ValueError: `env` contradicts `config`.
@@ -151,7 +155,7 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
-        reset_keys = jax.random.split(reset_key, config.episodes)
+        reset_keys = shards.part(jax.random.split(reset_key, config.episodes))
         initial, _ = jax.vmap(env.reset)(reset_keys)
         origin = jnp.full(config.episodes, FRESH)
         if config.restarts:
@@ -161,25 +165,23 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
                 successes=successes, steps_walked=state.steps_walked + steps_walked
             )
             origin = successes.choose(choice_key, config)
-            initial = successes.place(origin, initial, config.max_steps)
+            initial = successes.place(shards.part(origin), initial, config.max_steps)
         trajectory = rollout(
             agent,
             state.params,
             env,
             initial,
             action_key,
-            choose=sample_action,
+            choose=shards.drawing(sample_action),
             chunk=config.chunk,
         )
-        batch, state, play_metrics = prepare(agent, config, state, trajectory)
-        if config.imitation_coef:
-            state = state._replace(replay=state.replay.remember(trajectory))
+        batch, state, play_metrics = prepare(agent, config, state, trajectory, shards)
         if config.restarts:
-            play_metrics |= start_metrics(state.successes, origin, trajectory.solved)
-            rehearsed = state.successes.rehearsed(origin, trajectory.solved)
-            state = state._replace(successes=rehearsed)
+            solved = jnp.any(batch.reward > 0, axis=0)
+            play_metrics |= start_metrics(state.successes, origin, solved)
+            state = state._replace(successes=state.successes.rehearsed(origin, solved))
         params, opt_state, loss_metrics = optimize(
-            agent, config, optimizer, state, batch, update_key
+            agent, config, optimizer, state, batch, update_key, shards
         )
         state = state._replace(
             params=params,
@@ -187,11 +189,10 @@ def make_train(config: Config, env: Environment | None = None) -> Train:
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + config.episodes,
-            transitions=state.transitions + jnp.sum(trajectory.length),
         )
         return state, {**play_metrics, **loss_metrics}
 
-    return Train(init, iterate, agent, env, config)
+    return Train(init, iterate, agent, env, config, shards)
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:
@@ -203,24 +204,39 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
 
 
 def prepare(
-    agent: Agent, config: Config, state: TrainState, trajectory: Trajectory
+    agent: Agent,
+    config: Config,
+    state: TrainState,
+    trajectory: Trajectory,
+    shards: Shards = ALONE,
 ) -> tuple[Batch, TrainState, Metrics]:
     """Turns episodes into what the gradient steps learn from, under the acting parameters.
 
+    Args:
+      agent: the network.
+      config: the settings.
+      state: the state of training.
+      trajectory: this device's episodes.
+      shards: how the episodes are divided over devices.
+
     Returns:
-      The batch of all episodes, the state with the rewards' moments and the visits brought
-      up to date, and metrics of play.
+      The batch of all devices' episodes, the state with the rewards' moments, the visits, the
+      replay and the transitions brought up to date, and metrics of play.
     """
+    error = None
+    if agent.curiosity is not None:
+        error = shards.whole(_curiosity_reward(agent, state.params, trajectory), axis=1)
+    trajectory = trajectory.gathered(shards)
     mask = trajectory.mask
     observation_id = observation_ids(trajectory.layout, trajectory.cells)
     extrinsic = state.extrinsic.update(trajectory.reward, mask, config.reward_rate)
     reward = trajectory.reward / extrinsic.deviation
     curiosity, intrinsic, visits = jnp.zeros_like(mask), state.intrinsic, state.visits
     if config.curiosity != "none":
-        if config.curiosity == "counts":
+        if error is None:
             curiosity, visits = visit_bonus(visits, visit_slots(trajectory)[1:], mask)
         else:
-            curiosity = mask * _curiosity_reward(agent, state.params, trajectory)
+            curiosity = mask * error
         if config.episodic_novelty:
             curiosity = curiosity * first_visits(observation_id)[1:]
         intrinsic = intrinsic.update(curiosity, mask, config.reward_rate)
@@ -247,7 +263,12 @@ def prepare(
         "intrinsic_reward": jnp.sum(curiosity) / jnp.sum(mask),
         "distinct_observations": jnp.max(observation_id) + 1,
     }
-    state = state._replace(extrinsic=extrinsic, intrinsic=intrinsic, visits=visits)
+    if config.imitation_coef:
+        state = state._replace(replay=state.replay.remember(trajectory))
+    transitions = state.transitions + jnp.sum(trajectory.length)
+    state = state._replace(
+        extrinsic=extrinsic, intrinsic=intrinsic, visits=visits, transitions=transitions
+    )
     return batch, state, metrics
 
 
@@ -258,19 +279,25 @@ def optimize(
     state: TrainState,
     batch: Batch,
     key: jax.Array,
+    shards: Shards = ALONE,
 ) -> tuple[Params, Any, Metrics]:
-    """All epochs of gradient steps on minibatches of whole episodes, shuffled anew in each."""
+    """All epochs of gradient steps on minibatches of whole episodes, shuffled anew in each.
+
+    Every device differentiates its part of each minibatch; the mean is everyone's gradient.
+    """
 
     def update(
         carry: tuple[Params, Any], episodes: jax.Array
     ) -> tuple[tuple[Params, Any], Metrics]:
         params, opt_state = carry
-        gradient, metrics = jax.grad(loss, has_aux=True)(
-            params, agent, config, batch.take(episodes), state.replay
+        own = batch.take(shards.part(episodes))
+        gradient, metrics = shards.mean(
+            jax.grad(loss, has_aux=True)(params, agent, config, own, state.replay, shards)
         )
         updates, opt_state = optimizer.update(gradient, opt_state, params)
         updates = jax.tree.map(lambda update: rate * update, updates)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
+        metrics["entropy"] /= metrics.pop("steps")
         params: Any = optax.apply_updates(params, updates)
         return (params, opt_state), metrics
 
@@ -305,11 +332,18 @@ def start_metrics(successes: Successes, origin: jax.Array, solved: jax.Array) ->
 
 
 def loss(
-    params: Params, agent: Agent, config: Config, batch: Batch, replay: Replay
+    params: Params,
+    agent: Agent,
+    config: Config,
+    batch: Batch,
+    replay: Replay,
+    shards: Shards = ALONE,
 ) -> tuple[jax.Array, Metrics]:
-    """The total loss f32[] and its terms, weighted as they enter it.
+    """The total loss f32[] and its terms, weighted as they enter it; both as means over devices.
 
     L = policy + value - entropy + curiosity_coef * (forward + inverse) + imitation
+
+    Beside the terms: the sums of the entropy over `steps`, and of those.
     """
     features = encode_episodes(
         params, agent, config, batch.observation_id, batch.layout, batch.cells
@@ -333,10 +367,10 @@ def loss(
     }
     terms |= curiosity_terms
     if config.imitation_coef:
-        terms["imitation_loss"] = imitation_loss(params, agent, config, replay)
+        terms["imitation_loss"] = imitation_loss(params, agent, config, replay, shards)
     total = sum(terms.values(), jnp.zeros(()))
-    mean_entropy = jnp.sum(entropy * batch.mask) / jnp.sum(batch.mask)
-    return total, {**terms, "loss": total, "entropy": mean_entropy}
+    sums = {"entropy": jnp.sum(entropy * batch.mask), "steps": jnp.sum(batch.mask)}
+    return total, {**terms, "loss": total, **sums}
 
 
 def curiosity_losses(config: Config, prediction: Prediction, batch: Batch) -> Metrics:
@@ -350,20 +384,27 @@ def curiosity_losses(config: Config, prediction: Prediction, batch: Batch) -> Me
     return terms
 
 
-def imitation_loss(params: Params, agent: Agent, config: Config, replay: Replay) -> jax.Array:
+def imitation_loss(
+    params: Params, agent: Agent, config: Config, replay: Replay, shards: Shards = ALONE
+) -> jax.Array:
     """Minus the log-likelihood of remembered successes, each step weighted by its return.
 
       imitation_coef * mean over steps of -G_t log pi(a_t | o_t)
 
     Returns:
-      f32[], 0 while nothing is remembered.
+      f32[], this device's share, of which the mean over devices is the loss; 0 while nothing
+      is remembered.
     """
+    steps = jnp.maximum(jnp.sum(replay.mask), 1.0) / shards.count
+    if shards.count > 1:
+        place, is_own = shards.places(replay.mask.shape[1])
+        replay = replay.take(place)
+        replay = replay._replace(mask=replay.mask * is_own[None])
     observation_id = observation_ids(replay.layout, replay.cells)
     features = encode_episodes(params, agent, config, observation_id, replay.layout, replay.cells)
     embedding = agent.unroll(params, features, replay.action, replay.reward)
     log_prob = action_log_prob(agent.act(params, embedding), replay.action)
     weight = discounted_returns(replay.reward, jnp.float32(config.discount)) * replay.mask
-    steps = jnp.maximum(jnp.sum(replay.mask), 1.0)
     return -config.imitation_coef * jnp.sum(weight * log_prob) / steps
 
 

@@ -13,6 +13,7 @@ from agents import distinct
 from agents.agent import Agent, Params
 from agents.losses import log_prob
 from agents.network import Outputs
+from agents.sharding import Shards
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State
@@ -54,6 +55,13 @@ class Trajectory(NamedTuple):
     def length(self) -> jax.Array:
         """i32[B]: steps taken."""
         return jnp.sum(self.mask, axis=0).astype(jnp.int32)
+
+    def gathered(self, shards: Shards) -> "Trajectory":
+        """The episodes of all devices; with several, without features and embeddings."""
+        if shards.count == 1:
+            return self
+        light = self._replace(layout=None, features=None, embedding=None)
+        return shards.whole(light, axis=1)._replace(layout=shards.whole(self.layout))
 
     def observations(self) -> jax.Array:
         """All boards, u8[T + 1, B, 12, 12, N]."""

@@ -13,9 +13,9 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import report
+from agents import processes, report
 from agents.agent import Policy, num_parameters
-from agents.checkpoint import Checkpoints
+from agents.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.config import Config
 from agents.evaluate import (
     ALL_SETS,
@@ -29,11 +29,12 @@ from agents.evaluate import (
 from agents.metrics import FirstSolved, MetricsLog, Row
 from agents.ppo import Train, TrainState, make_train
 from agents.run_folder import Run, RunFolder, write_json
+from agents.sharding import DEFAULT_DEVICE, Placement
 from agents.tracking import Tracker
 
 POLL_SECONDS = 0.005
 
-Advance = Callable[[TrainState, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
+Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
 
 
 class Progress(NamedTuple):
@@ -70,7 +71,15 @@ class Progress(NamedTuple):
 
 
 class Stopped(Exception):  # noqa: N818  it is no error
-    """Training was asked to stop and has saved."""
+    """Training was asked to stop and has saved.
+
+    Attributes:
+      signal: the number of the signal that asked, perhaps another process.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(f"signal {number}")
+        self.signal = number
 
 
 class StopSignals:
@@ -114,6 +123,7 @@ class Session:
         checkpoint_every: int,
         keep: int,
         tracker: Tracker | None = None,
+        placement: Placement = DEFAULT_DEVICE,
     ):
         """Builds training and takes up the newest checkpoint.
 
@@ -123,28 +133,34 @@ class Session:
           console: where to show it.
           checkpoint_every: iterations from one checkpoint to the next.
           keep: how many checkpoints to keep.
-          tracker: what evaluates on further task sets as training goes, if anything does.
+          tracker: what evaluates on further task sets as training goes, if anything does; of
+            a single process.
+          placement: the devices to train on; no matter which wrote the checkpoint.
 
         Raises:
           ValueError: the settings cannot be trained with, or the checkpoint is unusable.
         """
         self.folder, self.run, self._console = folder, run, console
-        self._every, self._tracker = checkpoint_every, tracker
-        self._train = make_train(run.config)
-        self._checkpoints = Checkpoints(folder.checkpoints, keep=keep)
+        self._every, self._tracker, self._placement = checkpoint_every, tracker, placement
+        self._train = make_train(run.config, shards=placement.episodes)
+        # Files are the first process's alone.
+        is_first = processes.is_first()
+        self._checkpoints = Checkpoints(folder.checkpoints, keep=keep) if is_first else None
         try:
-            self._state, self._progress = self._start()
+            state, self._progress = self._start()
         except ValueError:
             self.close()
             raise
+        self._state = placement.put(state)
         self.saved = self._progress.iteration
-        self._log = MetricsLog(folder.metrics, last_iteration=self.saved)
-        if tracker is not None:
+        self._log = MetricsLog(folder.metrics, last_iteration=self.saved) if is_first else None
+        if tracker is not None and self._log is not None:
             tracker.resume(self._log.rows, self.saved)
 
     def close(self) -> None:
         """Ends whatever works in the background."""
-        self._checkpoints.close()
+        if self._checkpoints is not None:
+            self._checkpoints.close()
 
     def train(self, stop: StopSignals) -> None:
         """Trains until all seeds are solved or the iterations are over.
@@ -163,21 +179,27 @@ class Session:
             while self._progress.active(config).any():
                 rows = self._iterate(advance)
                 live.update(rows, sum(first is not None for first in self._progress.solved))
+                # A signal may arrive at any time: what counts is what all agreed on here.
+                request = processes.agree(stop.received)
                 is_over = not self._progress.active(config).any()
-                if is_over or stop.received or self._progress.iteration % self._every == 0:
+                if is_over or request or self._progress.iteration % self._every == 0:
                     self._save()
-                if stop.received:
-                    raise Stopped
+                if request:
+                    raise Stopped(request)
 
     def finish(self) -> None:
         """Evaluates on all task sets, writes the results and says where they are."""
         run, folder = self.run, self.folder
-        evaluator = Evaluator.of_sets(run.config, ALL_SETS, run.config.eval_episodes)
+        evaluator = Evaluator.of_sets(
+            run.config, ALL_SETS, run.config.eval_episodes, self._placement
+        )
         policies = self._policies()
         played = {policy.name: evaluator(policy.params) for policy in policies}
+        self.summarize()
+        if self._log is None:
+            return
         results = {name: scores(outcome, run.config.max_steps) for name, outcome in played.items()}
         write_json(folder.evaluation, results_json(policies, results))
-        self.summarize()
         env = tt.task_set(run.config.env_id)
         folder.animation.unlink(missing_ok=True)
         for outcome in played.values():
@@ -191,22 +213,34 @@ class Session:
 
     def summarize(self) -> None:
         """Writes the summary and the learning curves."""
-        write_json(self.folder.summary, self._summary())
+        summary = self._summary()
+        if self._log is None:
+            return
+        write_json(self.folder.summary, summary)
         if self._log.rows:
             report.save_curves(self._log.rows, self.folder.curves, self.folder.path.name)
 
     def _start(self) -> tuple[TrainState, Progress]:
         keys = jax.vmap(jax.random.key)(np.array(self.run.seed_range, np.uint32))
         init = jax.jit(jax.vmap(self._train.init))
-        if self._checkpoints.iterations:
-            state, record = self._checkpoints.restore(jax.eval_shape(init, keys))
-            return state, Progress.from_dict(record)
+        template = jax.eval_shape(init, keys)
+
+        def stored() -> Any:
+            if self._checkpoints is None or not self._checkpoints.iterations:
+                return None
+            state, record = self._checkpoints.restore(template)
+            return to_arrays(state), record
+
+        found = processes.from_first(stored)
+        if found is not None:
+            return from_arrays(found[0], template), Progress.from_dict(found[1])
         return init(keys), Progress(0, 0.0, 0.0, (None,) * self.run.seeds)
 
     def _compile(self) -> Any:
         started = time.perf_counter()
-        active = jnp.ones(self.run.seeds, bool)
-        advance = jax.jit(make_advance(self._train, self.run.seeds), donate_argnums=0)
+        active = np.ones(self.run.seeds, bool)
+        per_device = make_advance(self._train, self._placement.local_seeds(self.run.seeds))
+        advance = jax.jit(self._placement.shard(per_device), donate_argnums=0)
         with self._console.status("Compiling ..."):
             compiled = advance.lower(self._state, active).compile()
         seconds = time.perf_counter() - started
@@ -220,7 +254,7 @@ class Session:
         config, progress = self.run.config, self._progress
         active = progress.active(config)
         started = time.perf_counter()
-        self._state, metrics = advance(self._state, jnp.asarray(active))
+        self._state, metrics = advance(self._state, active)
         _wait(metrics)
         host = {name: np.asarray(values) for name, values in metrics.items()}
         taken = time.perf_counter() - started
@@ -239,7 +273,8 @@ class Session:
         ]
         solved = _first_solved(self.run, progress.solved, rows)
         rows = self._track(rows, is_due=solved != progress.solved)
-        self._log.append(rows)
+        if self._log is not None:
+            self._log.append(rows)
         self._progress = progress._replace(iteration=iteration, seconds=seconds, solved=solved)
         return rows
 
@@ -256,23 +291,27 @@ class Session:
 
     def _save(self) -> None:
         record = {**self._progress.to_dict(), "run": self.run.to_dict(), "version": tt.__version__}
-        self._checkpoints.save(self._progress.iteration, self._state, record)
+        state = self._placement.local(self._state)
+        if self._checkpoints is not None:
+            self._checkpoints.save(self._progress.iteration, state, record)
         self.saved = self._progress.iteration
 
     def _policies(self) -> list[Policy]:
-        iterations = np.asarray(self._state.iteration)
+        state = self._placement.local(self._state)
+        iterations = np.asarray(state.iteration)
         return [
             Policy(
                 f"seed {seed}",
                 self.run.config,
-                jax.tree.map(lambda x, index=index: x[index], self._state.params),
+                jax.tree.map(lambda x, index=index: x[index], state.params),
                 int(iterations[index]),
             )
             for index, seed in enumerate(self.run.seed_range)
         ]
 
     def _summary(self) -> dict[str, Any]:
-        seeds = zip(self.run.seed_range, self._state.episodes, self._progress.solved, strict=True)
+        state = self._placement.local(self._state)
+        seeds = zip(self.run.seed_range, state.episodes, self._progress.solved, strict=True)
         return {
             "env_id": self.run.config.env_id,
             "iterations": self._progress.iteration,
@@ -296,7 +335,7 @@ class Session:
         self._console.print(
             f"{self.folder.path}: preset {run.preset}, {tt.task_set(run.config.env_id).id}, "
             f"curiosity {run.config.curiosity}, seed {seeds}, {count:,} parameters, {begin}, "
-            f"on {jax.devices()[0].platform}",
+            f"on {self._placement}",
             soft_wrap=True,
             highlight=False,
         )
@@ -330,7 +369,7 @@ def make_advance(train: Train, num_seeds: int) -> Advance:
 
     def advance(state: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
         after, metrics = train.iterate(state)
-        outcome = evaluate(train.agent, after.params, train.env, tasks, config.chunk)
+        outcome = evaluate(train.agent, after.params, train.env, tasks, config.chunk, train.shards)
         metrics = {
             **metrics,
             "episodes": after.episodes,

@@ -3,18 +3,21 @@
 import dataclasses
 import signal
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, NoReturn
 
+import jax
 import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import compilation_cache
+from agents import compilation_cache, processes
 from agents.config import PRESETS, Config
 from agents.run_folder import Run, RunFolder, write_json
 from agents.session import Session, Stopped, StopSignals
+from agents.sharding import Placement
 
 PROGRAM = "python -m agents.train"
 # Settings that do not shape what has been trained so far.
@@ -46,13 +49,15 @@ class Selection:
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Selection):
+class Options(processes.Job, Selection):
     """Trains an agent, evaluates it on all task sets and leaves everything in a folder.
 
     Ctrl-C stops after the current iteration and saves; a second one stops at once.
     --resume then continues to the same result as if nothing had happened.
 
     Attributes:
+      devices: how many devices share the episodes and seeds, or `all` there are; one if
+        absent, and with several processes all of theirs.
       checkpoint_every: iterations from one checkpoint to the next.
       keep: how many checkpoints to keep, the newest.
       no_cache: compile everything anew, instead of keeping compiled programs in
@@ -60,6 +65,7 @@ class Options(Selection):
       config: the settings of training.
     """
 
+    devices: int | Literal["all"] | None = None
     checkpoint_every: int = 10
     keep: int = 3
     no_cache: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -67,6 +73,7 @@ class Options(Selection):
 
     def __post_init__(self) -> None:
         """Refuses impossible numbers."""
+        super().__post_init__()
         for name in ("checkpoint_every", "keep"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
@@ -75,32 +82,102 @@ class Options(Selection):
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    console = Console()
     try:
-        options, stored = parse(arguments)
+        train(arguments)
+    except Exception:
+        if processes.count() == 1:
+            raise
+        traceback.print_exc()
+        processes.leave(1)
+
+
+def train(arguments: Sequence[str]) -> None:
+    """Trains as a command line says.
+
+    Raises:
+      SystemExit: it is refused, or training was stopped.
+    """
+    try:
+        find_job(arguments).join()
+        console = Console(quiet=not processes.is_first())
+        options, folder, run = processes.from_first(lambda: set_up(arguments))
         if not options.no_cache:
             compilation_cache.enable()
-        folder, run = open_run(options, stored)
         session = Session(
-            folder, run, console, checkpoint_every=options.checkpoint_every, keep=options.keep
+            folder,
+            run,
+            console,
+            checkpoint_every=options.checkpoint_every,
+            keep=options.keep,
+            placement=Placement.of(options.devices, run.config, run.seeds),
         )
-        write_json(folder.config, run.to_dict())  # more iterations, once the run has been taken up
+        # More iterations, once the run has been taken up.
+        processes.from_first(lambda: write_json(folder.config, run.to_dict()))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
     except KeyboardInterrupt:
-        raise SystemExit(128 + signal.SIGINT) from None
+        processes.leave(128 + signal.SIGINT)
+    except jax.errors.JaxRuntimeError as error:
+        end_without_peers(error, "Begin again with the same command.")
+
+    def tell() -> None:
+        where = f"Stopped at iteration {session.saved}. {how_to_resume(folder)}"
+        console.print(where, soft_wrap=True)
+
     stop = StopSignals(lambda: console.print("Finishing this iteration; again to abandon it."))
     try:
         session.train(stop)
         session.finish()
-    except (KeyboardInterrupt, Stopped):
-        console.print(
-            f"Stopped at iteration {session.saved}. {how_to_resume(folder)}", soft_wrap=True
-        )
-        raise SystemExit(128 + (stop.received or signal.SIGINT)) from None
+    except Stopped as stopped:
+        tell()
+        raise SystemExit(128 + stopped.signal) from None
+    except KeyboardInterrupt:
+        tell()
+        processes.leave(128 + (stop.received or signal.SIGINT))
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        end_without_peers(error, f"Iteration {session.saved} is saved. {how_to_resume(folder)}")
     finally:
         session.close()
+
+
+def find_job(arguments: Sequence[str]) -> processes.Job:
+    """How the command line finds other processes.
+
+    Raises:
+      ValueError: the description is incomplete or contradicts itself.
+    """
+    job, _ = tyro.cli(
+        processes.Job, args=arguments, prog=PROGRAM, add_help=False, return_unknown_args=True
+    )
+    return job
+
+
+def set_up(arguments: Sequence[str]) -> tuple[Options, RunFolder, Run]:
+    """Checks a command line as a whole, then makes or opens its run.
+
+    Raises:
+      ValueError: something is not allowed.
+      OSError: the folder cannot be made.
+    """
+    options, stored = parse(arguments)
+    Placement.of(options.devices, options.config, options.seeds)
+    return options, *open_run(options, stored)
+
+
+def end_without_peers(error: Exception, advice: str) -> NoReturn:
+    """Ends one of several processes after an error; one alone raises the error.
+
+    The computations of a process end with one of JAX's errors where another process is gone.
+    """
+    if processes.count() == 1:
+        raise error
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    print(
+        f"error: training has ended here, likely because another process did ({reason}). {advice}",
+        file=sys.stderr,
+    )
+    processes.leave(1)
 
 
 def parse(arguments: Sequence[str]) -> tuple[Options, Run | None]:

@@ -1,0 +1,135 @@
+"""Trains on 8 simulated devices and on one, with checkpoints between them; prints what differs.
+
+A process of its own for `test_sharding.py`: the number of devices is fixed once JAX starts.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from agents.checkpoint import Checkpoints, digest, to_arrays
+from agents.config import Config
+from agents.evaluate import Evaluator, evaluation_tasks
+from agents.ppo import make_train
+from agents.sharding import Placement
+
+SEEDS = 2
+CONFIG = Config.preset(
+    "fast",
+    env_id="TrapTube-v0",
+    curiosity="icm",
+    episodes=16,
+    minibatch=8,
+    epochs=2,
+    max_steps=6,
+    filters=(2, 2),
+    hidden=4,
+    embedding=2,
+    imitation_episodes=3,
+    eval_episodes=3,
+    chunk=8,
+)
+
+
+class Trainer:
+    """Training with one seed a device, from the default device and back to it."""
+
+    def __init__(self, placement, seeds):
+        self.placement = placement
+        train = make_train(CONFIG, shards=placement.episodes)
+        self.init = jax.jit(jax.vmap(train.init))
+        assert placement.local_seeds(seeds) == 1
+
+        def advance(state):
+            result = train.iterate(jax.tree.map(lambda x: x[0], state))
+            return jax.tree.map(lambda x: x[None], result)
+
+        self.advance = jax.jit(placement.shard(advance))
+
+    def __call__(self, state, iterations):
+        state, rows = self.placement.put(state), []
+        for _ in range(iterations):
+            state, metrics = self.advance(state)
+            rows.append(jax.tree.map(np.asarray, metrics))
+        return self.placement.local(state), rows
+
+
+def first_state(trainer):
+    """A state whose replay holds solved episodes, so that imitation has something to share."""
+    state = trainer.init(jax.vmap(jax.random.key)(np.arange(SEEDS, dtype=np.uint32)))
+    replay = state.replay
+    mask = np.ones(replay.mask.shape, np.float32)
+    mask[:, :, -1] = 0
+    reward = np.zeros_like(mask)
+    reward[:, -1, :-1] = 1
+    return state._replace(replay=replay._replace(mask=mask, reward=reward))
+
+
+def rows_of(tree, index):
+    return jax.tree.map(lambda x: x[index : index + 1], tree)
+
+
+def on_one_device(state, iterations):
+    """Each seed alone, then side by side again."""
+    alone = Trainer(Placement.of(1, CONFIG, 1), 1)
+    results = [alone(rows_of(state, seed), iterations) for seed in range(SEEDS)]
+    arrays = [to_arrays(state) for state, _ in results]
+    return (
+        {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]},
+        [
+            {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+            for rows in zip(*(rows for _, rows in results), strict=True)
+        ],
+    )
+
+
+def difference(one, other):
+    """The largest difference, relative where numbers exceed 1, by name."""
+    assert set(one) == set(other)
+    gap = {
+        name: np.max(np.abs(np.float64(one[name]) - other[name]) / np.maximum(1, np.abs(one[name])))
+        for name in one
+    }
+    worst = max(gap, key=lambda name: gap[name])
+    return {"name": worst, "gap": float(gap[worst])}
+
+
+def main(folder):
+    assert len(jax.devices()) == 8
+    placement = Placement.of("all", CONFIG, SEEDS)
+    assert placement.mesh is not None
+    trainer = Trainer(placement, SEEDS)
+    start = first_state(trainer)
+    expected, expected_rows = on_one_device(start, 3)
+    found, rows = trainer(start, 3)
+    # Eight devices save after one iteration, and go on from what is read back.
+    once, _ = trainer(start, 1)
+    with Checkpoints(folder, keep=1) as checkpoints:
+        checkpoints.save(1, once, {})
+        restored, _ = checkpoints.restore(jax.eval_shape(lambda: start))
+    from_eight, _ = on_one_device(restored, 2)
+    twice, _ = trainer(restored, 2)
+    tasks = {name: evaluation_tasks(name, 3, max_steps=6) for name in ("base", "st")}
+    params = jax.tree.map(lambda x: x[0], once.params)
+    played = [Evaluator(CONFIG, tasks, place)(params) for place in (Placement(), placement)]
+    same = jax.tree.map(lambda x, y: bool(np.array_equal(x, y)), *played)
+    head = "params/heads/params/move/kernel"
+    report = {
+        "mesh": dict(placement.mesh.shape),
+        "state": difference(expected, to_arrays(found)),
+        "metrics": [difference(*pair) for pair in zip(expected_rows, rows, strict=True)],
+        "learned": float(np.max(np.abs(expected[head] - to_arrays(start)[head]))),
+        "imitation": [float(np.min(np.abs(row["imitation_loss"]))) for row in rows],
+        "eight_to_one": difference(expected, from_eight),
+        "eight_to_eight": digest(to_arrays(twice)) == digest(to_arrays(found)),
+        "evaluation": all(jax.tree.leaves(same)),
+        "tasks": {name: len(outcome.solved) for name, outcome in played[1].items()},
+    }
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
