@@ -29,6 +29,7 @@ from agents.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
 from agents.ppo import make_train
 from agents.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
 from agents.run_folder import Run, RunFolder
+from agents.sharding import ALONE
 from benchmarks import readme_tables
 
 ROOT = Path(__file__).parent.parent
@@ -52,9 +53,9 @@ class Killed(BaseException):
     """Nothing in the way of a process that is killed catches it."""
 
 
-def fake_train(config):
+def fake_train(config, shards=ALONE):
     """Training at once: every parameter becomes 100 * seed + iteration."""
-    real = make_train(config)
+    real = make_train(config, shards=shards)
     shapes = jax.eval_shape(real.init, jax.random.key(0))._replace(key=None)
 
     def init(key):
@@ -88,7 +89,7 @@ class FakeEvaluator:
         }
 
 
-def fake_evaluate(agent, params, env, tasks, chunk):
+def fake_evaluate(agent, params, env, tasks, chunk, shards):
     nothing = jnp.zeros(len(tasks.time), jnp.int32)
     return evaluate.Evaluation(nothing > 0, nothing, nothing)
 
