@@ -425,6 +425,7 @@ def test_readme_tables_are_written_on_demand(tmp_path, whole):
         readme_tables.generate("<!-- table: none -->\n<!-- end -->", tmp_path)
 
 
+@pytest.mark.slow
 def test_the_quick_protocol_runs(tmp_path):
     """A slice of it, as a process: one short iteration of real training, all sets."""
     settings = ["episodes=2", "minibatch=2", "epochs=1", "max_steps=4", "chunk=8", *SMALL]

@@ -60,6 +60,7 @@ def eight(tmp_path_factory):
     return json.loads(output)
 
 
+@pytest.mark.slow
 def test_eight_devices_train_as_one(eight):
     assert eight["mesh"] == {"seeds": 2, "episodes": 4}
     assert eight["learned"] > 1e-3
@@ -69,11 +70,13 @@ def test_eight_devices_train_as_one(eight):
         assert metrics["gap"] < 2e-6, metrics
 
 
+@pytest.mark.slow
 def test_eight_devices_evaluate_as_one(eight):
     assert eight["tasks"] == {"base": 1, "st": 3}
     assert eight["evaluation"]
 
 
+@pytest.mark.slow
 def test_checkpoints_move_between_numbers_of_devices(eight):
     assert eight["eight_to_one"]["gap"] < 2e-6, eight["eight_to_one"]
     assert eight["eight_to_eight"]
@@ -115,6 +118,7 @@ def without_transport(text):
     return "".join(line for line in text.splitlines(True) if not line.startswith("[Gloo]"))
 
 
+@pytest.mark.slow
 def test_two_processes_stop_together(joint):
     first, second = start_two(joint, *SETTINGS)
     wait_for_iterations(first, 2)
@@ -132,6 +136,7 @@ def test_two_processes_stop_together(joint):
     assert [row["episodes"] for row in rows] == list(range(8, 8 * iteration + 1, 8))
 
 
+@pytest.mark.slow
 def test_a_killed_process_ends_the_other(joint):
     """In the run that the test above has left: two processes take it up."""
     before = checkpoint(joint[0])
