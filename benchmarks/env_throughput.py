@@ -29,6 +29,7 @@ class Arguments:
       num_envs: batch sizes.
       num_steps: steps of each environment per timed call; episodes last up to 50.
       repeats: timed calls; the median counts.
+      devices: devices to divide the environments over; a CPU is made to appear as so many.
       plain: measure `jax.vmap` of an `AutoReset`, the fast path's reference, instead.
       json: file to write the results to.
     """
@@ -37,6 +38,7 @@ class Arguments:
     num_envs: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384)
     num_steps: int = 100
     repeats: int = 5
+    devices: int = 1
     plain: bool = False
     json: pathlib.Path | None = None
 
@@ -69,6 +71,7 @@ def sample_actions(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 def main(arguments: Arguments) -> list[harness.Throughput]:
     """Measures, prints a table, and writes JSON if asked to."""
+    harness.use_devices(arguments.devices)
     console = Console()
     console.print(harness.machine())
     bandwidth = harness.copy_bandwidth()
@@ -82,6 +85,7 @@ def main(arguments: Arguments) -> list[harness.Throughput]:
                 num_envs,
                 num_steps=arguments.num_steps,
                 repeats=arguments.repeats,
+                devices=arguments.devices,
             )
             results.append(result)
             table.add_row(

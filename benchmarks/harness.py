@@ -54,8 +54,9 @@ class Throughput:
 
     Attributes:
       name: the subject's.
-      num_envs: B, environments in the batch.
+      num_envs: B, environments in the batch, over all devices.
       num_steps: steps of each environment per call.
+      devices: how many the batch is divided over.
       steps_per_s: environment steps per second, all together, by the median call.
       observation_bytes: bytes of one environment's observation.
       timing: of one call.
@@ -64,6 +65,7 @@ class Throughput:
     name: str
     num_envs: int
     num_steps: int
+    devices: int
     steps_per_s: float
     observation_bytes: int
     timing: Timing
@@ -85,19 +87,33 @@ def measure(function: Callable[[int], Any], repeats: int = 5) -> Timing:
     return Timing(first, statistics.median(later), min(later), max(later))
 
 
+def use_devices(number: int) -> None:
+    """Makes a CPU appear as this many devices; before JAX is used for the first time."""
+    if number > 1:
+        jax.config.update("jax_num_cpu_devices", number)
+
+
 def measure_throughput(
-    subject: Subject, num_envs: int, *, num_steps: int = 100, repeats: int = 5
+    subject: Subject, num_envs: int, *, num_steps: int = 100, repeats: int = 5, devices: int = 1
 ) -> Throughput:
     """Steps a subject by random actions and consumes every byte of every observation.
 
     At each step the observations are XORed, byte for byte, into a running array of their
     own size, which the scan carries and so writes to memory each time. The actions are
-    drawn before the clock starts. A call goes on where the one before it stopped.
-    """
-    state, observation = jax.jit(subject.reset)(jax.random.split(jax.random.key(0), num_envs))
-    actions = subject.sample_actions(jax.random.key(1), (num_steps, num_envs))
+    drawn before the clock starts. A call goes on where the one before it stopped. Several
+    devices step a part of the environments each, and exchange nothing.
 
-    @jax.jit
+    Raises:
+      ValueError: the devices do not divide the environments.
+    """
+    if num_envs % devices:
+        raise ValueError(f"devices must divide num_envs={num_envs}, got {devices}")
+    own_envs = num_envs // devices
+
+    def reset(keys):
+        state, observation = subject.reset(keys)
+        return state, jnp.zeros_like(_bits(observation)), observation
+
     def run(carry, actions):
         def step(carry, actions):
             state, folded = carry
@@ -106,11 +122,14 @@ def measure_throughput(
 
         return jax.lax.scan(step, carry, actions)[0]
 
-    carry = (state, jnp.zeros_like(_bits(observation)))
+    keys = jax.random.split(jax.random.key(0), num_envs).reshape(devices, own_envs)
+    actions = subject.sample_actions(jax.random.key(1), (devices, num_steps, own_envs))
+    *carry, observation = on_devices(reset, devices)(keys)
+    compiled, carry = on_devices(run, devices), tuple(carry)
 
     def call(_: int) -> jax.Array:
         nonlocal carry
-        carry = run(carry, actions)
+        carry = compiled(carry, actions)
         return carry[1]
 
     timing = measure(call, repeats)
@@ -118,10 +137,29 @@ def measure_throughput(
         name=subject.name,
         num_envs=num_envs,
         num_steps=num_steps,
+        devices=devices,
         steps_per_s=num_envs * num_steps / timing.median_s,
         observation_bytes=observation.nbytes // num_envs,
         timing=timing,
     )
+
+
+def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]:
+    """Compiles a function that runs on every device by itself.
+
+    Arguments and results have the devices as an additional first axis.
+    """
+
+    def own(*arrays: Any) -> Any:
+        result = function(*jax.tree.map(lambda x: x[0], arrays))
+        return jax.tree.map(lambda x: x[None], result)
+
+    if devices == 1:
+        return jax.jit(own)
+    mesh = jax.make_mesh((devices,), ("devices",), axis_types=(jax.sharding.AxisType.Auto,))
+    part = jax.sharding.PartitionSpec("devices")
+    mapped = jax.shard_map(own, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+    return jax.jit(mapped)
 
 
 def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) -> float:

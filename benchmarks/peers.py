@@ -27,6 +27,7 @@ class Arguments:
       num_envs: batch size.
       num_steps: steps of each environment per timed call.
       repeats: timed calls; the median counts.
+      devices: devices to divide the environments over; a CPU is made to appear as so many.
       sets: our own task sets in the table; the first is the ratios' numerator.
       json: file to write the results to.
     """
@@ -34,6 +35,7 @@ class Arguments:
     num_envs: int = 4096
     num_steps: int = 100
     repeats: int = 5
+    devices: int = 1
     sets: tuple[str, ...] = ("pstsy", "base")
     json: pathlib.Path | None = None
 
@@ -160,6 +162,7 @@ def run(arguments: Arguments) -> tuple[list[harness.Throughput], dict[str, str]]
                 arguments.num_envs,
                 num_steps=arguments.num_steps,
                 repeats=arguments.repeats,
+                devices=arguments.devices,
             )
         except Exception as error:  # whatever breaks in a peer must not break the others
             first_line = next(iter(str(error).splitlines()), "")
@@ -171,6 +174,7 @@ def run(arguments: Arguments) -> tuple[list[harness.Throughput], dict[str, str]]
 
 def main(arguments: Arguments) -> None:
     """Measures, prints a table and the skipped peers, and writes JSON if asked to."""
+    harness.use_devices(arguments.devices)
     console = Console()
     console.print(harness.machine())
     results, skipped = run(arguments)
