@@ -76,13 +76,12 @@ class Part:
         return self.encoder_flop / self.timing.median_s
 
 
-def measure(env: str, arguments: Arguments) -> list[Part]:
-    """The iteration and its parts, on one task set."""
-    config = Config.preset(arguments.preset, env_id=env)
+def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
+    """The iteration and its parts; see `Arguments`."""
     train = make_train(config)
     state = jax.jit(train.init)(jax.random.key(0))
     iterate = jax.jit(train.iterate)
-    for _ in range(arguments.warm):
+    for _ in range(warm):
         state, _ = iterate(state)
     play = jax.jit(lambda state: _play(train, state))
     trajectory = play(state)
@@ -101,9 +100,9 @@ def measure(env: str, arguments: Arguments) -> list[Part]:
         ("recurrent part and heads", _jitted(_core_only, train, state, batch, trajectory), 0.0),
         ("optimiser", _jitted(_optimizer_only, train, state), 0.0),
     ]
-    short = task_set(env).short
+    short = task_set(config.env_id).short
     return [
-        Part(short, name, harness.measure(lambda _, run=run: run(), arguments.repeats), flop)
+        Part(short, name, harness.measure(lambda _, run=run: run(), repeats), flop)
         for name, run, flop in parts
     ]
 
@@ -192,12 +191,13 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
     agent = train.agent
 
     def total(params: Params, features: jax.Array, part: Batch) -> jax.Array:
-        embedding, following = agent.unroll(params, features, part.action, part.reward)
-        outputs = agent.act(params, embedding)
-        everything = [*outputs, following]
-        if agent.curiosity is not None:
+        given = (params, features, part.action, part.reward)
+        if agent.curiosity is None:
+            everything = [*agent.act(params, agent.unroll(*given))]
+        else:
+            embedding, following = agent.unroll_both(*given)
             prediction = agent.predict(params, embedding, following, features, part.action)
-            everything += jax.tree.leaves(prediction)
+            everything = [*agent.act(params, embedding), *jax.tree.leaves(prediction)]
         return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 
     def gradient(episodes: jax.Array) -> Params:
@@ -238,7 +238,8 @@ def main(arguments: Arguments) -> list[Part]:
     table = Table(*columns, title=f"preset {arguments.preset}")
     results: list[Part] = []
     for env in arguments.env:
-        parts = measure(env, arguments)
+        config = Config.preset(arguments.preset, env_id=env)
+        parts = measure(config, warm=arguments.warm, repeats=arguments.repeats)
         results += parts
         for part in parts:
             table.add_row(

@@ -1,0 +1,62 @@
+"""The benchmarks of training measure what they say."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from agents import Config
+from agents.agent import Agent
+from benchmarks import scaling, train_throughput
+
+CONFIG = Config(
+    max_steps=4, episodes=4, minibatch=2, epochs=2, filters=(2, 3), hidden=4, embedding=2, chunk=4
+)
+
+
+def test_operations_of_matrix_products_are_counted():
+    def function(x, y):
+        def body(carry, _):
+            return carry @ y, None
+
+        return jax.lax.scan(body, jax.jit(jnp.matmul)(x, y), None, length=1)[0]
+
+    jaxpr = jax.make_jaxpr(function)(jnp.zeros((3, 5)), jnp.zeros((5, 5)))
+    assert train_throughput.matrix_flop(jaxpr) == 2 * (2 * 3 * 5 * 5)
+
+
+def test_the_encoder_of_the_paper_costs_what_its_shapes_say():
+    agent = Agent(Config())
+    params = jax.eval_shape(agent.init, jax.random.key(0))
+    jaxpr = jax.make_jaxpr(agent.encode)(params, jnp.zeros((1, 12, 12, 3), jnp.uint8))
+    stem = 144 * 4 * 6 * 32 + 144 * 4 * 32 * 64
+    blocks = 2 * (36 + 9) * 9 * 64 * 64
+    assert train_throughput.matrix_flop(jaxpr) == 2 * (stem + blocks)
+
+
+@pytest.mark.slow
+def test_an_iteration_is_split_into_its_parts():
+    parts = train_throughput.measure(CONFIG, warm=0, repeats=1)
+    assert [part.name for part in parts] == [
+        "iteration", "rollout", "encoder", "recurrent part and heads", "optimiser",
+    ]  # fmt: skip
+    whole, play, encoder, *others = parts
+    assert whole.encoder_flop == play.encoder_flop + encoder.encoder_flop
+    assert encoder.encoder_flop > play.encoder_flop > 0
+    assert [part.encoder_flop for part in others] == [0, 0]
+    assert all(part.timing.median_s > 0 and part.env == "base" for part in parts)
+
+
+def test_points_are_drawn(tmp_path):
+    points = [
+        scaling.Point(kind, "base", size, 1e3 * size, 2**30, 1.0)
+        for kind in scaling.TITLES
+        for size in (1, 8)
+    ]
+    path = tmp_path / "folder" / "scaling.png"
+    scaling.save_figure(points, path)
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_unknown_presets_are_refused():
+    with pytest.raises(ValueError, match="unknown preset 'slow'; allowed: paper, fast"):
+        train_throughput.Arguments(preset="slow")
