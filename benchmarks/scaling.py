@@ -113,15 +113,19 @@ def save_figure(points: Sequence[Point], path: pathlib.Path) -> None:
     axes: Any = figure.subplots(2, len(kinds), squeeze=False, sharex="col")
     for column, kind in enumerate(kinds):
         top, bottom = axes[:, column]
+        sizes = sorted({point.size for point in points if point.kind == kind})
         for env in dict.fromkeys(point.env for point in points if point.kind == kind):
             chosen = [point for point in points if (point.kind, point.env) == (kind, env)]
-            sizes = [point.size for point in chosen]
-            top.loglog(sizes, [point.steps_per_s for point in chosen], "o-", label=env)
-            bottom.loglog(sizes, [point.peak_bytes / 2**30 for point in chosen], "o-", label=env)
+            at = [point.size for point in chosen]
+            top.plot(at, [point.steps_per_s for point in chosen], "o-", label=env)
+            bottom.plot(at, [point.peak_bytes / 2**30 for point in chosen], "o-", label=env)
         quantity, _, over = TITLES[kind].partition(" over ")
         top.set(title=quantity)
-        bottom.set(xlabel=over.partition(",")[0])
+        bottom.set(xlabel=over.partition(",")[0], xscale="log")
+        bottom.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        bottom.minorticks_off()
         for axis in (top, bottom):
+            axis.set_ylim(bottom=0)
             axis.grid(alpha=0.3)
             axis.legend()
     axes[0, 0].set_ylabel("per second")
