@@ -214,6 +214,8 @@ PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("curiosity losses", ("forward_loss", "inverse_loss"), "weighted loss"),
     ("entropy", ("entropy",), "nats, grasp + move"),
     ("gradient norm", ("gradient_norm",), "before clipping"),
+    ("fresh tasks", ("fresh_success",), "share solved in training"),
+    ("reach of restarts", ("reach",), "steps before a success"),
 )
 
 
@@ -226,10 +228,12 @@ def save_curves(rows: Sequence[Row], path: Path, title: str) -> None:
       title: over all panels.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+    from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
     panels = [
         (name, [metric for metric in metrics if metric in rows[0]], unit)
         for name, metrics, unit in PANELS
+        if name != "intrinsic reward" or any(row.get("intrinsic_reward") for row in rows)
     ]
     panels = [panel for panel in panels if panel[1]]
     height = -(-len(panels) // 2)
@@ -246,6 +250,7 @@ def save_curves(rows: Sequence[Row], path: Path, title: str) -> None:
             axis.set_ylim(-0.03, 1.03)
     for axis in axes[-1]:
         axis.set_xlabel("episodes")
+        axis.xaxis.set_major_formatter(EngFormatter())
     figure.savefig(path, format="png", dpi=110)
 
 
