@@ -234,6 +234,7 @@ def kill_after(patch, owner, name, is_moment):
     patch.setattr(owner, name, wrapped)
 
 
+@pytest.mark.slow
 def test_killed_experiments_continue_to_the_same_bits(whole, tmp_path):
     """Killed in a fourth iteration, one past a checkpoint, after each of its writes.
 
@@ -260,6 +261,7 @@ def test_killed_experiments_continue_to_the_same_bits(whole, tmp_path):
         assert contents(tmp_path / "x" / name) == contents(whole / name)
 
 
+@pytest.mark.slow
 def test_more_seeds_and_iterations_add_to_what_is_there(whole, tmp_path):
     shutil.copytree(whole, tmp_path / "x")
     kept = (whole / "ppo-seed0" / "metrics.csv").read_bytes()
@@ -275,6 +277,7 @@ def test_more_seeds_and_iterations_add_to_what_is_there(whole, tmp_path):
     assert (root / "ppo-seed0" / "metrics.csv").read_bytes().startswith(kept)
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_are_those_one_after_another(whole, tmp_path):
     folder = run(tmp_path, "--side-by-side") / "ppo-seed0to1"
     for name in ("metrics.csv", "outcomes.csv"):

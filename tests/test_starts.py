@@ -132,6 +132,7 @@ def test_walks_stop_when_the_memory_is_nearly_full(empty):
     jax.tree.map(np.testing.assert_array_equal, known, full)
 
 
+@pytest.mark.slow
 def test_training_rehearses_what_walks_have_found():
     train = make_train(CONFIG)
     iterate = jax.jit(train.iterate)
