@@ -153,6 +153,7 @@ def record(whole):
     return json.loads((whole / "summary.json").read_text())
 
 
+@pytest.mark.slow
 def test_evaluations_are_in_the_metrics(whole):
     for seed in (0, 1):
         rows = untimed(whole / f"ppo-seed{seed}" / "metrics.csv")
@@ -164,6 +165,7 @@ def test_evaluations_are_in_the_metrics(whole):
             np.testing.assert_array_equal(found, [*shares, np.mean(shares)])
 
 
+@pytest.mark.slow
 def test_the_steps_of_every_task_are_kept(whole):
     for seed in (0, 1):
         for row in read_metrics(whole / f"ppo-seed{seed}" / "outcomes.csv"):
@@ -174,6 +176,7 @@ def test_the_steps_of_every_task_are_kept(whole):
                 assert solved.tolist() == [count > 0 for count in steps]
 
 
+@pytest.mark.slow
 def test_the_best_parameters_are_kept(whole):
     for seed, iteration in ((0, 4), (1, 2)):
         policy = pretrained.load(whole / f"ppo-seed{seed}" / f"best-seed{seed}.npz")
@@ -181,6 +184,7 @@ def test_the_best_parameters_are_kept(whole):
         assert np.all(jax.tree.leaves(policy.params)[0] == 100 * seed + iteration)
 
 
+@pytest.mark.slow
 def test_the_record_says_how_good_the_best_evaluation_is(whole, record):
     (entry,) = record["algorithms"]
     trial, _ = entry["runs"]
@@ -197,6 +201,7 @@ def test_the_record_says_how_good_the_best_evaluation_is(whole, record):
     assert record["equal_to_base"] == {"base": 100, "p": 25}
 
 
+@pytest.mark.slow
 def test_an_experiment_leaves_tables_and_figures(whole, record, capsys):
     assert (whole / "curves.png").read_bytes().startswith(b"\x89PNG")
     text = (whole / "tables.md").read_text()
@@ -316,6 +321,7 @@ def test_impossible_experiments_are_refused(capsys, tmp_path, arguments, message
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_folder_holds_one_experiment(capsys, whole):
     where = ["--out", whole.parent, "--name", "x"]
     assert "holds another experiment than exp2" in refused(capsys, "exp2", *where)
@@ -413,6 +419,7 @@ def test_readme_tables_are_those_of_the_recorded_results():
     assert readme_tables.generate(text, readme_tables.Arguments().results) == text
 
 
+@pytest.mark.slow
 def test_readme_tables_are_written_on_demand(tmp_path, whole):
     readme = tmp_path / "README.md"
     shutil.copy(whole / "summary.json", tmp_path / "mine.json")
