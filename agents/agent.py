@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity import ICM, RND, DetachedICM, Prediction, Transition
-from agents.network import Core, Encoder, Heads, Outputs, RelationalEncoder, draw
+from agents.network import Core, Encoder, Heads, Outputs, draw
+from agents.object_encoder import ObjectEncoder
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
@@ -38,7 +39,7 @@ class Agent:
     """
 
     def __init__(self, config: Config):
-        encoders = {"paper": Encoder, "relational": RelationalEncoder}
+        encoders = {"paper": Encoder, "objects": ObjectEncoder}
         self.encoder = encoders[config.encoder](config.filters)
         self.core = Core(config.hidden, config.embedding)
         self.heads = Heads()

@@ -8,7 +8,8 @@ import difflib
 from typing import Any, Literal, Self, get_args
 
 Curiosity = Literal["icm", "icm-detached", "rnd", "counts", "none"]
-EncoderName = Literal["paper", "relational"]
+EncoderName = Literal["paper", "objects"]
+Method = Literal["ppo", "dagger"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,11 +20,14 @@ class Config:
       env_id: the task set to train on, by id or short name.
       num_features: N, feature channels of the observation; 3 is RGB.
       max_steps: steps after which an episode is truncated.
+      method: `ppo`, or `dagger`: random walks explore every task, and the agent learns to do
+        in all states that it comes to what they have found to bring the goal nearest.
       iterations: rollouts to train for, at most.
       stop_when_solved: stop early once the greedy policy solves this share of the
         evaluation tasks of `env_id`; 0 never stops early.
       episodes: episodes per iteration.
-      epochs: passes over each iteration's episodes.
+      epochs: passes over each iteration's episodes; with `dagger`, as many gradient steps
+        as they take.
       minibatch: whole episodes per gradient step; divides `episodes`.
       discount: gamma.
       gae_lambda: lambda of the advantage estimates.
@@ -45,16 +49,24 @@ class Config:
         their episode.
       imitation_coef: weight of imitating the agent's own solved episodes; 0 for none.
       imitation_episodes: the newest solved episodes that are remembered and imitated.
-      restarts: share of the episodes that start inside a success of a random walk,
-        some steps before its end, instead of at a fresh task; 0 for none.
-      restart_memory: how many such successes are rehearsed at a time.
-      walk_sets: task sets on which random walks look for successes, by id or short name.
-      walks: walks per iteration on each of them, while there is room in the memory.
-      walk_steps: steps of each.
+      task_sets: with `dagger`, the sets that tasks are drawn from in equal parts, by id or
+        short name; `env_id` alone if there are none.
+      tasks: new tasks per iteration with `dagger`; divides `episodes`.
+      walkers: random walks at a time that explore a task.
+      walk_rounds: how often they start again, where few have been.
+      walk_steps: steps of each round.
+      agent_rounds: further rounds, which start where the agent has come to.
+      restarts: share of a task's episodes that start anywhere that the walks came from to the
+        goal; the others start where the task does.
+      advised: share of a task's episodes in which actions are replaced by advice.
+      advice: share of the actions that are, at most; among the advised episodes it rises from
+        0 to this.
+      dataset: the newest episodes that `dagger` learns from; a multiple of `episodes`.
       reward_rate: weight of the past in the moving moments that normalise both rewards.
-      encoder: `paper`, or `relational`: less arithmetic, and an input that says how cells
-        relate to each other, to the agent and to the food.
-      filters: channels of the first convolutions, and of all later ones.
+      encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
+        seen from agent and food is all that is encoded.
+      filters: channels of the first convolutions, and of all later ones; units of the layers
+        of `objects`.
       hidden: units of the GRU, of the layer before it and of the inverse model.
       embedding: units of each action embedding and of the reward's.
       eval_episodes: fixed evaluation tasks per task set.
@@ -64,6 +76,7 @@ class Config:
     env_id: str = "TrapTube-v0"
     num_features: int = 3
     max_steps: int = 50
+    method: Method = "ppo"
     iterations: int = 250
     stop_when_solved: float = 0.0
     episodes: int = 1024
@@ -84,11 +97,16 @@ class Config:
     episodic_novelty: bool = False
     imitation_coef: float = 0.0
     imitation_episodes: int = 16
-    restarts: float = 0.0
-    restart_memory: int = 2048
-    walk_sets: tuple[str, ...] = ()
-    walks: tuple[int, ...] = ()
-    walk_steps: int = 400
+    task_sets: tuple[str, ...] = ()
+    tasks: int = 64
+    walkers: int = 512
+    walk_rounds: int = 8
+    walk_steps: int = 50
+    agent_rounds: int = 2
+    restarts: float = 0.25
+    advised: float = 0.75
+    advice: float = 0.9
+    dataset: int = 16_384
     reward_rate: float = 0.9
     encoder: EncoderName = "paper"
     filters: tuple[int, int] = (32, 64)
@@ -110,24 +128,35 @@ class Config:
             for value in values if isinstance(values, tuple) else (values,):
                 if not low <= value <= high:
                     raise ValueError(f"{name} must lie in [{low}, {high}], got {value}")
-        for name, choices in (("curiosity", Curiosity), ("encoder", EncoderName)):
+        for name, choices in _CHOICES.items():
             if getattr(self, name) not in get_args(choices):
                 allowed = ", ".join(get_args(choices))
                 raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}")
-        if len(self.walks) != len(self.walk_sets):
-            raise ValueError(
-                f"walks must be one number for each of walk_sets={self.walk_sets}, got {self.walks}"
-            )
-        if bool(self.restarts) != bool(self.walks):
-            raise ValueError(
-                f"restarts={self.restarts} and walks={self.walks} go together: restarts begin "
-                "in what walks find"
-            )
+        if self.method == "dagger":
+            self._check_dagger()
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
             raise ValueError(
                 f"minibatch must divide episodes={self.episodes}, got {self.minibatch}; "
                 f"allowed: {', '.join(map(str, divisors))}"
+            )
+
+    def _check_dagger(self) -> None:
+        if self.curiosity != "none":
+            raise ValueError(
+                f"curiosity must be none with method='dagger', which knows no reward, got "
+                f"{self.curiosity!r}"
+            )
+        if self.episodes % self.tasks:
+            raise ValueError(f"tasks must divide episodes={self.episodes}, got {self.tasks}")
+        if self.tasks % max(len(self.task_sets), 1):
+            raise ValueError(
+                f"tasks must be a multiple of the number of task_sets={self.task_sets}, got "
+                f"{self.tasks}"
+            )
+        if self.dataset % self.episodes:
+            raise ValueError(
+                f"dataset must be a multiple of episodes={self.episodes}, got {self.dataset}"
             )
 
     @classmethod
@@ -169,6 +198,7 @@ class Config:
         return self.episodes * self.max_steps
 
 
+_CHOICES = {"curiosity": Curiosity, "encoder": EncoderName, "method": Method}
 _INFINITY = float("inf")
 _RANGES: dict[str, tuple[float, float]] = {
     "num_features": (1, 256),
@@ -192,10 +222,15 @@ _RANGES: dict[str, tuple[float, float]] = {
     "imitation_coef": (0, _INFINITY),
     "imitation_episodes": (1, _INFINITY),
     "reward_rate": (0, 1),
-    "restarts": (0, 1),
-    "restart_memory": (1, _INFINITY),
-    "walks": (1, _INFINITY),
+    "tasks": (1, _INFINITY),
+    "walkers": (1, _INFINITY),
+    "walk_rounds": (1, 1000),
     "walk_steps": (1, 10_000),
+    "agent_rounds": (0, 1000),
+    "restarts": (0, 1),
+    "advised": (0, 1),
+    "advice": (0, 1),
+    "dataset": (1, _INFINITY),
     "filters": (1, 4096),
     "hidden": (1, 65_536),
     "embedding": (1, 65_536),
@@ -220,23 +255,24 @@ PRESETS: dict[str, dict[str, Any]] = {
         "intrinsic_scale": 0.3,
         "imitation_coef": 1.0,
     },
-    # Learns all task sets from {P, St, Sy}: random walks find what to rehearse, and the
-    # encoder is told which cells look alike.
+    # Learns all task sets from {P, St, Sy} and the fifth of it that is hard: random walks
+    # find out what is right, and the encoder sees objects instead of colours.
     "best": {
         "env_id": "pstsy",
+        "method": "dagger",
         "iterations": 2000,
         "curiosity": "none",
-        "discount": 0.98,
-        "value_coef": 0.02,
-        "entropy_coef": 3e-3,
-        "cooldown": 0.25,
-        "epochs": 3,
-        "encoder": "relational",
-        "filters": (32, 48),
+        "learning_rate": 3e-3,
+        "cooldown": 0.3,
+        "epochs": 4,
+        "minibatch": 64,
+        "task_sets": ("pst", "pstsy"),
+        "tasks": 32,
+        "walkers": 1024,
+        "dataset": 32_768,
+        "encoder": "objects",
+        "filters": (64, 64),
         "hidden": 128,
-        "restarts": 0.6,
-        "walk_sets": ("pst", "pstsy"),
-        "walks": (8192, 1024),
     },
 }
 
@@ -248,7 +284,7 @@ def _check_type(field: dataclasses.Field, value: Any) -> None:
     elif isinstance(default, float):
         matches = isinstance(value, int | float)
     elif isinstance(default, tuple):
-        kind = str if field.name == "walk_sets" else int
+        kind = str if field.name == "task_sets" else int
         matches = (
             isinstance(value, tuple)
             and len(value) == (len(default) or len(value))
@@ -257,6 +293,6 @@ def _check_type(field: dataclasses.Field, value: Any) -> None:
     else:
         matches = isinstance(value, type(default))
     if not matches:
-        names = {"filters": "2 integers", "walks": "integers", "walk_sets": "names of task sets"}
+        names = {"filters": "2 integers", "task_sets": "names of task sets"}
         wanted = names.get(field.name, type(default).__name__)
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")

@@ -28,6 +28,9 @@ from trap_tube_jax.state import State
 
 RowFn = Callable[[Any, Any], jax.Array]
 
+NUM_CELLS = BOARD_SIZE * BOARD_SIZE
+NUM_POSITIONS = NUM_CELLS**3  # of agent, tool and food together
+
 
 class Groups(NamedTuple):
     """Elements gathered by equality.
@@ -87,9 +90,15 @@ def layout_hash(state: State) -> jax.Array:
 def position_id(state: State) -> jax.Array:
     """An id i32[] of where agent, tool and food are; with the layout it fixes the observation."""
     cells = [state.agent, state.tool, state.food]
-    size = BOARD_SIZE * BOARD_SIZE
     agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
-    return (agent * size + tool) * size + food
+    return (agent * NUM_CELLS + tool) * NUM_CELLS + food
+
+
+def cells_at(position: jax.Array) -> jax.Array:
+    """u8[3, 2]: the cells of agent, tool and food with this id; inverse of `position_id`."""
+    agent_and_tool, food = jnp.divmod(position, NUM_CELLS)
+    cell = jnp.stack([*jnp.divmod(agent_and_tool, NUM_CELLS), food])
+    return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)
 
 
 def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> jax.Array:

@@ -36,6 +36,7 @@ from agents.protocol import (
 from agents.results import AlgorithmRun
 from agents.run_folder import Run, RunFolder, read_json, write_json
 from agents.session import Session, Stopped, StopSignals
+from agents.sharding import Placement
 from agents.tracking import Tracker
 from trap_tube_jax.state import State
 
@@ -74,6 +75,8 @@ class Options:
       quick: the reduced protocol: the fast preset, ppo and preset, 1 seed, 16 tasks per set,
         evaluated every 5 iterations; exp1 20 iterations or until solved, exp2 15 iterations.
       side_by_side: train all missing seeds of an algorithm at once, for a GPU.
+      devices: how many devices share a run's episodes and seeds, or `all` there are; one if
+        absent.
       name: the folder within --out; <experiment>-<preset> if absent, with -quick.
       out: the folder of all runs.
       report_only: train nothing; draw tables and figures from what there is.
@@ -97,6 +100,7 @@ class Options:
     settings: tuple[str, ...] | None = None
     quick: Flag = False
     side_by_side: Flag = False
+    devices: int | Literal["all"] | None = None
     name: str | None = None
     out: Path = Path("runs")
     report_only: Flag = False
@@ -195,6 +199,7 @@ def train_all(
             checkpoint_every=options.checkpoint_every,
             keep=2,
             tracker=tracker,
+            placement=Placement.of(options.devices, run.config, run.seeds),
         )
         write_json(folder.config, run.to_dict())  # more iterations, once it has been taken up
         try:

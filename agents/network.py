@@ -15,8 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_DIRECTIONS
-from trap_tube_jax.state import base_state
+from trap_tube_jax.objects import BOARD_SIZE, NUM_DIRECTIONS
 
 
 def variance_scaling(scale: float) -> nn.initializers.Initializer:
@@ -89,26 +88,6 @@ class Encoder(nn.Module):
         x = ResidualBlock(name="block1")(max_pool(x))
         x = ResidualBlock(name="block2")(max_pool(x))
         return jnp.max(x, axis=(1, 2))
-
-
-class RelationalEncoder(nn.Module):
-    """Observation to features: relations of cells, convolutions at 6x6 and 3x3, all places kept.
-
-    Attributes:
-      filters: channels at 6x6, and at 3x3.
-    """
-
-    filters: tuple[int, int]
-
-    @nn.compact
-    def __call__(self, observation: jax.Array) -> jax.Array:
-        """Encodes u8[M, 12, 12, N] to f32[M, 9 * filters[1]]."""
-        x = jnp.concatenate([scaled_with_coordinates(observation), relations(observation)], -1)
-        x = Conv(self.filters[0], 2, name="conv1")(space_to_depth(x))
-        x = max_pool(x + Conv(self.filters[0], 3, name="conv2")(nn.swish(x)))
-        x = Conv(self.filters[1], 2, name="conv3")(nn.swish(x))
-        x = x + Conv(self.filters[1], 3, name="conv4")(nn.swish(x))
-        return nn.swish(x.reshape(len(x), -1))
 
 
 class ResidualBlock(nn.Module):
@@ -251,41 +230,6 @@ def scaled_with_coordinates(observation: jax.Array) -> jax.Array:
     return jnp.concatenate([features, jnp.broadcast_to(coordinates, shape)], axis=-1)
 
 
-def relations(observation: jax.Array) -> jax.Array:
-    """How cells relate, whatever their colours: u8[M, 12, 12, N] to f32[M, 12, 12, 7].
-
-    The channels, in [-1, 1]: the logarithm of how many cells share the cell's colour; whether
-    the neighbour to the right does, and the one below; row and column relative to the agent,
-    and to the food, which are found by their colours since no transfer changes those; zeros
-    where there is none to be seen. Colours are told apart by a hash.
-    """
-    num_features = observation.shape[-1]
-    weights = np.random.default_rng(0).integers(1, 2**32, num_features, np.uint32)
-    color = _hash_colors(observation, weights)
-    flat = color.reshape(len(color), -1)
-    count = jnp.sum(flat[:, :, None] == flat[:, None, :], axis=-1, dtype=jnp.int32)
-    share = jnp.log(count.reshape(color.shape).astype(jnp.float32)) / np.log(BOARD_SIZE**2)
-    right = jnp.pad(color[:, :, 1:] == color[:, :, :-1], ((0, 0), (0, 0), (0, 1)))
-    below = jnp.pad(color[:, 1:] == color[:, :-1], ((0, 0), (0, 1), (0, 0)))
-    channels = [2 * share - 1, 2.0 * right - 1, 2.0 * below - 1]
-    own_colors = _hash_colors(base_state(num_features).palette, weights)
-    places = np.indices((1, BOARD_SIZE, BOARD_SIZE), np.float32)[1:] / (BOARD_SIZE - 1)
-    for thing in (AGENT, FOOD):
-        is_there = (color == own_colors[thing]).astype(jnp.float32)
-        total = jnp.sum(is_there, axis=(1, 2), keepdims=True)
-        for place in places:
-            mean = jnp.sum(is_there * place, axis=(1, 2), keepdims=True) / jnp.maximum(total, 1)
-            channels.append((place - mean) * (total > 0))
-    return jnp.stack(channels, axis=-1)
-
-
-def space_to_depth(x: jax.Array) -> jax.Array:
-    """Stacks 2x2 blocks of cells: f32[M, H, W, C] to f32[M, H / 2, W / 2, 4 * C]."""
-    count, height, width, channels = x.shape
-    blocks = x.reshape(count, height // 2, 2, width // 2, 2, channels).swapaxes(2, 3)
-    return blocks.reshape(count, height // 2, width // 2, 4 * channels)
-
-
 def patches(x: jax.Array, size: int) -> jax.Array:
     """The neighbourhood of every cell: f32[M, H, W, C] to f32[M, H, W, size * size * C].
 
@@ -303,12 +247,6 @@ def max_pool(x: jax.Array) -> jax.Array:
     """The maximum over 2x2 blocks: f32[M, H, W, C] to f32[M, H / 2, W / 2, C]."""
     count, height, width, channels = x.shape
     return jnp.max(x.reshape(count, height // 2, 2, width // 2, 2, channels), axis=(2, 4))
-
-
-def _hash_colors(colors: jax.Array, weights: np.ndarray) -> jax.Array:
-    """u8[..., N] to u32[...], different for different colours but for rare collisions."""
-    weights = weights.reshape((1,) * (colors.ndim - 1) + (-1,))
-    return jnp.sum(colors.astype(jnp.uint32) * weights, axis=-1, dtype=jnp.uint32)
 
 
 def _as_row(vector: jax.Array, ndim: int) -> jax.Array:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from agents.config import Config
+
 
 class AdamState(NamedTuple):
     """Adam's moments.
@@ -56,3 +58,19 @@ def adam(
         return step, AdamState(count, first, second)
 
     return optax.GradientTransformation(init, update)
+
+
+def make_optimizer(config: Config) -> optax.GradientTransformation:
+    """Adam behind a clip of the gradients' global norm."""
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_gradient_norm),
+        adam(config.learning_rate, epsilon=config.adam_epsilon),
+    )
+
+
+def cooldown(config: Config, iteration: jax.Array) -> jax.Array:
+    """f32[]: the factor of the step size, 1 until the last iterations and 0 after them."""
+    if not config.cooldown:
+        return jnp.ones(())
+    left = (config.iterations - iteration) / (config.cooldown * config.iterations)
+    return jnp.clip(left, 0.0, 1.0)

@@ -3,7 +3,6 @@
 Source: agent specification "PPO" and "ICM"; paper section "Results".
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,20 +10,23 @@ import jax.numpy as jnp
 import optax
 
 import trap_tube_jax as tt
-from agents import distinct, losses, returns
+from agents import losses, returns
 from agents.agent import Agent, Params
 from agents.config import Config
 from agents.curiosity import Prediction, forward_loss, intrinsic_reward, visit_bonus
-from agents.optimizer import adam
+from agents.method import Metrics, Train, environment
+from agents.observations import (
+    VISIT_SLOTS,
+    encode_episodes,
+    first_visits,
+    observation_ids,
+    visit_slots,
+)
+from agents.optimizer import cooldown, make_optimizer
 from agents.replay import Replay
-from agents.rollout import Trajectory, action_log_prob, place, rollout, sample_action
+from agents.rollout import Trajectory, action_log_prob, rollout, sample_action
 from agents.sharding import ALONE, Shards
-from agents.starts import FRESH, Successes, explore, walk_environments
 from trap_tube_jax.environment import Environment
-
-Metrics = dict[str, jax.Array]
-
-VISIT_SLOTS = 2**20
 
 # Over [T, B] arrays.
 discounted_returns = jax.vmap(returns.discounted_returns, in_axes=(1, None), out_axes=1)
@@ -44,12 +46,10 @@ class TrainState(NamedTuple):
       visits: f32[S], how often observations were seen, by slot of a hash table; one unused
         slot without the curiosity `counts`.
       replay: the newest solved episodes; never filled without imitation.
-      successes: where restarts begin; never filled without them.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
-      transitions: i32[], environment steps taken with the network.
-      steps_walked: f32[], environment steps of random walks.
+      transitions: i32[], environment steps taken.
     """
 
     params: Params
@@ -58,12 +58,10 @@ class TrainState(NamedTuple):
     intrinsic: returns.Moments
     visits: jax.Array
     replay: Replay
-    successes: Successes
     key: jax.Array
     iteration: jax.Array
     episodes: jax.Array
     transitions: jax.Array
-    steps_walked: jax.Array
 
 
 class Batch(NamedTuple):
@@ -98,26 +96,6 @@ class Batch(NamedTuple):
         return taken._replace(layout=jax.tree.map(lambda x: x[episodes], self.layout))
 
 
-class Train(NamedTuple):
-    """Training as two pure functions; jit them, and vmap them over seeds.
-
-    Attributes:
-      init: PRNG key to the first `TrainState`.
-      iterate: a `TrainState` to the next one and its metrics, f32[] each.
-      agent: the network's functions.
-      env: the environment.
-      config: the settings.
-      shards: how `iterate` divides its episodes over devices.
-    """
-
-    init: Callable[[jax.Array], TrainState]
-    iterate: Callable[[TrainState], tuple[TrainState, Metrics]]
-    agent: Agent
-    env: Environment
-    config: Config
-    shards: Shards
-
-
 def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Train:
     """Builds training from its settings.
 
@@ -129,10 +107,9 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
     Raises:
       ValueError: `env` contradicts `config`.
     """
-    env = _environment(config, env)
+    env = environment(config, env)
     agent = Agent(config)
     optimizer = make_optimizer(config)
-    walk_envs = walk_environments(config)
 
     def init(key: jax.Array) -> TrainState:
         params_key, key = jax.random.split(key)
@@ -145,27 +122,16 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             intrinsic=returns.Moments.zero(),
             visits=jnp.zeros(VISIT_SLOTS if config.curiosity == "counts" else 1),
             replay=Replay.empty(env.base, config.imitation_episodes, config.max_steps),
-            successes=Successes.empty(config, env.base),
             key=key,
             iteration=zero,
             episodes=zero,
             transitions=zero,
-            steps_walked=jnp.zeros(()),
         )
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
         reset_keys = shards.part(jax.random.split(reset_key, config.episodes))
         initial, _ = jax.vmap(env.reset)(reset_keys)
-        origin = jnp.full(config.episodes, FRESH)
-        if config.restarts:
-            walk_key, choice_key = jax.random.split(jax.random.fold_in(reset_key, 0))
-            successes, steps_walked = explore(walk_key, walk_envs, state.successes)
-            state = state._replace(
-                successes=successes, steps_walked=state.steps_walked + steps_walked
-            )
-            origin = successes.choose(choice_key, config)
-            initial = successes.place(shards.part(origin), initial, config.max_steps)
         trajectory = rollout(
             agent,
             state.params,
@@ -176,10 +142,6 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             chunk=config.chunk,
         )
         batch, state, play_metrics = prepare(agent, config, state, trajectory, shards)
-        if config.restarts:
-            solved = jnp.any(batch.reward > 0, axis=0)
-            play_metrics |= start_metrics(state.successes, origin, solved)
-            state = state._replace(successes=state.successes.rehearsed(origin, solved))
         params, opt_state, loss_metrics = optimize(
             agent, config, optimizer, state, batch, update_key, shards
         )
@@ -193,14 +155,6 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
         return state, {**play_metrics, **loss_metrics}
 
     return Train(init, iterate, agent, env, config, shards)
-
-
-def make_optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam behind a clip of the gradients' global norm."""
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_gradient_norm),
-        adam(config.learning_rate, epsilon=config.adam_epsilon),
-    )
 
 
 def prepare(
@@ -313,24 +267,6 @@ def optimize(
     return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
 
-def cooldown(config: Config, iteration: jax.Array) -> jax.Array:
-    """f32[]: the factor of the step size, 1 until the last iterations and 0 after them."""
-    if not config.cooldown:
-        return jnp.ones(())
-    left = (config.iterations - iteration) / (config.cooldown * config.iterations)
-    return jnp.clip(left, 0.0, 1.0)
-
-
-def start_metrics(successes: Successes, origin: jax.Array, solved: jax.Array) -> Metrics:
-    """How the agent does at fresh tasks, and how far it has come in rehearsing successes."""
-    is_fresh = origin == FRESH
-    return {
-        "fresh_success": jnp.sum(solved & is_fresh) / jnp.maximum(jnp.sum(is_fresh), 1),
-        "rehearsed": successes.number,
-        "reach": successes.mean_reach,
-    }
-
-
 def loss(
     params: Params,
     agent: Agent,
@@ -408,68 +344,6 @@ def imitation_loss(
     return -config.imitation_coef * jnp.sum(weight * log_prob) / steps
 
 
-def encode_episodes(
-    params: Params,
-    agent: Agent,
-    config: Config,
-    observation_id: jax.Array,
-    layout: tt.State,
-    cells: jax.Array,
-) -> jax.Array:
-    """The features f32[T + 1, B, F] of episodes, each distinct observation encoded once.
-
-    Args:
-      params: the parameters.
-      agent: the network.
-      config: the settings.
-      observation_id: i32[T + 1, B], equal only for equal observations.
-      layout: B states.
-      cells: u8[T + 1, B, 3, 2]; with the layouts, the observations.
-    """
-    shape = observation_id.shape
-    groups = distinct.group(observation_id.reshape(-1))
-    time, episode = groups.representative // shape[1], groups.representative % shape[1]
-    rows = jax.vmap(lambda layout, cells: tt.observe(place(layout, cells)))(
-        jax.tree.map(lambda x: x[episode], layout), cells[time, episode]
-    )
-    features = distinct.map_rows(
-        agent.encode, config.chunk, agent.encoding_params(params), rows, groups.total
-    )
-    return features[groups.number].reshape(*shape, -1)
-
-
-def observation_ids(layout: tt.State, cells: jax.Array) -> jax.Array:
-    """i32[T + 1, B]: equal only for equal observations, numbered from 0."""
-    position = _position_ids(layout, cells)
-    layout_id = jnp.broadcast_to(distinct.layout_ids(layout), position.shape)
-    groups = distinct.group(layout_id.reshape(-1), position.reshape(-1))
-    return groups.number.reshape(position.shape)
-
-
-def visit_slots(trajectory: Trajectory) -> jax.Array:
-    """i32[T + 1, B]: the slot of every observation in a table of `VISIT_SLOTS`."""
-    position = _position_ids(trajectory.layout, trajectory.cells)
-    code = distinct.layout_hash(trajectory.layout)[None] + position.astype(jnp.uint32)
-    # The finaliser of MurmurHash3: every bit of the code moves every bit of the slot.
-    code = (code ^ (code >> 16)) * jnp.uint32(0x85EBCA6B)
-    code = (code ^ (code >> 13)) * jnp.uint32(0xC2B2AE35)
-    return ((code ^ (code >> 16)) % VISIT_SLOTS).astype(jnp.int32)
-
-
-def first_visits(observation_id: jax.Array) -> jax.Array:
-    """f32[T + 1, B]: 1 where an observation is new in its episode, 0 where it returns."""
-    time = jnp.arange(len(observation_id))
-    same = observation_id[:, None] == observation_id[None]
-    earlier = (time[:, None] > time[None])[..., None]
-    return 1.0 - jnp.any(same & earlier, axis=1)
-
-
-def _position_ids(layout: tt.State, cells: jax.Array) -> jax.Array:
-    """i32[T + 1, B]: the ids of where agent, tool and food are."""
-    states = jax.vmap(jax.vmap(place), in_axes=(None, 0))(layout, cells)
-    return jax.vmap(jax.vmap(distinct.position_id))(states)
-
-
 def _curiosity_reward(agent: Agent, params: Params, trajectory: Trajectory) -> jax.Array:
     """The raw intrinsic reward f32[T, B]."""
     _, next_embedding = agent.unroll_both(
@@ -479,15 +353,3 @@ def _curiosity_reward(agent: Agent, params: Params, trajectory: Trajectory) -> j
         params, trajectory.embedding, next_embedding, trajectory.features, trajectory.action
     )
     return intrinsic_reward(prediction)
-
-
-def _environment(config: Config, env: Environment | None) -> Environment:
-    if env is None:
-        return tt.make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
-    for name in ("num_features", "max_steps"):
-        if getattr(env, name) != getattr(config, name):
-            raise ValueError(
-                f"the environment's {name} is {getattr(env, name)}, the config's "
-                f"{getattr(config, name)}; they must agree"
-            )
-    return env

@@ -214,8 +214,7 @@ PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("curiosity losses", ("forward_loss", "inverse_loss"), "weighted loss"),
     ("entropy", ("entropy",), "nats, grasp + move"),
     ("gradient norm", ("gradient_norm",), "before clipping"),
-    ("fresh tasks", ("fresh_success",), "share solved in training"),
-    ("reach of restarts", ("reach",), "steps before a success"),
+    ("advice", ("right", "labelled"), "share of steps"),
 )
 
 

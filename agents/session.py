@@ -26,11 +26,12 @@ from agents.evaluate import (
     save_solved_episode,
     scores,
 )
+from agents.method import Train
 from agents.metrics import FirstSolved, MetricsLog, Row
-from agents.ppo import Train, TrainState, make_train
 from agents.run_folder import Run, RunFolder, write_json
 from agents.sharding import DEFAULT_DEVICE, Placement
 from agents.tracking import Tracker
+from agents.training import TrainState, make_train
 
 POLL_SECONDS = 0.005
 
