@@ -43,6 +43,21 @@ IMPOSSIBLE = -1e9  # a log-probability
 ACTIONS = np.arange(NUM_ACTIONS)
 
 
+class Lesson(NamedTuple):
+    """B episodes of T steps and what would have been right in them.
+
+    Attributes:
+      trajectory: the episodes.
+      right: u16[T, B], a bit for each of the 16 actions that are right; 0 after the
+        episode's end and where nothing is known.
+      known: u16[T, B], a bit for each action of which it is known whether it is right.
+    """
+
+    trajectory: Trajectory
+    right: jax.Array
+    known: jax.Array
+
+
 class Dataset(NamedTuple):
     """The newest K episodes of T steps, with advice; the oldest is the next to be replaced.
 
@@ -50,9 +65,8 @@ class Dataset(NamedTuple):
       layout: K states, of which board, palette and tool extent hold for the episode.
       cells: u8[T + 1, K, 3, 2], the (row, column) of agent, tool and food.
       action: u8[T, K, 2].
-      right: u16[T, K], a bit for each of the 16 actions that are right; 0 after the
-        episode's end and where nothing is known.
-      known: u16[T, K], a bit for each action of which it is known whether it is right.
+      right: u16[T, K]; see `Lesson`.
+      known: u16[T, K]; see `Lesson`.
       added: i32[], episodes ever added.
     """
 
@@ -81,24 +95,35 @@ class Dataset(NamedTuple):
         """i32[]: the episodes that there are."""
         return jnp.minimum(self.added, self.right.shape[1])
 
-    def add(self, trajectory: Trajectory, right: jax.Array, known: jax.Array) -> "Dataset":
+    def add(self, lesson: Lesson) -> "Dataset":
         """Replaces the oldest B episodes, of which K is a multiple."""
-        batch = right.shape[1]
+        trajectory = lesson.trajectory
+        batch = lesson.right.shape[1]
         spot = self.added % self.right.shape[1]
 
         def put(old: jax.Array, new: jax.Array, axis: int) -> jax.Array:
             return jax.lax.dynamic_update_slice_in_dim(old, new.astype(old.dtype), spot, axis)
 
         layout = jax.tree.map(lambda old, new: put(old, new, 0), self.layout, trajectory.layout)
-        old = (self.cells, self.action, self.right, self.known)
-        new = (trajectory.cells, trajectory.action, right, known)
-        parts = [put(old, new, 1) for old, new in zip(old, new, strict=True)]
-        return Dataset(layout, *parts, self.added + batch)
+        return Dataset(
+            layout=layout,
+            cells=put(self.cells, trajectory.cells, 1),
+            action=put(self.action, trajectory.action, 1),
+            right=put(self.right, lesson.right, 1),
+            known=put(self.known, lesson.known, 1),
+            added=self.added + batch,
+        )
 
     def take(self, episodes: jax.Array) -> "Dataset":
         """The episodes at these places, i32[M]."""
-        rest = (x[:, episodes] for x in self[1:-1])
-        return Dataset(jax.tree.map(lambda x: x[episodes], self.layout), *rest, self.added)
+        return Dataset(
+            layout=jax.tree.map(lambda x: x[episodes], self.layout),
+            cells=self.cells[:, episodes],
+            action=self.action[:, episodes],
+            right=self.right[:, episodes],
+            known=self.known[:, episodes],
+            added=self.added,
+        )
 
 
 class TrainState(NamedTuple):
@@ -162,8 +187,8 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
         task_key, play_key, update_key, key = jax.random.split(state.key, 4)
         tasks, walks = chart(env, sources, task_key, config, shards)
-        *played, metrics = play(agent, config, env, state.params, tasks, walks, play_key, shards)
-        state = state._replace(dataset=state.dataset.add(*played))
+        lesson, metrics = play(agent, config, env, state.params, tasks, walks, play_key, shards)
+        state = state._replace(dataset=state.dataset.add(lesson))
         params, opt_state, loss_metrics = optimize(
             agent, config, optimizer, state, update_key, shards
         )
@@ -174,7 +199,7 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + config.episodes,
-            transitions=state.transitions + jnp.sum(played[0].length),
+            transitions=state.transitions + jnp.sum(lesson.trajectory.length),
             steps_walked=state.steps_walked + walked,
         )
         return state, {**metrics, **loss_metrics}
@@ -203,7 +228,7 @@ def chart(
     # Neighbours come from different sources, so that every device gets some of each.
     tasks = jax.tree.map(lambda *x: jnp.stack(x, axis=1).reshape(-1, *x[0].shape[1:]), *drawn)
     tasks, keys = shards.part(tasks), shards.part(keys[1])
-    return tasks, jax.lax.map(lambda task: explore(env, *task, config), (tasks, keys))
+    return tasks, jax.lax.map(lambda each: explore(env, each[0], each[1], config), (tasks, keys))
 
 
 def play(
@@ -215,7 +240,7 @@ def play(
     walks: jax.Array,
     key: jax.Array,
     shards: Shards = ALONE,
-) -> tuple[Trajectory, jax.Array, jax.Array, Metrics]:
+) -> tuple[Lesson, Metrics]:
     """Plays every task many times, from its start and elsewhere, with and without advice.
 
     The walks go on from where the agent has come to before they say what would have been right.
@@ -231,8 +256,7 @@ def play(
       shards: how the tasks are divided over devices.
 
     Returns:
-      The episodes of all devices, neighbours being of the same task, what was right in them
-      and of which actions that is known, u16[T, B] each, and metrics of play.
+      The episodes of all devices, neighbours being of the same task, and metrics of play.
     """
     start_key, play_key, walk_key = jax.random.split(key, 3)
     number = config.episodes // config.tasks
@@ -268,10 +292,8 @@ def play(
         return jnp.where(followed[:, None], advice, action)
 
     start_keys = shards.part(jax.random.split(start_key, config.tasks))
-    before, initial = jax.lax.map(
-        lambda each: ((atlas := Atlas.of(*each[:2])), starts(atlas, each[2])),
-        (tasks, walks, start_keys),
-    )
+    before = jax.lax.map(lambda each: Atlas.of(*each), (tasks, walks))
+    initial = jax.lax.map(lambda each: starts(*each), (before, start_keys))
     initial = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), initial)
     trajectory = rollout(
         agent,
@@ -284,9 +306,10 @@ def play(
         replace=replace,
     )
     walk_keys = shards.part(jax.random.split(walk_key, config.tasks))
+    positions, length = _visited(trajectory, len(walks))
     after = jax.lax.map(
-        lambda each: go_on(env, *each, config),
-        (tasks, walks, *_visited(trajectory, len(walks)), walk_keys),
+        lambda each: go_on(env, *each, config=config),
+        (tasks, walks, positions, length, walk_keys),
     )
     right, known = jax.lax.map(
         lambda cells: judge(after, jax.vmap(place)(trajectory.layout, cells)),
@@ -308,7 +331,7 @@ def play(
         "charted": jnp.mean(charted.astype(jnp.float32)),
         "labelled": jnp.sum(right != 0) / steps,
     }
-    return trajectory, right, known, metrics
+    return Lesson(trajectory, right, known), metrics
 
 
 def go_on(

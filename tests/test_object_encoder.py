@@ -1,0 +1,114 @@
+"""What the object encoder is told of a board."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents.agent import Agent
+from agents.config import Config
+from agents.object_encoder import MAX_OBJECTS, describe_board
+from trap_tube_jax.objects import AGENT, FOOD
+
+PALETTE = np.asarray(tt.base_state().palette)
+
+
+@pytest.fixture(scope="module")
+def tasks() -> tt.State:
+    env = tt.make("psy")
+    return jax.vmap(env.reset)(jax.random.split(jax.random.key(3), 32))[0]
+
+
+def described(board: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """The features of every object and the places of agent and food, found cell by cell."""
+    colors = [tuple(color) for color in board.reshape(-1, board.shape[-1])]
+    anchors = [tuple(PALETTE[thing]) for thing in (AGENT, FOOD)]
+    others = [color for color in dict.fromkeys(colors) if color not in anchors]
+    cells = {color: np.argwhere((board == color).all(axis=-1)) for color in set(colors)}
+    rows = []
+    for color in others:
+        features = []
+        for axis in (0, 1):
+            features += [place in cells[color][:, axis] for place in range(12)]
+        for anchor in anchors:
+            for axis in (0, 1):
+                there = cells[anchor][0, axis] if anchor in cells else -1000
+                features += [place + there in cells[color][:, axis] for place in range(-11, 12)]
+        size = len(cells[color])
+        features += [size == number for number in range(5)] + [size / 20, np.log1p(size) / 3]
+        rows.append(np.array(features, np.float32))
+    nowhere = np.array([[-1000, -1000]])
+    agent, food = (cells.get(anchor, nowhere)[0] for anchor in anchors)
+    places = [thing[axis] == n for thing in (agent, food) for axis in (0, 1) for n in range(12)]
+    seen = min(agent[0], food[0]) >= 0
+    places += [seen and food[axis] - agent[axis] == n for axis in (0, 1) for n in range(-11, 12)]
+    return rows, np.array(places, np.float32)
+
+
+def test_objects_are_where_they_are(tasks):
+    boards = np.asarray(jax.vmap(tt.observe)(tasks))
+    features, exists, places = map(np.asarray, describe_board(jnp.asarray(boards)))
+    for board, found, is_there, place in zip(boards, features, exists, places, strict=True):
+        expected, expected_place = described(board)
+        assert is_there.sum() == len(expected)
+        assert is_there[: len(expected)].all()
+        np.testing.assert_allclose(found[: len(expected)], expected, rtol=1e-6)
+        np.testing.assert_array_equal(place, expected_place)
+
+
+def test_colours_are_not_told(tasks):
+    """A structural transfer may only change which tubes look alike, and base tubes do."""
+    keys = jax.random.split(jax.random.key(4), 32)
+    plain = jax.vmap(tt.perceptual)(
+        keys, jax.tree.map(lambda x: jnp.stack([x] * 32), tt.base_state())
+    )
+    recolored = jax.vmap(tt.structural)(keys, plain)
+    before, after = (describe_board(jax.vmap(tt.observe)(states)) for states in (plain, recolored))
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_cannot_be_seen_is_nowhere():
+    board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
+    features, exists, places = describe_board(board)
+    assert exists[0].tolist() == [True] + [False] * (MAX_OBJECTS - 1)
+    assert (features[0, 0, :24] == 1).all()
+    assert (features[0, 0, 24:116] == 0).all()
+    assert (features[0, 1:, :116] == 0).all()
+    assert (places == 0).all()
+
+
+def test_objects_beyond_the_sixth_are_left_out():
+    board = np.arange(144, dtype=np.uint8).reshape(1, 12, 12, 1)
+    features, exists, _ = describe_board(jnp.asarray(board))
+    assert exists.all()
+    assert np.argmax(np.asarray(features[0, :, 12:24]), axis=1).tolist() == list(range(6))
+
+
+@pytest.mark.parametrize("num_features", [1, 5])
+def test_any_number_of_features_will_do(num_features):
+    config = Config(
+        num_features=num_features, encoder="objects", filters=(4, 6), hidden=4, curiosity="none"
+    )
+    agent = Agent(config)
+    params = agent.init(jax.random.key(0))
+    board = tt.observe(tt.base_state(num_features))[None]
+    features = agent.encode(params, board)
+    assert features.shape == (1, 12)
+    _, exists, _ = describe_board(board)
+    assert exists.sum() == 5  # ground, trap, exit, tubes, tool
+    moved = tt.observe(tt.base_state(num_features).replace(agent=jnp.array([0, 0])))[None]
+    assert (agent.encode(params, moved) != features).any()
+
+
+def test_objects_that_are_not_there_do_not_count():
+    """The features of a board do not depend on what the empty places are filled with."""
+    config = Config(encoder="objects", filters=(4, 6), hidden=4, curiosity="none")
+    agent = Agent(config)
+    params = agent.init(jax.random.key(0))
+    boards = jnp.zeros((2, 12, 12, 3), jnp.uint8).at[1, 0, 0].set(200)
+    one, two = agent.encode(params, boards)
+    assert np.isfinite(one).all()
+    assert np.abs(one).max() < 100
+    assert (one != two).any()
