@@ -62,6 +62,7 @@ class Config:
       advice: share of the actions that are, at most; among the advised episodes it rises from
         0 to this.
       dataset: the newest episodes that `dagger` learns from; a multiple of `episodes`.
+      mirrored: whether `dagger` learns from episodes under the eight symmetries of the board.
       reward_rate: weight of the past in the moving moments that normalise both rewards.
       encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
         seen from agent and food is all that is encoded.
@@ -107,6 +108,7 @@ class Config:
     advised: float = 0.75
     advice: float = 0.9
     dataset: int = 16_384
+    mirrored: bool = True
     reward_rate: float = 0.9
     encoder: EncoderName = "paper"
     filters: tuple[int, int] = (32, 64)
@@ -197,6 +199,14 @@ class Config:
         """The largest number of environment steps of one iteration."""
         return self.episodes * self.max_steps
 
+    @property
+    def steps_walked(self) -> int:
+        """The environment steps of one iteration's random walks."""
+        if self.method != "dagger":
+            return 0
+        rounds = self.walk_rounds + self.agent_rounds
+        return self.tasks * self.walkers * rounds * self.walk_steps
+
 
 _CHOICES = {"curiosity": Curiosity, "encoder": EncoderName, "method": Method}
 _INFINITY = float("inf")
@@ -264,7 +274,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "curiosity": "none",
         "learning_rate": 3e-3,
         "cooldown": 0.3,
-        "epochs": 4,
+        "epochs": 6,
         "minibatch": 64,
         "task_sets": ("pst", "pstsy"),
         "tasks": 32,

@@ -34,7 +34,8 @@ from agents.observations import encode_episodes, observation_ids
 from agents.optimizer import cooldown, make_optimizer
 from agents.rollout import Trajectory, place, rollout, sample_action
 from agents.sharding import ALONE, Shards
-from trap_tube_jax.environment import Environment, action_from_index
+from agents.symmetry import NUM_SYMMETRIES, Symmetry
+from trap_tube_jax.environment import Environment, action_from_index, action_to_index
 from trap_tube_jax.objects import NUM_ACTIONS
 from trap_tube_jax.registry import make
 from trap_tube_jax.state import State
@@ -122,6 +123,24 @@ class Dataset(NamedTuple):
             action=self.action[:, episodes],
             right=self.right[:, episodes],
             known=self.known[:, episodes],
+            added=self.added,
+        )
+
+    def mirrored(self, symmetry: Symmetry) -> "Dataset":
+        """The image of all episodes under a symmetry of the board."""
+        image = symmetry.directions()
+        number = action_to_index(image[action_from_index(jnp.asarray(ACTIONS))])
+
+        def permuted(bits: jax.Array) -> jax.Array:
+            flags = _from_bits(bits)
+            return _as_bits(jnp.zeros_like(flags).at[..., number].set(flags))
+
+        return Dataset(
+            layout=symmetry.layout(self.layout),
+            cells=symmetry.cells(self.cells, self.layout.tool_extent),
+            action=image[self.action].astype(self.action.dtype),
+            right=permuted(self.right),
+            known=permuted(self.known),
             added=self.added,
         )
 
@@ -384,16 +403,21 @@ def optimize(
     key: jax.Array,
     shards: Shards = ALONE,
 ) -> tuple[Params, Any, Metrics]:
-    """Gradient steps on minibatches of episodes drawn from the dataset."""
+    """Gradient steps on minibatches of episodes drawn from the dataset, or their images."""
     num_steps = config.epochs * config.episodes // config.minibatch
-    drawn = jax.random.randint(key, (num_steps, config.minibatch), 0, state.dataset.number)
+    episode_key, symmetry_key = jax.random.split(key)
+    drawn = jax.random.randint(episode_key, (num_steps, config.minibatch), 0, state.dataset.number)
+    symmetries = jax.random.randint(symmetry_key, (num_steps,), 0, NUM_SYMMETRIES)
 
     def update(
-        carry: tuple[Params, Any], episodes: jax.Array
+        carry: tuple[Params, Any], minibatch: tuple[jax.Array, jax.Array]
     ) -> tuple[tuple[Params, Any], Metrics]:
         params, opt_state = carry
+        episodes, symmetry = minibatch
         steps = jnp.maximum(jnp.sum(state.dataset.right[:, episodes] != 0), 1)
         own = state.dataset.take(shards.part(episodes))
+        if config.mirrored:
+            own = own.mirrored(Symmetry.of(symmetry))
         gradient, metrics = shards.mean(
             jax.grad(loss, has_aux=True)(params, agent, config, own, steps / shards.count)
         )
@@ -404,7 +428,9 @@ def optimize(
         return (params, opt_state), metrics
 
     rate = cooldown(config, state.iteration)
-    (params, opt_state), metrics = jax.lax.scan(update, (state.params, state.opt_state), drawn)
+    (params, opt_state), metrics = jax.lax.scan(
+        update, (state.params, state.opt_state), (drawn, symmetries)
+    )
     return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
 

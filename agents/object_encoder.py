@@ -23,6 +23,7 @@ from trap_tube_jax.state import base_state
 
 MAX_OBJECTS = NUM_OBJECTS - 2
 NAMED_SIZES = 4  # cells; sizes up to here have an input of their own
+NEAR = 2  # rows and columns about agent and food, of which every cell is told
 NOWHERE = -1e3  # below every activation
 
 
@@ -60,10 +61,11 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     any further ones are left out.
 
     Returns:
-      f32[M, 6, 123]: the rows and the columns in which an object has cells, 12 + 12 flags; the
-      same as seen from the agent, 23 + 23, and from the food, 23 + 23, all 0 where that is not
-      to be seen; whether the object has 0, 1, 2, 3, 4 cells; and its size, as it is and its
-      logarithm. bool[M, 6]: whether there is such an object. f32[M, 94]: row and column of
+      f32[M, 6, 173]: the rows and the columns in which an object has cells, 12 + 12 flags; the
+      same as seen from the agent, 23 + 23, and which of the 5x5 cells around it are the
+      object's, 25; the same three for the food; all 0 where agent or food is not to be seen;
+      whether the object has 0, 1, 2, 3, 4 cells; and its size, as it is and its logarithm.
+      bool[M, 6]: whether there is such an object. f32[M, 94]: row and column of
       the agent, 12 + 12, of the food, 12 + 12, and of the food as seen from the agent, 23 + 23.
     """
     count, _, _, num_features = observation.shape
@@ -91,7 +93,7 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     size = jnp.sum(mask, axis=(2, 3))
     parts = [rows, columns]
     for row, column in (agent, food):
-        parts += [_seen_from(rows, row), _seen_from(columns, column)]
+        parts += [_seen_from(rows, row), _seen_from(columns, column), _around(mask, row, column)]
     parts += [size[..., None] == jnp.arange(NAMED_SIZES + 1)[None, None]]
     sizes = jnp.stack([size / 20, jnp.log1p(size) / 3], axis=-1)
     parts = [part.astype(jnp.float32) for part in [*parts, sizes]]
@@ -113,6 +115,23 @@ def _seen_from(flags: jax.Array, anchor: jax.Array) -> jax.Array:
         return jax.lax.dynamic_slice(padded, (0, place), shape)
 
     return jax.vmap(around)(padded, jnp.argmax(anchor, axis=1))
+
+
+def _around(mask: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
+    """The cells of masks bool[M, K, 12, 12] near the one at row and column, bool[M, 12] each.
+
+    Returns:
+      bool[M, K, 25], the 5x5 cells around it; all false where there is none, and off the board.
+    """
+    there = jnp.any(row, axis=1)[:, None, None, None]
+    padded = jnp.pad(mask & there, ((0, 0), (0, 0), (NEAR, NEAR), (NEAR, NEAR)))
+    width = 2 * NEAR + 1
+    shape = (mask.shape[1], width, width)
+
+    def cut(padded: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
+        return jax.lax.dynamic_slice(padded, (0, row, column), shape).reshape(shape[0], -1)
+
+    return jax.vmap(cut)(padded, jnp.argmax(row, axis=1), jnp.argmax(column, axis=1))
 
 
 def _hash_colors(colors: jax.Array, weights: np.ndarray) -> jax.Array:

@@ -167,25 +167,28 @@ def quality_table(record: Record, entry: Record) -> Table:
 
 def cost_table(record: Record) -> Table:
     """How long the training was."""
-    whole = any(entry["aggregate"].get("process_seconds") for entry in record["algorithms"])
+    everything = [entry["aggregate"] for entry in record["algorithms"]]
+    whole = any(found.get("process_seconds") for found in everything)
+    walked = any((found.get("steps_walked") or {}).get("mean") for found in everything)
     rows = []
-    for entry in record["algorithms"]:
-        found = entry["aggregate"]
+    for entry, found in zip(record["algorithms"], everything, strict=True):
         iterations = sorted({run["iterations"] for run in entry["runs"]})
         cells = [
             _label(record, entry),
             str(found["trials"]),
             "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
             f"{found['transitions']['mean']:,.0f}",
-            duration(found["training_seconds"]["mean"]),
         ]
+        if walked:
+            cells.append(f"{found['steps_walked']['mean']:,.0f}")
+        cells.append(duration(found["training_seconds"]["mean"]))
         if whole:
             process = found.get("process_seconds")
             cells.append(duration(process["mean"]) if process else NOTHING)
         rows.append(tuple(cells))
-    heads = ("algorithm", "trials", "iterations", "transitions", "training time")
-    heads = (*heads, "with start-up") if whole else heads
-    return Table("What a trial took, on average", heads, tuple(rows))
+    heads = ["algorithm", "trials", "iterations", "transitions"]
+    heads += ["random walks' steps"] * walked + ["training time"] + ["with start-up"] * whole
+    return Table("What a trial took, on average", tuple(heads), tuple(rows))
 
 
 def notes(record: Record) -> list[str]:
