@@ -156,6 +156,10 @@ class Config:
                 f"tasks must be a multiple of the number of task_sets={self.task_sets}, got "
                 f"{self.tasks}"
             )
+        if self.walk_steps > self.max_steps:
+            raise ValueError(
+                f"walk_steps must be at most max_steps={self.max_steps}, got {self.walk_steps}"
+            )
         if self.dataset % self.episodes:
             raise ValueError(
                 f"dataset must be a multiple of episodes={self.episodes}, got {self.dataset}"
@@ -270,7 +274,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "best": {
         "env_id": "pstsy",
         "method": "dagger",
-        "iterations": 2000,
+        "iterations": 300,
         "curiosity": "none",
         "learning_rate": 3e-3,
         "cooldown": 0.3,

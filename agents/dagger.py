@@ -27,7 +27,7 @@ from agents import losses
 from agents.agent import Agent, Params
 from agents.config import Config
 from agents.distinct import position_id
-from agents.explore import UNKNOWN, Atlas, explore, look_ahead, steps_walked, walk
+from agents.explore import UNKNOWN, Atlas, explore, look_ahead, walk
 from agents.method import Metrics, Train, environment
 from agents.network import Outputs
 from agents.observations import encode_episodes, observation_ids
@@ -155,8 +155,7 @@ class TrainState(NamedTuple):
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
-      transitions: i32[], environment steps taken with the network.
-      steps_walked: f32[], environment steps of random walks.
+      transitions: i32[], environment steps taken with the network; walks come on top.
     """
 
     params: Params
@@ -166,7 +165,6 @@ class TrainState(NamedTuple):
     iteration: jax.Array
     episodes: jax.Array
     transitions: jax.Array
-    steps_walked: jax.Array
 
 
 def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Train:
@@ -200,7 +198,6 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             iteration=zero,
             episodes=zero,
             transitions=zero,
-            steps_walked=jnp.zeros(()),
         )
 
     def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
@@ -211,7 +208,6 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
         params, opt_state, loss_metrics = optimize(
             agent, config, optimizer, state, update_key, shards
         )
-        walked = float(config.tasks * steps_walked(config))
         state = state._replace(
             params=params,
             opt_state=opt_state,
@@ -219,7 +215,6 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             iteration=state.iteration + 1,
             episodes=state.episodes + config.episodes,
             transitions=state.transitions + jnp.sum(lesson.trajectory.length),
-            steps_walked=state.steps_walked + walked,
         )
         return state, {**metrics, **loss_metrics}
 

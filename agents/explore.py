@@ -164,11 +164,6 @@ def look_ahead(
     return is_known & (steps == jnp.min(steps)), is_known
 
 
-def steps_walked(config: Config) -> int:
-    """Environment steps of the walks in one task."""
-    return config.walkers * (config.walk_rounds + config.agent_rounds) * config.walk_steps
-
-
 def _draw_actions(key: jax.Array, number: int) -> jax.Array:
     return jax.random.randint(key, (number, 2), 0, NUM_DIRECTIONS)
 

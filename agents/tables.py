@@ -180,7 +180,7 @@ def cost_table(record: Record) -> Table:
             f"{found['transitions']['mean']:,.0f}",
         ]
         if walked:
-            cells.append(f"{found['steps_walked']['mean']:,.0f}")
+            cells.append(f"{(found.get('steps_walked') or {'mean': 0})['mean']:,.0f}")
         cells.append(duration(found["training_seconds"]["mean"]))
         if whole:
             process = found.get("process_seconds")

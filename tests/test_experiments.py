@@ -25,6 +25,7 @@ from agents import (
     tracking,
 )
 from agents.checkpoint import Checkpoints, digest, to_arrays
+from agents.config import Config
 from agents.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
 from agents.ppo import make_train
 from agents.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
@@ -401,6 +402,18 @@ def test_tables_hold_means_and_deviations(tmp_path):
     record["experiment"] = "exp1"
     assert tables.solved_table(record).rows[0] == ("PPO + ICM", "2 / 3", "3,072 ± 1,448")
     assert tables.percent_table(record).rows[0] == ("{P}", "55.6 ± 19.2", "25.0")
+    cost = ("PPO + ICM", "3", "3–4", "3,333", "0:07")
+    assert tables.cost_table(record).rows == (cost,)
+    found["steps_walked"]["mean"] = 5e6
+    table = tables.cost_table(record)
+    assert table.rows == ((*cost[:4], "5,000,000", cost[4]),)
+    assert table.heads[4] == "random walks' steps"
+
+
+def test_walks_are_counted():
+    config = Config.preset("best")
+    assert config.steps_walked == 32 * 1024 * 10 * 50
+    assert Config().steps_walked == 0
 
 
 def test_curves_are_drawn_of_seeds_of_any_length(tmp_path):

@@ -35,6 +35,9 @@ def described(board: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
             for axis in (0, 1):
                 there = cells[anchor][0, axis] if anchor in cells else -1000
                 features += [place + there in cells[color][:, axis] for place in range(-11, 12)]
+            origin = cells[anchor][0] if anchor in cells else np.array([-1000, -1000])
+            near = [(origin[0] + i, origin[1] + j) for i in range(-2, 3) for j in range(-2, 3)]
+            features += [list(cell) in cells[color].tolist() for cell in near]
         size = len(cells[color])
         features += [size == number for number in range(5)] + [size / 20, np.log1p(size) / 3]
         rows.append(np.array(features, np.float32))
@@ -74,8 +77,8 @@ def test_what_cannot_be_seen_is_nowhere():
     features, exists, places = describe_board(board)
     assert exists[0].tolist() == [True] + [False] * (MAX_OBJECTS - 1)
     assert (features[0, 0, :24] == 1).all()
-    assert (features[0, 0, 24:116] == 0).all()
-    assert (features[0, 1:, :116] == 0).all()
+    assert (features[0, 0, 24:166] == 0).all()
+    assert (features[0, 1:, :166] == 0).all()
     assert (places == 0).all()
 
 

@@ -9,7 +9,7 @@ import trap_tube_jax as tt
 from agents import Config, ppo
 from agents.agent import Agent
 from agents.replay import Replay
-from agents.rollout import Trajectory
+from agents.rollout import Trajectory, place
 
 STEPS, CAPACITY = 4, 3
 CONFIG = Config(
@@ -73,9 +73,7 @@ def test_imitation_loss_is_the_weighted_log_likelihood(empty):
     replay = empty.remember(played([3, 1], [True, False]))
     loss = jax.jit(lambda params: ppo.imitation_loss(params, agent, CONFIG, replay))(params)
 
-    boards = jax.vmap(lambda cells: tt.observe(ppo.place(tt.base_state(), cells)))(
-        replay.cells[:, 0]
-    )
+    boards = jax.vmap(lambda cells: tt.observe(place(tt.base_state(), cells)))(replay.cells[:, 0])
 
     @jax.jit
     def log_probs(params):

@@ -83,7 +83,7 @@ def test_the_eight_differ_and_the_first_changes_nothing(states):
 def test_a_dataset_is_mirrored_as_a_whole(states, number):
     """What is right in an image is what is right, mirrored."""
     symmetry = Symmetry.of(jnp.asarray(number))
-    config = Config.preset("best", tasks=32, episodes=64, dataset=64, max_steps=19)
+    config = Config.preset("best", tasks=32, episodes=64, dataset=64, max_steps=19, walk_steps=19)
     rng = np.random.default_rng(number)
     right = rng.integers(0, 2**16, (19, 64)).astype(np.uint16)
     layout = jax.tree.map(lambda x: x[0], states)
