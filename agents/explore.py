@@ -57,10 +57,16 @@ class Atlas(NamedTuple):
         The first state of the task where there are none.
         """
         is_known = (self.steps > 0) & (self.steps != UNKNOWN)
-        rank = jnp.cumsum(is_known, dtype=jnp.int32)
-        wanted = jax.random.randint(key, (number,), 0, jnp.maximum(rank[-1], 1)) + 1
-        found = jnp.searchsorted(rank, wanted)
-        position = jnp.where(rank[-1] > 0, found, distinct.position_id(self.task))
+        # By the agent's cell first, which spares counting through all of the table.
+        by_cell = is_known.reshape(distinct.NUM_CELLS, -1)
+        inside = jnp.sum(by_cell, axis=1, dtype=jnp.int32)
+        up_to = jnp.cumsum(inside)
+        wanted = jax.random.randint(key, (number,), 0, jnp.maximum(up_to[-1], 1)) + 1
+        cell = jnp.searchsorted(up_to, wanted)
+        rank = jnp.cumsum(by_cell[cell], axis=1, dtype=jnp.int32)
+        left = (wanted - (up_to - inside)[cell])[:, None]
+        found = cell * by_cell.shape[1] + jnp.argmax(rank >= left, axis=1)
+        position = jnp.where(up_to[-1] > 0, found, distinct.position_id(self.task))
         return jax.vmap(self._at)(position)
 
     def _at(self, position: jax.Array) -> State:

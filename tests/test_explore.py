@@ -9,7 +9,7 @@ import trap_tube_jax as tt
 from agents import distinct
 from agents.config import Config
 from agents.explore import UNKNOWN, Atlas, explore, is_goal, look_ahead, shortest_ways, walk
-from trap_tube_jax.solver.distance import distances
+from trap_tube_jax.solver.distance import Distances, distances
 
 CONFIG = Config.preset("best", walkers=128, walk_rounds=4, walk_steps=40)
 ENV = tt.make("sy", max_steps=100)
@@ -23,6 +23,11 @@ def atlas() -> Atlas:
     tasks, _ = jax.vmap(ENV.reset)(keys)
     task = jax.tree.map(lambda x: x[4], tasks)
     return jax.jit(lambda key: Atlas.of(task, explore(ENV, task, key, CONFIG)))(jax.random.key(1))
+
+
+@pytest.fixture(scope="module")
+def exact(atlas) -> Distances:
+    return distances(atlas.task)
 
 
 def known_states(atlas: Atlas) -> tuple[tt.State, np.ndarray]:
@@ -52,11 +57,11 @@ def test_positions_are_inverted():
     np.testing.assert_array_equal(jax.vmap(there_and_back)(numbers), numbers)
 
 
-def test_known_steps_are_those_of_real_ways(atlas):
+def test_known_steps_are_those_of_real_ways(atlas, exact):
     """Nothing is nearer than it is, and every known way can be gone on, step by step."""
     states, steps = known_states(atlas)
     assert len(steps) > 1000
-    true = distances(atlas.task).lookup(states).astype(int)
+    true = exact.lookup(states).astype(int)
     assert (true >= 0).all()
     assert (steps >= true).all()
     after = successors(states)
@@ -67,11 +72,11 @@ def test_known_steps_are_those_of_real_ways(atlas):
     assert (beyond.min(axis=1) <= steps - 1)[~goal].all()
 
 
-def test_ways_from_many_walks_are_nearly_shortest(atlas):
+def test_ways_from_many_walks_are_nearly_shortest(atlas, exact):
     states, steps = known_states(atlas)
-    true = distances(atlas.task).lookup(states).astype(int)
+    true = exact.lookup(states).astype(int)
     start = int(atlas.steps[distinct.position_id(atlas.task)])
-    assert start <= 2 * distances(atlas.task).lookup(atlas.task)
+    assert start <= 2 * exact.lookup(atlas.task)
     assert np.mean(steps[steps > 0] / true[steps > 0]) < 1.8
 
 
@@ -119,7 +124,7 @@ def test_what_is_known_to_be_worse_is_known_but_not_right():
 
 
 def test_samples_are_known_states_short_of_the_goal(atlas):
-    sample = jax.jit(lambda key: atlas.sample(key, 64))(jax.random.key(5))
+    sample = jax.jit(lambda atlas: atlas.sample(jax.random.key(5), 64))(atlas)
     steps = np.asarray(atlas.steps)[np.asarray(jax.vmap(distinct.position_id)(sample))]
     assert (steps > 0).all()
     assert (steps != UNKNOWN).all()
