@@ -5,7 +5,7 @@ ones share what they saw. They start where few have been before, and the transit
 of them together make up a graph of states. Its shortest ways to the goal, by dynamic
 programming, are far shorter than any walk that contributed to them.
 
-The walks need neither observations nor a network: they cost a hundred nanoseconds a step. They
+The walks need neither observations nor a network: they cost some hundred nanoseconds a step. They
 use nothing but `step` and the places of agent, tool and food, all of which an observation
 shows, and a task that is set back to a state where a walk has been.
 
