@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity import ICM, RND, DetachedICM, Prediction, Transition
-from agents.network import Core, Encoder, Heads, Outputs, draw
+from agents.encoder import Encoder, encode_by_windows
+from agents.network import Core, Heads, Outputs, draw
 from agents.object_encoder import ObjectEncoder
 from trap_tube_jax.objects import BOARD_SIZE
 
@@ -81,12 +82,22 @@ class Agent:
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features f32[M, F] of observations u8[M, 12, 12, N]; needs `encoding_params` only."""
-        features = [_apply(self.encoder, params["encoder"], observation)]
-        if self.curiosity is not None:
-            features.append(
-                _apply(self.curiosity, params["curiosity"], observation, method="encode")
+        return self.encode_rows(params, observation, None)[0]
+
+    def encode_rows(
+        self, params: Params, observation: jax.Array, remembered: Any
+    ) -> tuple[jax.Array, Any]:
+        """The features, and what `distinct.map_rows` may remember of them."""
+        if isinstance(self.encoder, Encoder):
+            features, remembered = encode_by_windows(
+                self.encoder, params["encoder"], observation, remembered
             )
-        return jnp.concatenate(features, axis=-1)
+        else:
+            features, remembered = _apply(self.encoder, params["encoder"], observation), None
+        if self.curiosity is not None:
+            own = _apply(self.curiosity, params["curiosity"], observation, method="encode")
+            features = jnp.concatenate([features, own], axis=-1)
+        return features, remembered
 
     def encoding_params(self, params: Params) -> Params:
         """The part of the parameters that `encode` reads."""

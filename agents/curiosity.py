@@ -15,7 +15,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from agents.network import Encoder, dense, output_dense
+from agents.encoder import Encoder
+from agents.network import dense, output_dense
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 

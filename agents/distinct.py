@@ -15,8 +15,7 @@ of float32 sums. Tests hold both against the plain encoder.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import chex
 import jax
@@ -26,10 +25,29 @@ import numpy as np
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import State
 
-RowFn = Callable[[Any, Any], jax.Array]
+
+class RowFn(Protocol):
+    """What `map_rows` maps: rows to features, row by row."""
+
+    def __call__(self, params: Any, rows: Any, remembered: Any, /) -> tuple[jax.Array, Any]:
+        """Maps rows, arrays [chunk, ...], to f32[chunk, F] and what to remember of it.
+
+        Args:
+          params: any pytree.
+          rows: pytree of arrays [chunk, ...].
+          remembered: None, or what an earlier call with the same arguments returned, to save
+            computing it again (`recall`).
+
+        Returns:
+          The features and a pytree of arrays, or None where there is nothing to remember.
+        """
+        ...
+
 
 NUM_CELLS = BOARD_SIZE * BOARD_SIZE
 NUM_POSITIONS = NUM_CELLS**3  # of agent, tool and food together
+ROW_SLOT_BITS = 16
+REMEMBERED_ROWS = 2048
 
 
 class Groups(NamedTuple):
@@ -62,29 +80,38 @@ def group(*keys: jax.Array) -> Groups:
     )
 
 
+def group_rows(content: jax.Array) -> Groups:
+    """Groups rows integer[M, K] that agree everywhere.
+
+    Every row looks up whom a table names at its hash, and joins them if they are equal. Equal
+    rows are in one group unless the table names another for them; different ones never are.
+    """
+    own = jnp.arange(len(content))
+    slot = _hash_rows(content) >> (32 - ROW_SLOT_BITS)
+    known = jnp.zeros(2**ROW_SLOT_BITS, jnp.int32).at[slot].max(own)[slot]
+    known = jnp.where(jnp.all(content[known] == content, axis=1), known, own)
+    first = known == own
+    number = jnp.cumsum(first, dtype=jnp.int32) - 1
+    zeros = jnp.zeros(len(content), jnp.int32)
+    return Groups(
+        number=number[known],
+        representative=zeros.at[jnp.where(first, number, len(content))].set(own, mode="drop"),
+        total=number[-1] + 1,
+    )
+
+
 def layout_ids(state: State) -> jax.Array:
     """An id i32[B] per episode, equal only for equal boards, palettes and tool extents.
-
-    Layouts are ordered by a hash and compared with their neighbours, so equal layouts get
-    one id unless hashes collide; different ones never share an id.
 
     Args:
       state: B states.
     """
-    content = _layout_content(state)
-    batch = len(content)
-    _, order = jax.lax.sort((layout_hash(state), jnp.arange(batch)), num_keys=1)
-    content = content[order]
-    differs = jnp.any(content[1:] != content[:-1], axis=1)
-    number = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(differs, dtype=jnp.int32)])
-    return jnp.zeros(batch, jnp.int32).at[order].set(number, unique_indices=True)
+    return group_rows(_layout_content(state)).number
 
 
 def layout_hash(state: State) -> jax.Array:
     """A hash u32[B] of the boards, palettes and tool extents of B states."""
-    content = _layout_content(state)
-    weights = np.random.default_rng(0).integers(1, 2**32, content.shape[1], np.uint32)
-    return jnp.sum(content.astype(jnp.uint32) * weights[None], axis=1, dtype=jnp.uint32)
+    return _hash_rows(_layout_content(state))
 
 
 def position_id(state: State) -> jax.Array:
@@ -102,12 +129,13 @@ def cells_at(position: jax.Array) -> jax.Array:
 
 
 def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> jax.Array:
-    """`fn(params, rows)` on the first `count` rows, a chunk at a time; zeros below.
+    """`fn` on the first `count` rows, a chunk at a time; zeros below.
 
-    Differentiable with respect to `params` only.
+    Differentiable with respect to `params` only. What `fn` wants remembered of the first
+    `REMEMBERED_ROWS` is; for the others the derivative calls it once more.
 
     Args:
-      fn: maps parameters and [chunk, ...] rows to f32[chunk, F], row by row.
+      fn: see `RowFn`.
       chunk: rows per call of `fn`.
       params: any pytree.
       rows: pytree of arrays [M, ...].
@@ -122,33 +150,50 @@ def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) ->
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> jax.Array:
-    num_rows = len(jax.tree.leaves(rows)[0])
-    rows = _pad_rows(rows, chunk)
-    size = len(jax.tree.leaves(rows)[0])
-    width = jax.eval_shape(fn, params, _take(rows, 0, chunk)).shape[1]
-
-    def body(index: jax.Array, features: jax.Array) -> jax.Array:
-        result = fn(params, _take(rows, index, chunk))
-        return jax.lax.dynamic_update_slice_in_dim(features, result, index * chunk, axis=0)
-
-    features = jnp.zeros((size, width))
-    return jax.lax.fori_loop(0, _num_chunks(count, chunk), body, features)[:num_rows]
+    return _map_rows_forward(fn, chunk, params, rows, count)[0]
 
 
 def _map_rows_forward(
     fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array
 ) -> tuple[jax.Array, Any]:
-    return map_rows(fn, chunk, params, rows, count), (params, rows, count)
+    num_rows = len(jax.tree.leaves(rows)[0])
+    padded = _pad_rows(rows, chunk)
+    num_chunks = len(jax.tree.leaves(padded)[0]) // chunk
+    num_remembered = min(-(-REMEMBERED_ROWS // chunk), num_chunks)
+
+    def body(index: jax.Array, outputs: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        features, memory = outputs
+        result, remembered = fn(params, _take(padded, index, chunk), None)
+        place = jnp.minimum(index, num_remembered)
+        memory = jax.tree.map(lambda kept, new: kept.at[place].set(new), memory, remembered)
+        return features.at[index].set(result), memory
+
+    result, remembered = jax.eval_shape(fn, params, _take(padded, 0, chunk), None)
+    features = jnp.zeros((num_chunks, *result.shape), result.dtype)
+    # The place after the last is written by all chunks that are not remembered.
+    memory = jax.tree.map(lambda x: jnp.zeros((num_remembered + 1, *x.shape), x.dtype), remembered)
+    outputs = (features, memory)
+    features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, outputs)
+    features = features.reshape(-1, *features.shape[2:])[:num_rows]
+    return features, (params, rows, count, memory)
 
 
 def _map_rows_backward(
     fn: RowFn, chunk: int, residuals: Any, cotangent: jax.Array
 ) -> tuple[Any, None, None]:
-    params, rows, count = residuals
+    params, rows, count, memory = residuals
     rows, cotangent = _pad_rows((rows, cotangent), chunk)
 
     def body(index: jax.Array, gradient: Any) -> Any:
-        _, pullback = jax.vjp(lambda p: fn(p, _take(rows, index, chunk)), params)
+        part = _take(rows, index, chunk)
+        remembered = memory
+        if memory is not None:
+            remembered = jax.lax.cond(
+                index < len(jax.tree.leaves(memory)[0]) - 1,
+                lambda: jax.tree.map(lambda kept: kept[index], memory),
+                lambda: fn(params, part, None)[1],
+            )
+        _, pullback = jax.vjp(lambda p: fn(p, part, remembered)[0], params)
         (contribution,) = pullback(_take(cotangent, index, chunk))
         return jax.tree.map(jnp.add, gradient, contribution)
 
@@ -157,6 +202,18 @@ def _map_rows_backward(
 
 
 _map_rows.defvjp(_map_rows_forward, _map_rows_backward)
+
+
+@jax.custom_jvp
+def recall(value: jax.Array, remembered: jax.Array) -> jax.Array:
+    """`remembered` in place of the equal `value`, which is differentiated but not computed."""
+    del value
+    return remembered
+
+
+@recall.defjvp
+def _(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    return primals[1], tangents[0]
 
 
 @jax.custom_batching.custom_vmap
@@ -173,6 +230,12 @@ def shared_maximum(x: jax.Array) -> jax.Array:
 def _(axis_size: int, in_batched: list[bool], x: jax.Array) -> tuple[jax.Array, bool]:
     del axis_size, in_batched
     return shared_maximum(jnp.max(x)), False
+
+
+def _hash_rows(content: jax.Array) -> jax.Array:
+    """u32[M]: a hash of each row of integer[M, K]."""
+    weights = np.random.default_rng(0).integers(1, 2**32, content.shape[1], np.uint32)
+    return jnp.sum(content.astype(jnp.uint32) * weights[None], axis=1, dtype=jnp.uint32)
 
 
 def _layout_content(state: State) -> jax.Array:

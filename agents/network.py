@@ -1,4 +1,4 @@
-"""The agent's network: convolutional encoder, recurrent core, heads.
+"""The agent's network beyond its encoder: recurrent core and heads, and how all are initialised.
 
 The parts are separate because they are evaluated separately: the encoder once per
 distinct observation, the core once per step, the heads on whatever is needed.
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.objects import BOARD_SIZE, NUM_DIRECTIONS
+from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
 def variance_scaling(scale: float) -> nn.initializers.Initializer:
@@ -67,64 +67,6 @@ class Outputs(NamedTuple):
     value: jax.Array
 
 
-class Encoder(nn.Module):
-    """Observation to features: two convolutions, two residual blocks, global max pool.
-
-    Batched, as convolutions are. Every convolution pads to keep the size; a 2x2 one
-    pads below and to the right.
-
-    Attributes:
-      filters: channels of the first convolution, and of all later ones.
-    """
-
-    filters: tuple[int, int]
-
-    @nn.compact
-    def __call__(self, observation: jax.Array) -> jax.Array:
-        """Encodes u8[M, 12, 12, N] to f32[M, filters[1]]."""
-        x = scaled_with_coordinates(observation)
-        x = nn.swish(Conv(self.filters[0], 2, name="conv1")(x))
-        x = nn.swish(Conv(self.filters[1], 2, name="conv2")(x))
-        x = ResidualBlock(name="block1")(max_pool(x))
-        x = ResidualBlock(name="block2")(max_pool(x))
-        return jnp.max(x, axis=(1, 2))
-
-
-class ResidualBlock(nn.Module):
-    """x + conv3x3(swish(conv3x3(swish(x)))), channels kept."""
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps f32[M, H, W, C] to f32[M, H, W, C]."""
-        channels = x.shape[-1]
-        y = Conv(channels, 3, name="conv1")(nn.swish(x))
-        return x + Conv(channels, 3, name="conv2")(nn.swish(y))
-
-
-class Conv(nn.Module):
-    """A square convolution, stride 1, size kept, written as one matrix product.
-
-    XLA's CPU convolutions are slow backwards; the product of the gathered patches with
-    the kernel, [M * H * W, k * k * C_in] times [k * k * C_in, C_out], is not.
-
-    Attributes:
-      features: output channels.
-      size: the kernel's height and width.
-    """
-
-    features: int
-    size: int
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps f32[M, H, W, C_in] to f32[M, H, W, features]."""
-        shape = (self.size, self.size, x.shape[-1], self.features)
-        kernel = self.param("kernel", hidden_init, shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        y = patches(x, self.size) @ kernel.reshape(-1, self.features)
-        return y + _as_row(bias, y.ndim)
-
-
 class Core(nn.Module):
     """What the agent remembers: previous action and reward beside the features, and a GRU.
 
@@ -171,7 +113,7 @@ class Core(nn.Module):
         reward = nn.swish(self.reward_embedding(reward_tm1[..., None]))
         parts = [features, self.embed_action(action_tm1), reward]
         x = nn.swish(self.mix(jnp.concatenate(parts, axis=-1)))
-        return x @ self.input_kernel + _as_row(self.bias[0], x.ndim)
+        return x @ self.input_kernel + as_row(self.bias[0], x.ndim)
 
     def embed_action(self, action: jax.Array) -> jax.Array:
         """The embeddings f32[..., 2 * embedding] of an action i32[..., 2]."""
@@ -184,7 +126,7 @@ class Core(nn.Module):
 
     def advance(self, state: jax.Array, inputs: jax.Array) -> jax.Array:
         """One step of the GRU: f32[..., hidden], f32[..., 3 * hidden] -> f32[..., hidden]."""
-        recurrent = state @ self.state_kernel + _as_row(self.bias[1], state.ndim)
+        recurrent = state @ self.state_kernel + as_row(self.bias[1], state.ndim)
         update_x, reset_x, candidate_x = jnp.split(inputs, 3, axis=-1)
         update_h, reset_h, candidate_h = jnp.split(recurrent, 3, axis=-1)
         update = nn.sigmoid(update_x + update_h)
@@ -215,40 +157,6 @@ class Heads(nn.Module):
         )
 
 
-def scaled_with_coordinates(observation: jax.Array) -> jax.Array:
-    """u8[M, 12, 12, N] to f32[M, 12, 12, N + 3], all in [-1, 1].
-
-    The channels after the N features are column, row and their Euclidean norm, each
-    divided by its maximum and rescaled.
-    """
-    features = observation.astype(jnp.float32) / 127.5 - 1
-    row, column = np.indices((BOARD_SIZE, BOARD_SIZE)) / (BOARD_SIZE - 1)
-    radius = np.hypot(row, column)
-    coordinates = 2 * np.stack([column, row, radius / radius.max()], axis=-1) - 1
-    coordinates = jnp.asarray(coordinates, jnp.float32)
-    shape = (*observation.shape[:-1], coordinates.shape[-1])
-    return jnp.concatenate([features, jnp.broadcast_to(coordinates, shape)], axis=-1)
-
-
-def patches(x: jax.Array, size: int) -> jax.Array:
-    """The neighbourhood of every cell: f32[M, H, W, C] to f32[M, H, W, size * size * C].
-
-    Row by row, zeros beyond the edge; an even size reaches further down and right.
-    """
-    before = (size - 1) // 2
-    height, width = x.shape[1:3]
-    padding = (before, size - 1 - before)
-    x = jnp.pad(x, ((0, 0), padding, padding, (0, 0)))
-    shifts = [x[:, i : i + height, j : j + width] for i in range(size) for j in range(size)]
-    return jnp.concatenate(shifts, axis=-1)
-
-
-def max_pool(x: jax.Array) -> jax.Array:
-    """The maximum over 2x2 blocks: f32[M, H, W, C] to f32[M, H / 2, W / 2, C]."""
-    count, height, width, channels = x.shape
-    return jnp.max(x.reshape(count, height // 2, 2, width // 2, 2, channels), axis=(2, 4))
-
-
-def _as_row(vector: jax.Array, ndim: int) -> jax.Array:
+def as_row(vector: jax.Array, ndim: int) -> jax.Array:
     """f32[1, ..., 1, C], to add f32[C] along the last axis."""
     return vector.reshape((1,) * (ndim - 1) + (-1,))

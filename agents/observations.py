@@ -38,7 +38,7 @@ def encode_episodes(
         jax.tree.map(lambda x: x[episode], layout), cells[time, episode]
     )
     features = distinct.map_rows(
-        agent.encode, config.chunk, agent.encoding_params(params), rows, groups.total
+        agent.encode_rows, config.chunk, agent.encoding_params(params), rows, groups.total
     )
     return features[groups.number].reshape(*shape, -1)
 

@@ -149,7 +149,9 @@ def rollout(
         groups = distinct.group(seen.astype(jnp.int32), layout_id, position)
         num_new = jnp.max(jnp.where(seen, -1, groups.number)) + 1
         rows = jax.vmap(observe)(state)[groups.representative]
-        new = distinct.map_rows(agent.encode, chunk, agent.encoding_params(params), rows, num_new)
+        new = distinct.map_rows(
+            agent.encode_rows, chunk, agent.encoding_params(params), rows, num_new
+        )
         features = jnp.where(seen[:, None], recalled, new[groups.number])
         return features, _Memory(
             memory.position.at[time].set(position), memory.features.at[time].set(features)

@@ -62,7 +62,8 @@ class Part:
       name: what is timed.
       timing: of one iteration's worth of it.
       encoder_flop: the encoder's useful floating-point operations in it: each distinct
-        observation once per minibatch and derivative, nothing recomputed, no padding.
+        observation whole, once per minibatch and derivative, nothing recomputed, no padding.
+        Windows that observations share count in each, though they are encoded once.
     """
 
     env: str
@@ -87,7 +88,9 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     trajectory = play(state)
     batch, _, _ = jax.jit(lambda *x: prepare(train.agent, config, *x))(state, trajectory)
     per_observation = matrix_flop(
-        jax.make_jaxpr(train.agent.encode)(state.params, trajectory.observations()[0, :1])
+        jax.make_jaxpr(train.agent.encoder.apply)(
+            state.params["encoder"], trajectory.observations()[0, :1]
+        )
     )
     distinct = jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch)
     play_flop = per_observation * float(jnp.max(batch.observation_id) + 1)

@@ -27,7 +27,8 @@ def test_operations_of_matrix_products_are_counted():
 def test_the_encoder_of_the_paper_costs_what_its_shapes_say():
     agent = Agent(Config())
     params = jax.eval_shape(agent.init, jax.random.key(0))
-    jaxpr = jax.make_jaxpr(agent.encode)(params, jnp.zeros((1, 12, 12, 3), jnp.uint8))
+    board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
+    jaxpr = jax.make_jaxpr(agent.encoder.apply)(params["encoder"], board)
     stem = 144 * 4 * 6 * 32 + 144 * 4 * 32 * 64
     blocks = 2 * (36 + 9) * 9 * 64 * 64
     assert train_throughput.matrix_flop(jaxpr) == 2 * (stem + blocks)

@@ -64,6 +64,19 @@ def plain(params: dict[str, jax.Array], rows: jax.Array) -> jax.Array:
     return jnp.tanh(rows @ params["w"] + params["b"].reshape(1, -1))
 
 
+def forgetful(params: dict[str, jax.Array], rows: jax.Array, _: None) -> tuple[jax.Array, None]:
+    return plain(params, rows), None
+
+
+def remembering(
+    params: dict[str, jax.Array], rows: jax.Array, remembered: dict[str, jax.Array] | None
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    product = rows @ params["w"]
+    if remembered is not None:
+        product = distinct.recall(product, remembered["product"])
+    return jnp.tanh(product + params["b"].reshape(1, -1)), {"product": product}
+
+
 @pytest.fixture(scope="module")
 def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
     keys = jax.random.split(jax.random.key(0), 4)
@@ -74,14 +87,16 @@ def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
     return params, jax.random.normal(keys[2], (ROWS, 3)), jax.random.normal(keys[3], (ROWS, WIDTH))
 
 
+@pytest.mark.parametrize("fn", [forgetful, remembering])
 @pytest.mark.parametrize("chunk", [1, 8, 37, 64])
 @pytest.mark.parametrize("count", [0, 1, 8, 9, ROWS])
-def test_map_rows_and_its_gradient(problem, chunk, count):
+def test_map_rows_and_its_gradient(problem, fn, chunk, count, monkeypatch):
+    monkeypatch.setattr(distinct, "REMEMBERED_ROWS", 16)
     params, rows, cotangent = problem
     valid = (jnp.arange(ROWS) < count)[:, None]
 
     def ours(params):
-        features = distinct.map_rows(plain, chunk, params, rows, jnp.int32(count))
+        features = distinct.map_rows(fn, chunk, params, rows, jnp.int32(count))
         return jnp.sum(jnp.where(valid, features, 0) * cotangent)
 
     def reference(params):
@@ -98,7 +113,7 @@ def test_map_rows_under_vmap_with_different_counts(problem):
 
     def gradient(params, count):
         def total(params):
-            features = distinct.map_rows(plain, 8, params, rows, count)
+            features = distinct.map_rows(remembering, 8, params, rows, count)
             return jnp.sum(features * cotangent * (jnp.arange(ROWS) < count)[:, None])
 
         return jax.grad(total)(params)

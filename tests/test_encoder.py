@@ -1,0 +1,86 @@
+"""The paper's encoder by distinct windows against the plain one."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents import distinct
+from agents.encoder import Encoder, cut_into_windows, encode_by_windows
+from agents.network import draw
+
+EPISODES, STEPS = 3, 6
+encoder = Encoder((4, 6))
+
+
+def boards(env_id: str, num_features: int) -> jax.Array:
+    """What random play sees, u8[M, 12, 12, N]."""
+    env = tt.make(env_id, num_features=num_features)
+    keys = jax.random.split(jax.random.key(1), EPISODES)
+    actions = jax.random.randint(jax.random.key(2), (STEPS, EPISODES, 2), 0, 4)
+
+    def step(state: tt.State, action: jax.Array) -> tuple[tt.State, jax.Array]:
+        state, timestep = jax.vmap(env.step)(state, action)
+        return state, timestep.observation
+
+    state, _ = jax.vmap(env.reset)(keys)
+    _, observations = jax.lax.scan(step, state, actions)
+    return observations.reshape(-1, *observations.shape[2:])
+
+
+@pytest.fixture(scope="module", params=[("base", 3), ("pstsy", 3), ("pstsy", 1), ("pst", 5)])
+def observation(request: pytest.FixtureRequest) -> jax.Array:
+    return jax.jit(boards, static_argnums=(0, 1))(*request.param)
+
+
+def parameters(observation: jax.Array) -> dict:
+    deviations = encoder.init(jax.random.key(0), observation[:1])
+    # Biases too: what lies beyond the edge is zero only because nothing is added to it.
+    deviations = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else leaf + 0.1, deviations)
+    return draw(jax.random.key(3), deviations)
+
+
+@pytest.mark.parametrize("remembered_rows", [0, 2048])
+def test_windows_give_the_plain_features_and_gradient(observation, remembered_rows, monkeypatch):
+    monkeypatch.setattr(distinct, "REMEMBERED_ROWS", remembered_rows)
+    params = parameters(observation)
+    count = jnp.int32(len(observation))
+
+    def by_windows(params):
+        rows = functools.partial(encode_by_windows, encoder)
+        return jnp.sin(distinct.map_rows(rows, 4, params, observation, count))
+
+    def plain(params: Any) -> Any:
+        features: Any = encoder.apply(params, observation)
+        return jnp.sin(features)
+
+    def gradient(function):
+        return jax.jit(jax.grad(lambda params: jnp.sum(function(params))))(params)
+
+    np.testing.assert_allclose(by_windows(params), plain(params), rtol=1e-5, atol=1e-5)
+    got, want = gradient(by_windows), gradient(plain)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), got, want)
+    assert all(np.abs(leaf).max() > 1e-2 for leaf in jax.tree.leaves(want))
+
+
+def test_windows_are_the_parts_of_the_board():
+    observation = jax.random.randint(jax.random.key(0), (2, 12, 12, 3), 0, 256).astype(jnp.uint8)
+    window, block = cut_into_windows(observation)
+    padded = np.pad(observation, ((0, 0), (0, 2), (0, 2), (0, 0)))
+    for index in range(72):
+        row, column = divmod(int(block[index]), 6)
+        assert (row * 6 + column) == index % 36
+        part = padded[index // 36, 2 * row : 2 * row + 4, 2 * column : 2 * column + 4]
+        np.testing.assert_array_equal(window[index].reshape(4, 4, 3), part)
+
+
+def test_few_windows_of_an_episode_are_distinct():
+    window, block = cut_into_windows(jax.jit(boards, static_argnums=(0, 1))("base", 3))
+    groups = distinct.group_rows(jnp.concatenate([window, block[:, None]], axis=1))
+    assert 36 < groups.total < len(window) / 5
+    np.testing.assert_array_equal(window[groups.representative[groups.number]], window)
+    np.testing.assert_array_equal(block[groups.representative[groups.number]], block)
