@@ -29,8 +29,8 @@ from trap_tube_jax.state import State
 class RowFn(Protocol):
     """What `map_rows` maps: rows to features, row by row."""
 
-    def __call__(self, params: Any, rows: Any, remembered: Any, /) -> tuple[jax.Array, Any]:
-        """Maps rows, arrays [chunk, ...], to f32[chunk, F] and what to remember of it.
+    def __call__(self, params: Any, rows: Any, remembered: Any, /) -> tuple[Any, Any]:
+        """Maps rows, arrays [chunk, ...], to features and what to remember of them.
 
         Args:
           params: any pytree.
@@ -39,7 +39,8 @@ class RowFn(Protocol):
             computing it again (`recall`).
 
         Returns:
-          The features and a pytree of arrays, or None where there is nothing to remember.
+          A pytree of arrays [chunk, ...], the features; and a pytree of arrays, or None where
+          there is nothing to remember.
         """
         ...
 
@@ -128,7 +129,7 @@ def cells_at(position: jax.Array) -> jax.Array:
     return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)
 
 
-def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> jax.Array:
+def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
     """`fn` on the first `count` rows, a chunk at a time; zeros below.
 
     Differentiable with respect to `params` only. What `fn` wants remembered of the first
@@ -142,44 +143,48 @@ def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) ->
       count: i32[], at most M.
 
     Returns:
-      f32[M, F].
+      The features, a pytree of arrays [M, ...].
     """
-    features: Any = _map_rows(fn, chunk, params, rows, count)
-    return features
+    return _map_rows(fn, chunk, params, rows, count)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> jax.Array:
+def _map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
     return _map_rows_forward(fn, chunk, params, rows, count)[0]
 
 
 def _map_rows_forward(
     fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array
-) -> tuple[jax.Array, Any]:
+) -> tuple[Any, Any]:
     num_rows = len(jax.tree.leaves(rows)[0])
     padded = _pad_rows(rows, chunk)
     num_chunks = len(jax.tree.leaves(padded)[0]) // chunk
     num_remembered = min(-(-REMEMBERED_ROWS // chunk), num_chunks)
 
-    def body(index: jax.Array, outputs: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        features, memory = outputs
-        result, remembered = fn(params, _take(padded, index, chunk), None)
-        place = jnp.minimum(index, num_remembered)
-        memory = jax.tree.map(lambda kept, new: kept.at[place].set(new), memory, remembered)
-        return features.at[index].set(result), memory
+    def body(index: jax.Array, outputs: tuple[Any, Any]) -> tuple[Any, Any]:
+        results = fn(params, _take(padded, index, chunk), None)
+        # The place after the last is written by all chunks that are not remembered.
+        places = (index, jnp.minimum(index, num_remembered))
+        return tuple(
+            jax.tree.map(lambda all_of, new, place=place: all_of.at[place].set(new), *both)
+            for place, *both in zip(places, outputs, results, strict=True)
+        )
 
-    result, remembered = jax.eval_shape(fn, params, _take(padded, 0, chunk), None)
-    features = jnp.zeros((num_chunks, *result.shape), result.dtype)
-    # The place after the last is written by all chunks that are not remembered.
-    memory = jax.tree.map(lambda x: jnp.zeros((num_remembered + 1, *x.shape), x.dtype), remembered)
-    outputs = (features, memory)
+    def empty(length: int, leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        return jnp.zeros((length, *leaf.shape), leaf.dtype)
+
+    shapes = jax.eval_shape(fn, params, _take(padded, 0, chunk), None)
+    outputs = tuple(
+        jax.tree.map(functools.partial(empty, length), shape)
+        for length, shape in zip((num_chunks, num_remembered + 1), shapes, strict=True)
+    )
     features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, outputs)
-    features = features.reshape(-1, *features.shape[2:])[:num_rows]
+    features = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:num_rows], features)
     return features, (params, rows, count, memory)
 
 
 def _map_rows_backward(
-    fn: RowFn, chunk: int, residuals: Any, cotangent: jax.Array
+    fn: RowFn, chunk: int, residuals: Any, cotangent: Any
 ) -> tuple[Any, None, None]:
     params, rows, count, memory = residuals
     rows, cotangent = _pad_rows((rows, cotangent), chunk)

@@ -3,8 +3,10 @@
 What the encoder makes of a 2x2 block of the board, up to its first pooling, is a function of
 a 4x4 window of the observation. Observations are 36 windows each, and few of them differ: what
 one step moves is seen by a handful of windows, and all others are those of the step before.
-So a batch of observations is cut into windows, each distinct one goes through the first two
-convolutions once, and only what follows the pooling is computed observation by observation.
+So a batch of observations is cut into windows, and each distinct one goes through the first
+two convolutions once, and then through the third, which is linear, as far as to say what it
+adds to each of the cells around. Summing that up, and all that follows, is done observation by
+observation.
 
 The result is that of `Encoder` applied as a whole, and so is the gradient, up to the order of
 float32 sums. Tests hold both against it.
@@ -12,6 +14,7 @@ float32 sums. Tests hold both against it.
 Source: paper section "Results", agent specification "Network".
 """
 
+import functools
 from typing import Any
 
 import flax.linen as nn
@@ -44,15 +47,17 @@ class Encoder(nn.Module):
         """Declares the layers."""
         self.conv1 = Conv(self.filters[0], 2)
         self.conv2 = Conv(self.filters[1], 2)
-        self.block1 = ResidualBlock()
-        self.block2 = ResidualBlock()
+        self.block1 = ResidualBlock(self.filters[1])
+        self.block2 = ResidualBlock(self.filters[1])
 
     def __call__(self, observation: jax.Array) -> jax.Array:
         """Encodes u8[M, 12, 12, N] to f32[M, filters[1]]."""
         x = nn.swish(self.conv1(scaled_with_coordinates(observation)))
-        return self.encode_blocks(max_pool(nn.swish(self.conv2(x))))
+        x = max_pool(nn.swish(self.conv2(x)))
+        x = self.block2(max_pool(self.block1(x)))
+        return jnp.max(x, axis=(1, 2))
 
-    def encode_windows(self, window: jax.Array, block: jax.Array) -> jax.Array:
+    def encode_windows(self, window: jax.Array, block: jax.Array) -> tuple[jax.Array, jax.Array]:
         """What the first pooling yields at single 2x2 blocks of the board.
 
         Args:
@@ -61,30 +66,51 @@ class Encoder(nn.Module):
           block: integer[W], which of the 36 blocks, row by row.
 
         Returns:
-          f32[W, filters[1]].
+          f32[W, filters[1]]; and f32[W, 9 * filters[1]], see `ResidualBlock.spread`.
         """
         place = jnp.asarray(_coordinates_of_windows())[block]
         coordinates, inside = place[..., :-1], place[..., -1:]
         x = jnp.concatenate([_scaled(window) * inside, coordinates], axis=-1)
         # The second convolution pads its own input, so features beyond the edge are zeros too.
         x = nn.swish(self.conv1(x, pad=False)) * inside[:, :-1, :-1]
-        return jnp.max(nn.swish(self.conv2(x, pad=False)), axis=(1, 2))
+        x = jnp.max(nn.swish(self.conv2(x, pad=False)), axis=(1, 2))
+        return x, self.block1.spread(x)
 
-    def encode_blocks(self, x: jax.Array) -> jax.Array:
-        """What follows the first pooling: f32[M, 6, 6, filters[1]] to f32[M, filters[1]]."""
-        x = self.block2(max_pool(self.block1(x)))
+    def encode_blocks(self, x: jax.Array, spread: jax.Array) -> jax.Array:
+        """What follows: both results of `encode_windows`, [M, 6, 6, ...], to f32[M, filters[1]]."""
+        x = self.block2(max_pool(self.block1.collect(x, spread)))
         return jnp.max(x, axis=(1, 2))
 
 
 class ResidualBlock(nn.Module):
-    """x + conv3x3(swish(conv3x3(swish(x)))), channels kept."""
+    """x + conv3x3(swish(conv3x3(swish(x)))), channels kept.
 
-    @nn.compact
+    Attributes:
+      channels: C.
+    """
+
+    channels: int
+
+    def setup(self) -> None:
+        """Declares the two convolutions."""
+        self.conv1 = Conv(self.channels, 3)
+        self.conv2 = Conv(self.channels, 3)
+
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps f32[M, H, W, C] to f32[M, H, W, C]."""
-        channels = x.shape[-1]
-        y = Conv(channels, 3, name="conv1")(nn.swish(x))
-        return x + Conv(channels, 3, name="conv2")(nn.swish(y))
+        return x + self.conv2(nn.swish(self.conv1(nn.swish(x))))
+
+    def spread(self, x: jax.Array) -> jax.Array:
+        """What cells f32[W, C] add to the first convolution at each of the 9 cells around them.
+
+        Returns:
+          f32[W, 9 * C], row by row.
+        """
+        return self.conv1.spread(nn.swish(x))
+
+    def collect(self, x: jax.Array, spread: jax.Array) -> jax.Array:
+        """The block's result from f32[M, H, W, C] and f32[M, H, W, 9 * C]."""
+        return x + self.conv2(nn.swish(self.conv1.collect(spread)))
 
 
 class Conv(nn.Module):
@@ -107,16 +133,27 @@ class Conv(nn.Module):
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", hidden_init, shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        if pad:
-            before = (self.size - 1) // 2
-            padding = (before, self.size - 1 - before)
-            x = jnp.pad(x, ((0, 0), padding, padding, (0, 0)))
-        y = patches(x, self.size) @ kernel.reshape(-1, self.features)
-        if self.has_variable("remembered", "product"):
-            y = distinct.recall(y, self.get_variable("remembered", "product"))
+        x = patches(x, self.size) if not pad else patches(pad_edges(x, self.size), self.size)
+        return self._remember(x @ kernel.reshape(-1, self.features) + as_row(bias, x.ndim))
+
+    def spread(self, x: jax.Array) -> jax.Array:
+        """What cells f32[W, C_in] add to each of the cells around, f32[W, k * k * features]."""
+        kernel = self.get_variable("params", "kernel")[::-1, ::-1]
+        return x @ kernel.transpose(2, 0, 1, 3).reshape(x.shape[-1], -1)
+
+    def collect(self, spread: jax.Array) -> jax.Array:
+        """The convolution from f32[M, H, W, k * k * features], what `spread` says of its input."""
+        bias = self.get_variable("params", "bias")
+        sums: Any = add_patches(spread, self.size)
+        return self._remember(sums + as_row(bias, spread.ndim))
+
+    def _remember(self, y: jax.Array) -> jax.Array:
+        """Lets y be remembered, and recalls it if it was; see `distinct.recall`."""
+        if self.has_variable("remembered", "y"):
+            y = distinct.recall(y, self.get_variable("remembered", "y"))
         if not self.is_initializing():
-            self.sow("remembered", "product", y, init_fn=lambda: y, reduce_fn=lambda _, y: y)
-        return y + as_row(bias, y.ndim)
+            self.sow("remembered", "y", y, init_fn=lambda: y, reduce_fn=lambda _, y: y)
+        return y
 
 
 def encode_by_windows(
@@ -149,13 +186,14 @@ def encode_by_windows(
         (window.reshape(-1, WINDOW, WINDOW, observation.shape[-1]), block),
         groups.total,
     )
-    x = features[groups.number].reshape(-1, BLOCKS, BLOCKS, features.shape[-1])
+    shape = (len(observation), BLOCKS, BLOCKS, -1)
+    x, spread = (table[groups.number].reshape(shape) for table in features)
     if remembered is not None:
         x = distinct.recall(x, remembered["x"])
-        params = {**params, "remembered": remembered["products"]}
+        params = {**params, "remembered": remembered["layers"]}
     y: Any
-    y, variables = encoder.apply(params, x, method="encode_blocks", mutable=["remembered"])
-    return y, {"x": x, "products": variables["remembered"]}
+    y, variables = encoder.apply(params, x, spread, method="encode_blocks", mutable=["remembered"])
+    return y, {"x": x, "layers": variables["remembered"]}
 
 
 def cut_into_windows(observation: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -196,6 +234,33 @@ def patches(x: jax.Array, size: int) -> jax.Array:
     height, width = (length - size + 1 for length in x.shape[1:3])
     shifts = [x[:, i : i + height, j : j + width] for i in range(size) for j in range(size)]
     return jnp.concatenate(shifts, axis=-1)
+
+
+def pad_edges(x: jax.Array, size: int) -> jax.Array:
+    """Zeros around f32[M, H, W, C] that let a convolution of this size keep H and W."""
+    before = (size - 1) // 2
+    padding = (before, size - 1 - before)
+    return jnp.pad(x, ((0, 0), padding, padding, (0, 0)))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def add_patches(x: jax.Array, size: int) -> jax.Array:
+    """The transpose of `patches` after `pad_edges`, for odd sizes.
+
+    Every cell of f32[M, H, W, size * size * C] holds what it adds to the cells around it, row
+    by row; the sums are f32[M, H, W, C]. Its own derivative is `patches`, written as such
+    because XLA does not find out.
+    """
+    channels = x.shape[-1] // size**2
+    cells = jax.ShapeDtypeStruct((*x.shape[:-1], channels), x.dtype)
+    (sums,) = jax.linear_transpose(lambda y: patches(pad_edges(y, size), size), cells)(x)
+    return sums
+
+
+add_patches.defvjp(
+    lambda x, size: (add_patches(x, size), None),
+    lambda size, _, cotangent: (patches(pad_edges(cotangent, size), size),),
+)
 
 
 def max_pool(x: jax.Array) -> jax.Array:
