@@ -21,6 +21,7 @@ from trap_tube_jax.objects import (
     NUM_DIRECTIONS,
 )
 from trap_tube_jax.observation import observe
+from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State, TimeStep, base_state, check_structure, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
 
@@ -93,7 +94,7 @@ class Environment:
           ValueError: `key` is not one PRNG key.
         """
         _check_key(key)
-        state = self._transfer(key, self.base)
+        state = self._transfer(loop_free(key), self.base)
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:

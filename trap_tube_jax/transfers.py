@@ -154,10 +154,11 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
     board = jnp.where(state.board == code, jnp.uint8(GROUND), state.board)
     board = jnp.where(old_tool, code.astype(jnp.uint8), board)
     objects = np.arange(NUM_OBJECTS)
-    looks_of = jnp.where(objects == TOOL, code, jnp.where(objects == code, TOOL, objects))
+    partner = jnp.where(objects == TOOL, code, jnp.where(objects == code, TOOL, objects))
+    looks_of = jnp.where(swaps, partner, objects)
     return state.replace(
         board=jnp.where(swaps, board, state.board),
-        palette=jnp.where(swaps, state.palette[looks_of], state.palette),
+        palette=state.palette[looks_of],
         tool=jnp.where(swaps, corner, state.tool),
         tool_extent=jnp.where(swaps, extent, state.tool_extent),
     )
