@@ -7,14 +7,17 @@ base task all episodes share their boards. So instead of encoding M observations
   1. name each by a few integers that determine it (`observation_ids`),
   2. sort the names to find the distinct ones (`group`),
   3. encode one of each, in chunks of fixed size whose number depends on the data
-     (`map_rows`, which has its own derivative, since loops of varying length have none),
+     (`map_rows`, which has its own derivative, since loops of varying length have none, and
+     remembers for it what is dear to compute),
   4. hand every observation the features of its representative.
 
 The result is that of encoding all M observations, and so is the gradient, up to the order
-of float32 sums. Tests hold both against the plain encoder.
+of float32 sums. Tests hold both against the plain encoder, which `agents.encoder` takes apart
+further, in the same way.
 """
 
 import functools
+import math
 from typing import Any, NamedTuple, Protocol
 
 import chex
@@ -24,6 +27,11 @@ import numpy as np
 
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import State
+
+NUM_CELLS = BOARD_SIZE * BOARD_SIZE
+NUM_POSITIONS = NUM_CELLS**3  # of agent, tool and food together
+ROW_SLOT_BITS = 16  # of a hash, in the table that `group_rows` looks up
+REMEMBERED_BYTES = 2**26  # by one `map_rows`; changes speed, not results
 
 
 class RowFn(Protocol):
@@ -43,12 +51,6 @@ class RowFn(Protocol):
           there is nothing to remember.
         """
         ...
-
-
-NUM_CELLS = BOARD_SIZE * BOARD_SIZE
-NUM_POSITIONS = NUM_CELLS**3  # of agent, tool and food together
-ROW_SLOT_BITS = 16
-REMEMBERED_ROWS = 2048
 
 
 class Groups(NamedTuple):
@@ -132,8 +134,8 @@ def cells_at(position: jax.Array) -> jax.Array:
 def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
     """`fn` on the first `count` rows, a chunk at a time; zeros below.
 
-    Differentiable with respect to `params` only. What `fn` wants remembered of the first
-    `REMEMBERED_ROWS` is; for the others the derivative calls it once more.
+    Differentiable with respect to `params` only. What `fn` wants remembered is, as far as
+    `REMEMBERED_BYTES` go; for the rows after that, the derivative calls it once more.
 
     Args:
       fn: see `RowFn`.
@@ -159,11 +161,13 @@ def _map_rows_forward(
     num_rows = len(jax.tree.leaves(rows)[0])
     padded = _pad_rows(rows, chunk)
     num_chunks = len(jax.tree.leaves(padded)[0]) // chunk
-    num_remembered = min(-(-REMEMBERED_ROWS // chunk), num_chunks)
+    shapes = jax.eval_shape(fn, params, _take(padded, 0, chunk), None)
+    num_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes[1]))
+    num_remembered = min(REMEMBERED_BYTES // max(num_bytes, 1), num_chunks)
 
     def body(index: jax.Array, outputs: tuple[Any, Any]) -> tuple[Any, Any]:
         results = fn(params, _take(padded, index, chunk), None)
-        # The place after the last is written by all chunks that are not remembered.
+        # One more place than is remembered, for all chunks that are not.
         places = (index, jnp.minimum(index, num_remembered))
         return tuple(
             jax.tree.map(lambda all_of, new, place=place: all_of.at[place].set(new), *both)
@@ -173,7 +177,6 @@ def _map_rows_forward(
     def empty(length: int, leaf: jax.ShapeDtypeStruct) -> jax.Array:
         return jnp.zeros((length, *leaf.shape), leaf.dtype)
 
-    shapes = jax.eval_shape(fn, params, _take(padded, 0, chunk), None)
     outputs = tuple(
         jax.tree.map(functools.partial(empty, length), shape)
         for length, shape in zip((num_chunks, num_remembered + 1), shapes, strict=True)
@@ -188,15 +191,14 @@ def _map_rows_backward(
 ) -> tuple[Any, None, None]:
     params, rows, count, memory = residuals
     rows, cotangent = _pad_rows((rows, cotangent), chunk)
+    num_remembered = min((len(kept) - 1 for kept in jax.tree.leaves(memory)), default=math.inf)
 
     def body(index: jax.Array, gradient: Any) -> Any:
         part = _take(rows, index, chunk)
-        remembered = memory
-        if memory is not None:
+        remembered = jax.tree.map(lambda kept: kept[index], memory)
+        if num_remembered < len(jax.tree.leaves(rows)[0]) // chunk:
             remembered = jax.lax.cond(
-                index < len(jax.tree.leaves(memory)[0]) - 1,
-                lambda: jax.tree.map(lambda kept: kept[index], memory),
-                lambda: fn(params, part, None)[1],
+                index < num_remembered, lambda: remembered, lambda: fn(params, part, None)[1]
             )
         _, pullback = jax.vjp(lambda p: fn(p, part, remembered)[0], params)
         (contribution,) = pullback(_take(cotangent, index, chunk))

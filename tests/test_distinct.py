@@ -91,7 +91,7 @@ def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
 @pytest.mark.parametrize("chunk", [1, 8, 37, 64])
 @pytest.mark.parametrize("count", [0, 1, 8, 9, ROWS])
 def test_map_rows_and_its_gradient(problem, fn, chunk, count, monkeypatch):
-    monkeypatch.setattr(distinct, "REMEMBERED_ROWS", 16)
+    monkeypatch.setattr(distinct, "REMEMBERED_BYTES", 16 * 4 * WIDTH)
     params, rows, cotangent = problem
     valid = (jnp.arange(ROWS) < count)[:, None]
 

@@ -44,9 +44,9 @@ def parameters(observation: jax.Array) -> dict:
     return draw(jax.random.key(3), deviations)
 
 
-@pytest.mark.parametrize("remembered_rows", [0, 2048])
-def test_windows_give_the_plain_features_and_gradient(observation, remembered_rows, monkeypatch):
-    monkeypatch.setattr(distinct, "REMEMBERED_ROWS", remembered_rows)
+@pytest.mark.parametrize("remembered_bytes", [0, 2**20])
+def test_windows_give_the_plain_features_and_gradient(observation, remembered_bytes, monkeypatch):
+    monkeypatch.setattr(distinct, "REMEMBERED_BYTES", remembered_bytes)
     params = parameters(observation)
     count = jnp.int32(len(observation))
 
