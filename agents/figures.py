@@ -99,20 +99,30 @@ def _save(
 
 
 def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
+    """Every seed as a thin line, and their mean as far as there are all of them."""
     if len(values) > 1:
         for row in values:
-            axis.plot(episodes, row, color=style["color"], linewidth=0.8, alpha=0.35)
-    axis.plot(episodes, np.nanmean(values, axis=0), linewidth=1.6, **style)
+            known = ~np.isnan(row)
+            axis.plot(episodes[known], row[known], color=style["color"], linewidth=0.8, alpha=0.35)
+    shared, values = _of_all_seeds(episodes, values)
+    axis.plot(shared, np.mean(values, axis=0), linewidth=1.6, **style)
 
 
 def _draw_spread(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
     """Mean as a line, one deviation on either side as a band, maximum dotted."""
-    mean, color = np.nanmean(values, axis=0), style["color"]
-    axis.plot(episodes, mean, linewidth=1.6, **style)
+    color = style["color"]
+    shared, complete = _of_all_seeds(episodes, values)
+    mean = np.mean(complete, axis=0)
+    axis.plot(shared, mean, linewidth=1.6, **style)
     if len(values) > 1:
-        seeds = np.sum(~np.isnan(values), axis=0)
-        deviation = np.sqrt(np.nansum((values - mean) ** 2, axis=0) / np.maximum(seeds - 1, 1))
+        deviation = np.std(complete, axis=0, ddof=1)
         axis.fill_between(
-            episodes, mean - deviation, mean + deviation, color=color, alpha=0.2, linewidth=0
+            shared, mean - deviation, mean + deviation, color=color, alpha=0.2, linewidth=0
         )
         axis.plot(episodes, np.nanmax(values, axis=0), color=color, linewidth=0.9, linestyle=":")
+
+
+def _of_all_seeds(episodes: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points at which no seed is missing: a mean of those left says something else."""
+    complete = ~np.isnan(values).any(axis=0)
+    return episodes[complete], values[:, complete]
