@@ -26,7 +26,9 @@ CONFIG = Config(
     chunk=16,
     value_coef=0.5,
     entropy_coef=1e-3,
-    learning_rate=1e-2,
+    learning_rate=5e-3,
+    iterations=ITERATIONS,
+    cooldown=0.7,
 )
 Learner = Callable[[str], tuple[jax.Array, Trajectory]]
 
