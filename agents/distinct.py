@@ -90,7 +90,7 @@ def group_rows(content: jax.Array) -> Groups:
     rows are in one group unless the table names another for them; different ones never are.
     """
     own = jnp.arange(len(content))
-    slot = _hash_rows(content) >> (32 - ROW_SLOT_BITS)
+    slot = slots(content, ROW_SLOT_BITS)
     known = jnp.zeros(2**ROW_SLOT_BITS, jnp.int32).at[slot].max(own)[slot]
     known = jnp.where(jnp.all(content[known] == content, axis=1), known, own)
     first = known == own
@@ -101,6 +101,11 @@ def group_rows(content: jax.Array) -> Groups:
         representative=zeros.at[jnp.where(first, number, len(content))].set(own, mode="drop"),
         total=number[-1] + 1,
     )
+
+
+def slots(content: jax.Array, bits: int) -> jax.Array:
+    """A hash i32[M] of rows integer[M, K], below 2**bits, to look them up in a table by."""
+    return (_hash_rows(content) >> (32 - bits)).astype(jnp.int32)
 
 
 def layout_ids(state: State) -> jax.Array:

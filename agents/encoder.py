@@ -133,8 +133,8 @@ class Conv(nn.Module):
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", hidden_init, shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        x = patches(x, self.size) if not pad else patches(pad_edges(x, self.size), self.size)
-        return self._remember(x @ kernel.reshape(-1, self.features) + as_row(bias, x.ndim))
+        y: Any = convolve(x, kernel) if pad else patches(x, self.size) @ as_matrix(kernel)
+        return self._remember(y + as_row(bias, x.ndim))
 
     def spread(self, x: jax.Array) -> jax.Array:
         """What cells f32[W, C_in] add to each of the cells around, f32[W, k * k * features]."""
@@ -236,11 +236,44 @@ def patches(x: jax.Array, size: int) -> jax.Array:
     return jnp.concatenate(shifts, axis=-1)
 
 
-def pad_edges(x: jax.Array, size: int) -> jax.Array:
-    """Zeros around f32[M, H, W, C] that let a convolution of this size keep H and W."""
+def pad_edges(x: jax.Array, size: int, *, turned: bool = False) -> jax.Array:
+    """Zeros around f32[M, H, W, C] that let a convolution of this size keep H and W.
+
+    Turned, where the size is even, they are more above and to the left.
+    """
     before = (size - 1) // 2
     padding = (before, size - 1 - before)
+    padding = padding[::-1] if turned else padding
     return jnp.pad(x, ((0, 0), padding, padding, (0, 0)))
+
+
+def as_matrix(kernel: jax.Array) -> jax.Array:
+    """f32[k, k, C_in, C_out] to f32[k * k * C_in, C_out], what `patches` are multiplied with."""
+    return kernel.reshape(-1, kernel.shape[-1])
+
+
+@jax.custom_vjp
+def convolve(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """f32[M, H, W, C_in] and f32[k, k, C_in, C_out] to f32[M, H, W, C_out], padded with zeros.
+
+    Both derivatives are made from the patches of the cotangent. JAX, left to itself, would add
+    up k * k overlapping parts for the one and make the patches of x again for the other.
+    """
+    size = len(kernel)
+    return patches(pad_edges(x, size), size) @ as_matrix(kernel)
+
+
+def _convolve_backward(residuals: Any, cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, kernel = residuals
+    size, _, channels, features = kernel.shape
+    turned = kernel[::-1, ::-1].swapaxes(2, 3)
+    around = patches(pad_edges(cotangent, size, turned=True), size)
+    by_kernel = jnp.tensordot(x, around, axes=[(0, 1, 2)] * 2)
+    by_kernel = by_kernel.reshape(channels, size, size, features).transpose(1, 2, 0, 3)
+    return around @ as_matrix(turned), by_kernel[::-1, ::-1]
+
+
+convolve.defvjp(lambda x, kernel: (convolve(x, kernel), (x, kernel)), _convolve_backward)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))

@@ -18,6 +18,8 @@ from trap_tube_jax.environment import Environment
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State
 
+SLOT_BITS = 20  # of an observation's hash, by which episodes remember what they met
+
 ChooseAction = Callable[[jax.Array, Outputs], jax.Array]
 ReplaceAction = Callable[[jax.Array, State, jax.Array], jax.Array]
 
@@ -71,15 +73,18 @@ class Trajectory(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """What has been encoded in each episode so far.
+    """What has been encoded so far.
 
     Attributes:
-      position: i32[T + 1, B], -1 where the future is.
+      position: i32[T + 1, B].
       features: f32[T + 1, B, F].
+      newest: i32[S], by hash of an observation, where above (time * B + episode) it was last
+        met; -1 where it never was. Of observations with the same hash, one is forgotten.
     """
 
     position: jax.Array
     features: jax.Array
+    newest: jax.Array
 
 
 class _Carry(NamedTuple):
@@ -124,8 +129,7 @@ def rollout(
 ) -> Trajectory:
     """Plays one episode from each of B initial states.
 
-    Observations are encoded once each: an episode remembers what it has seen, and what
-    is new is shared between episodes of the same layout.
+    Observations are encoded once each, whichever of the episodes meet them and when.
 
     Args:
       agent: the network.
@@ -143,9 +147,11 @@ def rollout(
 
     def encode(state: State, memory: _Memory, time: jax.Array | int) -> tuple[jax.Array, _Memory]:
         position = jax.vmap(distinct.position_id)(state)
-        known = memory.position == position[None]
-        seen = jnp.any(known, axis=0)
-        recalled = memory.features[jnp.argmax(known, axis=0), jnp.arange(batch)]
+        slot = distinct.slots(jnp.stack([layout_id, position], axis=1), SLOT_BITS)
+        met = memory.newest[slot]
+        same_layout = layout_id[met % batch] == layout_id
+        seen = (met >= 0) & same_layout & (memory.position.reshape(-1)[met] == position)
+        recalled = memory.features.reshape(-1, memory.features.shape[-1])[met]
         groups = distinct.group(seen.astype(jnp.int32), layout_id, position)
         num_new = jnp.max(jnp.where(seen, -1, groups.number)) + 1
         rows = jax.vmap(observe)(state)[groups.representative]
@@ -153,9 +159,12 @@ def rollout(
             agent.encode_rows, chunk, agent.encoding_params(params), rows, num_new
         )
         features = jnp.where(seen[:, None], recalled, new[groups.number])
-        return features, _Memory(
-            memory.position.at[time].set(position), memory.features.at[time].set(features)
+        memory = _Memory(
+            position=memory.position.at[time].set(position),
+            features=memory.features.at[time].set(features),
+            newest=memory.newest.at[slot].max(time * batch + jnp.arange(batch)),
         )
+        return features, memory
 
     def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[_Carry, Any]:
         time, step_key = inputs
@@ -186,8 +195,9 @@ def rollout(
         action_tm1=jnp.zeros((batch, 2), jnp.int32),
         reward_tm1=jnp.zeros(batch),
         memory=_Memory(
-            position=jnp.full((env.max_steps + 1, batch), -1),
+            position=jnp.zeros((env.max_steps + 1, batch), jnp.int32),
             features=jnp.zeros((env.max_steps + 1, batch, width)),
+            newest=jnp.full(2**SLOT_BITS, -1),
         ),
     )
     times = jnp.arange(env.max_steps)

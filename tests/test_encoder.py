@@ -10,7 +10,7 @@ import pytest
 
 import trap_tube_jax as tt
 from agents import distinct
-from agents.encoder import Encoder, cut_into_windows, encode_by_windows
+from agents.encoder import Encoder, convolve, cut_into_windows, encode_by_windows
 from agents.network import draw
 
 EPISODES, STEPS = 3, 6
@@ -65,6 +65,32 @@ def test_windows_give_the_plain_features_and_gradient(observation, remembered_by
     got, want = gradient(by_windows), gradient(plain)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), got, want)
     assert all(np.abs(leaf).max() > 1e-2 for leaf in jax.tree.leaves(want))
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_convolution_and_its_derivatives_are_those_of_jax(size):
+    keys = jax.random.split(jax.random.key(size), 3)
+    x, cotangent = (
+        jax.random.normal(keys[0], (2, 6, 4, 3)),
+        jax.random.normal(keys[1], (2, 6, 4, 5)),
+    )
+    kernel = jax.random.normal(keys[2], (size, size, 3, 5))
+
+    def reference(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        return jax.lax.conv_general_dilated(
+            x,
+            kernel,
+            (1, 1),
+            "SAME",
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            precision="highest",
+        )
+
+    got, pullback = jax.vjp(convolve, x, kernel)
+    want, reference_pullback = jax.vjp(reference, x, kernel)
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
+    for ours, theirs in zip(pullback(cotangent), reference_pullback(cotangent), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
 def test_windows_are_the_parts_of_the_board():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from trap_tube_jax.prng import loop_free, threefry
+from trap_tube_jax.prng import loop_free, split, threefry
 
 # Salmon et al. (2011), known answers of Threefry-2x32 with 20 rounds: key, counter, result.
 KNOWN = [
@@ -50,6 +50,22 @@ def test_other_keys_stay_what_they_are():
     with jax.threefry_partitionable(False):
         key = jax.random.key(0)
         assert loop_free(key) is key
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        jax.random.key(5),
+        jax.random.PRNGKey(5),
+        jax.random.key(5, impl="rbg"),
+        loop_free(jax.random.key(5)),
+    ],
+    ids=["typed", "raw", "rbg", "loop-free"],
+)
+def test_split_gives_the_same_keys_of_the_same_type(key):
+    for ours, theirs in zip(split(key), jax.random.split(key), strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_array_equal(jax.random.key_data(ours), jax.random.key_data(theirs))
 
 
 def test_a_loop_free_key_stays_one():

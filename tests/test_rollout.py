@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, ppo
+from agents import Config, distinct, ppo
 from agents.agent import Agent
 from agents.rollout import Trajectory, rollout, sample_action
 
@@ -61,6 +61,39 @@ def test_every_observation_has_its_own_features(played):
     observations = trajectory.observations()
     plain = jax.vmap(lambda rows: agent.encode(params, rows))(observations)
     np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("env_id", ["base", "st"])
+@pytest.mark.parametrize("bits", [0, 20])
+def test_every_observation_is_encoded_once(env_id, bits, monkeypatch):
+    """Across episodes and times; where hashes collide it may be more often, to the same result."""
+    counts: list[int] = []
+    map_rows = distinct.map_rows
+
+    def counting(fn, chunk, params, rows, count):
+        if not isinstance(rows, tuple):  # as windows are
+            jax.debug.callback(lambda count: counts.append(int(count)), count)
+        return map_rows(fn, chunk, params, rows, count)
+
+    monkeypatch.setattr(distinct, "map_rows", counting)
+    monkeypatch.setattr("agents.rollout.SLOT_BITS", bits)
+    config = Config.from_dict({**CONFIG.to_dict(), "env_id": env_id, "max_steps": 20})
+    env, agent = tt.make(env_id, max_steps=config.max_steps), Agent(config)
+    params = agent.init(jax.random.key(0))
+    layouts, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 3))
+    # Two episodes of each layout, which meet again what the other has met before.
+    initial = jax.tree.map(lambda x: jnp.concatenate([x, x]), layouts)
+    trajectory = rollout(
+        agent, params, env, initial, jax.random.key(2), choose=sample_action, chunk=config.chunk
+    )
+    jax.effects_barrier()
+    plain = jax.vmap(lambda rows: agent.encode(params, rows))(trajectory.observations())
+    np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
+    ids = ppo.observation_ids(trajectory.layout, trajectory.cells)
+    if bits:
+        assert sum(counts) == int(ids.max()) + 1
+    else:
+        assert sum(counts) > int(ids.max()) + 1
 
 
 def test_network_saw_the_episodes_in_order(played):

@@ -36,6 +36,16 @@ def loop_free(key: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(data, impl=_LOOP_FREE)
 
 
+def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The two keys of `jax.random.split`, of the same type as `key`."""
+    pair = jax.random.split(loop_free(key))
+    if pair.dtype != key.dtype:
+        data = jax.random.key_data(pair)
+        raw = key.dtype == jnp.uint32
+        pair = data if raw else jax.random.wrap_key_data(data, impl=jax.random.key_impl(key))
+    return pair[0], pair[1]
+
+
 def threefry(key: jax.Array, high: jax.Array, low: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Threefry-2x32 with 20 rounds: hashes counters of two words, u32[...] each, with u32[2]."""
     words = (key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(PARITY))

@@ -48,13 +48,14 @@ class VectorEnvironment:
     seed with most finished environments needs.)
     """
 
-    def __init__(self, env: Environment, *, chunk_size: int = 128):
+    def __init__(self, env: Environment, *, chunk_size: int = 32):
         """Wraps the environment of one task set.
 
         Args:
           env: the environment; not wrapped in an `AutoReset`.
           chunk_size: how many environments start over at a time, at least 1. Small
-            chunks waste less when few end together, large ones cost less for each.
+            chunks waste less when few end together, and are quick on a CPU; a GPU wants
+            large ones.
 
         Raises:
           ValueError: naming the argument, its value and what is allowed.
@@ -97,17 +98,23 @@ class VectorEnvironment:
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
         def start_chunk(carry):
-            started, old = carry
+            started, (state, picture) = carry
             # The environment at which the count of finished ones reaches its next value;
             # past the last one that is `num_envs`, where writes are dropped.
             ranks = started + 1 + jnp.arange(size, dtype=jnp.int32)
             index = jnp.searchsorted(finished, ranks, method="scan_unrolled")
-            keys = old[0].episodes.key.at[index].get(mode="clip")
-            new = jax.vmap(self._start)(keys)
+            read = lambda rows: rows.at[index].get(mode="clip")  # noqa: E731
             write = lambda into, rows: into.at[index].set(  # noqa: E731
                 rows, mode="drop", indices_are_sorted=True
             )
-            return started + size, jax.tree.map(write, old, new)
+            # What is read back from where it was written is not computed again in each of its
+            # uses, as XLA does with what it fuses.
+            new, _ = jax.vmap(self._auto_reset.reset)(read(state.episodes.key))
+            episodes = jax.tree.map(write, state.episodes, new)
+            inner = jax.tree.map(read, episodes.inner)
+            background = write(state.background, jax.vmap(draw_static)(inner))
+            picture = write(picture, jax.vmap(draw_movable)(inner, read(background)))
+            return started + size, (VectorState(episodes, background), picture)
 
         _, (state, picture) = jax.lax.while_loop(
             lambda carry: carry[0] < finished[num_envs - 1],
@@ -115,12 +122,6 @@ class VectorEnvironment:
             (jnp.int32(0), (state, picture)),
         )
         return state, picture
-
-    def _start(self, key: jax.Array) -> tuple[VectorState, jax.Array]:
-        """One environment's next episode, and its first picture."""
-        episode, _ = self._auto_reset.reset(key)
-        background = draw_static(episode.inner)
-        return VectorState(episode, background), draw_movable(episode.inner, background)
 
 
 def draw_static(state: State) -> jax.Array:

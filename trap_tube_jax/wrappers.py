@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from trap_tube_jax.prng import split
 from trap_tube_jax.state import TimeStep
 
 
@@ -57,7 +58,7 @@ class AutoReset:
 
     def reset(self, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
         """Starts the first episode. See `Environment.reset`."""
-        reset_key, next_key = jax.random.split(key)
+        reset_key, next_key = split(key)
         inner, timestep = self.env.reset(reset_key)
         return AutoResetState(inner, next_key), _auto_reset_timestep(timestep, timestep.observation)
 
