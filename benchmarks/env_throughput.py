@@ -37,7 +37,7 @@ class Arguments:
     sets: tuple[str, ...] = tuple(task_set.short for task_set in tt.PAPER_TASK_SETS)
     num_envs: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384)
     num_steps: int = 100
-    repeats: int = 5
+    repeats: int = 20
     devices: int = 1
     plain: bool = False
     json: pathlib.Path | None = None
