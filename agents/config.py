@@ -58,9 +58,6 @@ class Config:
       agent_rounds: further rounds, which start where the agent has come to.
       restarts: share of a task's episodes that start anywhere that the walks came from to the
         goal; the others start where the task does.
-      coldest: temperature at which the first of a task's episodes are played with `dagger`; it
-        rises to 1 over eight of them, and again. At 0, the greedy play of evaluation is learnt
-        from too, whose loops an agent that draws its actions hardly sees.
       advised: share of a task's episodes in which actions are replaced by advice.
       advice: share of the actions that are, at most; among the advised episodes it rises from
         0 to this.
@@ -108,7 +105,6 @@ class Config:
     walk_steps: int = 50
     agent_rounds: int = 2
     restarts: float = 0.25
-    coldest: float = 1.0
     advised: float = 0.75
     advice: float = 0.9
     dataset: int = 16_384
@@ -246,7 +242,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "walk_steps": (1, 10_000),
     "agent_rounds": (0, 1000),
     "restarts": (0, 1),
-    "coldest": (0, 1),
     "advised": (0, 1),
     "advice": (0, 1),
     "dataset": (1, _INFINITY),
@@ -288,7 +283,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "task_sets": ("pst", "pstsy"),
         "tasks": 32,
         "walkers": 1024,
-        "coldest": 0.0,
         "dataset": 32_768,
         "encoder": "objects",
         "filters": (64, 64),

@@ -42,8 +42,6 @@ from trap_tube_jax.state import State
 
 IMPOSSIBLE = -1e9  # a log-probability
 ACTIONS = np.arange(NUM_ACTIONS)
-TEMPERATURES = 8  # from `coldest` to 1, among the episodes of a task
-COLD = 1e-6  # a temperature that is all but greedy
 
 
 class Lesson(NamedTuple):
@@ -279,8 +277,6 @@ def play(
     num_restarts = round(config.restarts * number)
     advised = jnp.tile(advised_share(config), config.tasks)
     own_advised = shards.part(advised)
-    own_temperature = shards.part(jnp.tile(temperature(config), config.tasks))
-    draw = shards.drawing(sample_action)
     task = jnp.repeat(jnp.arange(len(walks)), number)
 
     def starts(atlas: Atlas, key: jax.Array) -> State:
@@ -319,7 +315,7 @@ def play(
         env,
         initial,
         play_key,
-        choose=lambda key, outputs: draw(key, cooled(outputs, own_temperature)),
+        choose=shards.drawing(sample_action),
         chunk=config.chunk,
         replace=replace,
     )
@@ -392,21 +388,6 @@ def advised_share(config: Config) -> jax.Array:
     alone = max(round((1 - config.advised) * number), 1)
     rank = jnp.maximum(jnp.arange(number) - (alone - 1), 0)
     return config.advice * rank / max(number - alone, 1)
-
-
-def temperature(config: Config) -> jax.Array:
-    """f32[episodes of a task]: by what the logits are divided before actions are drawn."""
-    number = config.episodes // config.tasks
-    cycle = jnp.arange(number) % TEMPERATURES / (TEMPERATURES - 1)
-    return config.coldest + (1 - config.coldest) * cycle
-
-
-def cooled(outputs: Outputs, temperature: jax.Array) -> Outputs:
-    """The outputs of B episodes with their logits divided by f32[B]."""
-    divisor = jnp.maximum(temperature, COLD)[:, None]
-    return outputs._replace(
-        grasp_logits=outputs.grasp_logits / divisor, move_logits=outputs.move_logits / divisor
-    )
 
 
 def optimize(

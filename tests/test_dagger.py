@@ -10,19 +10,8 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.agent import Agent
-from agents.dagger import (
-    Dataset,
-    Lesson,
-    advised_share,
-    chart,
-    cooled,
-    joint_log_probs,
-    loss,
-    play,
-    temperature,
-)
+from agents.dagger import Dataset, Lesson, advised_share, chart, joint_log_probs, loss, play
 from agents.network import Outputs
-from agents.rollout import greedy_action, sample_action
 
 CONFIG = Config(
     env_id="sy", method="dagger", max_steps=20, episodes=32, minibatch=8, epochs=1, tasks=4,
@@ -52,28 +41,6 @@ def test_the_share_of_advice_rises_over_the_episodes_of_a_task():
     assert share[-1] == pytest.approx(0.9)
     never = advised_share(Config.preset("best", advised=0.0))
     assert (np.asarray(never) == 0).all()
-
-
-def test_episodes_of_a_task_are_played_from_cold_to_warm():
-    cycle = np.asarray(temperature(Config.preset("best", coldest=0.3))).reshape(4, 8)
-    np.testing.assert_allclose(cycle[:, [0, 7]], [[0.3, 1.0]] * 4, rtol=1e-6)
-    assert (np.diff(cycle, axis=1) > 0).all()
-    assert (np.asarray(temperature(Config.preset("best", coldest=1.0))) == 1).all()
-
-
-def test_the_coldest_play_is_greedy():
-    keys = jax.random.split(jax.random.key(0), 4)
-    outputs = Outputs(
-        grasp_logits=jax.random.normal(keys[0], (64, 4)),
-        move_logits=jax.random.normal(keys[1], (64, 4)),
-        value=jnp.zeros(64),
-    )
-    drawn = sample_action(keys[2], outputs)
-    greedy = greedy_action(keys[2], outputs)
-    assert (drawn != greedy).any()
-    cold = jnp.arange(64) % 2 == 0
-    mixed = sample_action(keys[2], cooled(outputs, 1.0 - cold))
-    np.testing.assert_array_equal(mixed, jnp.where(cold[:, None], greedy, drawn))
 
 
 def test_episodes_of_a_task_are_neighbours_and_the_last_ones_start_elsewhere(played):
