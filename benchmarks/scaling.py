@@ -122,7 +122,7 @@ def save_figure(points: Sequence[Point], path: pathlib.Path) -> None:
         quantity, _, over = TITLES[kind].partition(" over ")
         top.set(title=quantity)
         bottom.set(xlabel=over.partition(",")[0], xscale="log")
-        bottom.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        bottom.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=45, ha="right")
         bottom.minorticks_off()
         for axis in (top, bottom):
             axis.set_ylim(bottom=0)
