@@ -1,12 +1,21 @@
-"""Programs for accelerators, of which the machine that runs the tests may have none."""
+"""Programs for accelerators, of which the machine that runs the tests may have none.
 
-from typing import Any
+All are lowered for CUDA and TPU. After `pip install 'jax[cuda12]'`, `JAX_PLATFORMS=cpu pytest -m
+slow tests/test_platforms.py` has XLA compile them for an H200, which need not be there. Neither
+runs them.
+"""
+
+from typing import Any, get_args
 
 import jax
+import jax.numpy as jnp
 import pytest
+from jax.experimental import topologies
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import trap_tube_jax as tt
 from agents import Config, make_train
+from agents.config import Curiosity
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 TINY = Config(
@@ -17,6 +26,36 @@ DAGGER = {
     "method": "dagger", "curiosity": "none", "encoder": "objects", "tasks": 2, "walkers": 4,
     "walk_rounds": 1, "walk_steps": 4, "agent_rounds": 1, "dataset": 8,
 }  # fmt: skip
+CURIOSITIES = get_args(Curiosity)
+# What XLA wants to know of a GPU that it cannot ask.
+H200 = """
+platform_name: "CUDA"
+device_description_str: "NVIDIA H200"
+runtime_version { major: 12 minor: 9 patch: 0 }
+dnn_version_info { major: 9 minor: 8 }
+gpu_device_info {
+  cuda_compute_capability { major: 9 }
+  core_count: 132
+  fpus_per_core: 128
+  clock_rate_ghz: 1.98
+  memory_bandwidth: 4800000000000
+  device_memory_size: 150000000000
+  l2_cache_size: 52428800
+  threads_per_warp: 32
+  threads_per_block_limit: 1024
+  threads_per_core_limit: 2048
+  block_dim_limit_x: 2147483647
+  block_dim_limit_y: 65535
+  block_dim_limit_z: 65535
+  registers_per_block_limit: 65536
+  registers_per_core_limit: 65536
+  shared_memory_per_block: 49152
+  shared_memory_per_block_optin: 232448
+  shared_memory_per_core: 233472
+}
+"""
+# No measuring of alternatives, and no kernels that cannot be had without it.
+NOTHING_MEASURED = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}
 
 
 def lowered_for(function: Any, *arguments: Any) -> tuple[str, ...]:
@@ -38,3 +77,50 @@ def test_training_lowers_for_accelerators(settings):
     train = make_train(Config.from_dict({**TINY, **settings}))
     state = jax.eval_shape(train.init, jax.random.key(0))
     assert lowered_for(train.iterate, state) == PLATFORMS
+
+
+@pytest.fixture(scope="module")
+def gpu() -> Mesh:
+    """One H200 to compile for."""
+    try:
+        described = topologies.get_topology_desc(
+            "h200", "cuda", target_config=H200, topology="1x1x1"
+        )
+    except NotImplementedError:
+        pytest.skip("needs jax[cuda12], and JAX_PLATFORMS=cpu where there is no driver")
+    return topologies.make_mesh(described, (1,), ("gpu",))
+
+
+def machine_code(gpu: Mesh, function: Any, *arguments: Any) -> str | None:
+    there = NamedSharding(gpu, PartitionSpec())
+    arguments = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=there), arguments
+    )
+    return jax.jit(function).lower(*arguments).compile(NOTHING_MEASURED).as_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["base", "pstsy"])
+def test_the_environment_compiles_for_a_gpu(gpu, name):
+    env = tt.make(name)
+    vector = tt.VectorEnvironment(env)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 64))
+    actions = jax.ShapeDtypeStruct((64, 2), jnp.int32)
+    for reset, step in ((jax.vmap(env.reset), jax.vmap(env.step)), (vector.reset, vector.step)):
+        states, _ = jax.eval_shape(reset, keys)
+        assert machine_code(gpu, reset, keys)
+        assert machine_code(gpu, step, states, actions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [DAGGER, {"imitation_coef": 1.0}, *({"curiosity": name} for name in CURIOSITIES)],
+    ids=["dagger", "imitation", *CURIOSITIES],
+)
+def test_training_compiles_for_a_gpu(gpu, settings):
+    train = make_train(Config.from_dict({**TINY, **settings}))
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 2))
+    states = jax.eval_shape(jax.vmap(train.init), keys)
+    assert machine_code(gpu, jax.vmap(train.init), keys)
+    assert machine_code(gpu, jax.vmap(train.iterate), states)  # two seeds side by side
