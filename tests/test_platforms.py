@@ -1,7 +1,7 @@
 """Programs for accelerators, of which the machine that runs the tests may have none.
 
 All are lowered for CUDA and TPU. After `pip install 'jax[cuda12]'`, `JAX_PLATFORMS=cpu pytest -m
-slow tests/test_platforms.py` has XLA compile them for an H200, which need not be there. Neither
+slow tests/test_platforms.py` has XLA compile them for H200 GPUs, which need not be there. Neither
 runs them.
 """
 
@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.experimental import topologies
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -16,6 +17,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.config import Curiosity
+from agents.session import make_advance
+from agents.sharding import EPISODES, SEEDS, Placement
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 TINY = Config(
@@ -80,36 +83,38 @@ def test_training_lowers_for_accelerators(settings):
 
 
 @pytest.fixture(scope="module")
-def gpu() -> Mesh:
-    """One H200 to compile for."""
+def gpus() -> list[Any]:
+    """Four H200 to compile for."""
     try:
-        described = topologies.get_topology_desc(
-            "h200", "cuda", target_config=H200, topology="1x1x1"
-        )
+        return topologies.get_topology_desc(
+            "h200", "cuda", target_config=H200, topology="1x1x4"
+        ).devices
     except NotImplementedError:
         pytest.skip("needs jax[cuda12], and JAX_PLATFORMS=cpu where there is no driver")
-    return topologies.make_mesh(described, (1,), ("gpu",))
 
 
-def machine_code(gpu: Mesh, function: Any, *arguments: Any) -> str | None:
-    there = NamedSharding(gpu, PartitionSpec())
-    arguments = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=there), arguments
+def machine_code(sharding: NamedSharding, function: Any, *arguments: Any) -> str | None:
+    there = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), arguments
     )
-    return jax.jit(function).lower(*arguments).compile(NOTHING_MEASURED).as_text()
+    return jax.jit(function).lower(*there).compile(NOTHING_MEASURED).as_text()
+
+
+def on_one(gpus: list[Any]) -> NamedSharding:
+    return NamedSharding(Mesh(np.array(gpus[:1]), "gpu"), PartitionSpec())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["base", "pstsy"])
-def test_the_environment_compiles_for_a_gpu(gpu, name):
+def test_the_environment_compiles_for_a_gpu(gpus, name):
     env = tt.make(name)
     vector = tt.VectorEnvironment(env)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 64))
     actions = jax.ShapeDtypeStruct((64, 2), jnp.int32)
     for reset, step in ((jax.vmap(env.reset), jax.vmap(env.step)), (vector.reset, vector.step)):
         states, _ = jax.eval_shape(reset, keys)
-        assert machine_code(gpu, reset, keys)
-        assert machine_code(gpu, step, states, actions)
+        assert machine_code(on_one(gpus), reset, keys)
+        assert machine_code(on_one(gpus), step, states, actions)
 
 
 @pytest.mark.slow
@@ -118,9 +123,27 @@ def test_the_environment_compiles_for_a_gpu(gpu, name):
     [DAGGER, {"imitation_coef": 1.0}, *({"curiosity": name} for name in CURIOSITIES)],
     ids=["dagger", "imitation", *CURIOSITIES],
 )
-def test_training_compiles_for_a_gpu(gpu, settings):
+def test_training_compiles_for_a_gpu(gpus, settings):
     train = make_train(Config.from_dict({**TINY, **settings}))
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 2))
     states = jax.eval_shape(jax.vmap(train.init), keys)
-    assert machine_code(gpu, jax.vmap(train.init), keys)
-    assert machine_code(gpu, jax.vmap(train.iterate), states)  # two seeds side by side
+    assert machine_code(on_one(gpus), jax.vmap(train.init), keys)
+    assert machine_code(on_one(gpus), jax.vmap(train.iterate), states)  # two seeds side by side
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [{}, DAGGER], ids=["icm", "dagger"])
+def test_training_compiles_for_several_gpus(gpus, settings):
+    mesh = Mesh(np.array(gpus).reshape(2, 2), (SEEDS, EPISODES))
+    placement = Placement(mesh)
+    config = Config.from_dict({**TINY, **settings})
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 4))
+    states = jax.eval_shape(jax.vmap(make_train(config).init), keys)
+    train = make_train(config, shards=placement.episodes)
+    advance = placement.shard(make_advance(train, placement.local_seeds(4)))
+    code = machine_code(
+        NamedSharding(mesh, PartitionSpec(SEEDS)), advance, states, jax.ShapeDtypeStruct((4,), bool)
+    )
+    assert code is not None
+    assert "all-reduce" in code  # the gradients' mean
+    assert "all-gather" in code  # the episodes
