@@ -7,6 +7,8 @@ import dataclasses
 import difflib
 from typing import Any, Literal, Self, get_args
 
+from trap_tube_jax.objects import NUM_ACTIONS
+
 Curiosity = Literal["icm", "icm-detached", "rnd", "counts", "none"]
 EncoderName = Literal["paper", "objects"]
 Method = Literal["ppo", "dagger"]
@@ -203,13 +205,22 @@ class Config:
         """The largest number of environment steps of one iteration."""
         return self.episodes * self.max_steps
 
-    @property
-    def steps_walked(self) -> int:
-        """The environment steps of one iteration's random walks."""
+    def environment_steps(self, iterations: int, transitions: int) -> int:
+        """All steps of the environment that so much training takes.
+
+        Where `dagger` plays, all actions are tried in every state that the agent comes to, to
+        see which one brings it nearer; what the agent does is one of them. Random walks come on
+        top.
+
+        Args:
+          iterations: how many.
+          transitions: steps of the agent in these.
+        """
         if self.method != "dagger":
-            return 0
+            return transitions
         rounds = self.walk_rounds + self.agent_rounds
-        return self.tasks * self.walkers * rounds * self.walk_steps
+        walked = self.tasks * self.walkers * rounds * self.walk_steps
+        return iterations * walked + NUM_ACTIONS * transitions
 
 
 _CHOICES = {"curiosity": Curiosity, "encoder": EncoderName, "method": Method}

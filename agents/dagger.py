@@ -257,7 +257,8 @@ def play(
 ) -> tuple[Lesson, Metrics]:
     """Plays every task many times, from its start and elsewhere, with and without advice.
 
-    The walks go on from where the agent has come to before they say what would have been right.
+    The walks go on from where the agent has come to, and its episodes count among them, before
+    they say what would have been right.
 
     Args:
       agent: the network.
@@ -357,7 +358,7 @@ def go_on(
     key: jax.Array,
     config: Config,
 ) -> Atlas:
-    """The atlas of a task after further walks from where the agent has been.
+    """The atlas of a task after the agent's episodes, and walks from where they have been.
 
     Args:
       env: the dynamics.
@@ -369,13 +370,13 @@ def go_on(
       config: the number of walkers, their rounds and the steps of a round.
     """
     if not config.agent_rounds:
-        return Atlas.of(task, walks)
+        return Atlas.of(task, walks, positions.T)
     keys = jax.random.split(key, 3)
     number = config.agent_rounds * config.walkers
     episode = jax.random.randint(keys[0], (number,), 0, len(positions))
     time = (jax.random.uniform(keys[1], (number,)) * length[episode]).astype(jnp.int32)
     further = walk(env, task, positions[episode, time], keys[2], config.walk_steps)
-    return Atlas.of(task, jnp.concatenate([walks, further], axis=1))
+    return Atlas.of(task, walks, further, positions.T)
 
 
 def advised_share(config: Config) -> jax.Array:

@@ -29,7 +29,7 @@ from trap_tube_jax.state import State
 # A walk repeats its grasp and its direction with these probabilities: a tool is moved by
 # holding on to it.
 GRASP_PERSISTENCE, MOVE_PERSISTENCE = 0.97, 0.6
-CONTENDERS = 64  # states seen, of which the one with the fewest visits starts the next walk
+CONTENDERS = 64  # states seen, of which the rarest starts the next walk
 SWEEPS = 3
 UNKNOWN = 255
 
@@ -47,9 +47,9 @@ class Atlas(NamedTuple):
     steps: jax.Array
 
     @staticmethod
-    def of(task: State, walks: jax.Array) -> "Atlas":
-        """What the walks i32[T + 1, W] in a task, positions by time, have seen of it."""
-        return Atlas(task, shortest_ways(walks))
+    def of(task: State, *walks: jax.Array) -> "Atlas":
+        """What walks in a task, each array i32[T + 1, W] positions by time, have seen of it."""
+        return Atlas(task, shortest_ways(*walks))
 
     def sample(self, key: jax.Array, number: int) -> State:
         """States from which a way to the goal is known, [number], uniformly.
@@ -74,7 +74,9 @@ class Atlas(NamedTuple):
 
 
 def explore(env: Environment, task: State, key: jax.Array, config: Config) -> jax.Array:
-    """Walks about in a task, round after round from where few have been.
+    """Walks about in a task, round after round from where tool and food have rarely been.
+
+    The agent gets anywhere by itself. What it takes walks to find out is what can be moved where.
 
     Args:
       env: the dynamics.
@@ -96,18 +98,18 @@ def explore(env: Environment, task: State, key: jax.Array, config: Config) -> ja
         walk_key, choice_key = jax.random.split(key)
         walked = walk(env, task, start, walk_key, config.walk_steps)
         seen = seen.at[number].set(walked)
-        visits = visits.at[walked.reshape(-1)].add(1)
+        visits = visits.at[_moved(walked.reshape(-1))].add(1)
         # Only rounds up to this one have been walked.
         drawn = jax.random.randint(choice_key, (CONTENDERS, walkers), 0, (number + 1) * walked.size)
         contender = seen.reshape(-1)[drawn]
-        score = jnp.where(is_goal(contender), jnp.iinfo(jnp.int32).max, visits[contender])
+        score = jnp.where(is_goal(contender), jnp.iinfo(jnp.int32).max, visits[_moved(contender)])
         chosen = jnp.argmin(score, axis=0)
         start = jnp.take_along_axis(contender, chosen[None], axis=0)[0]
         return (seen, visits, start), None
 
     nothing = (
         jnp.zeros(shape, jnp.int32),
-        jnp.zeros(distinct.NUM_POSITIONS, jnp.int32),
+        jnp.zeros(distinct.NUM_CELLS**2, jnp.int32),
         jnp.broadcast_to(distinct.position_id(task), walkers),
     )
     (seen, _, _), _ = jax.lax.scan(
@@ -174,19 +176,26 @@ def _draw_actions(key: jax.Array, number: int) -> jax.Array:
     return jax.random.randint(key, (number, 2), 0, NUM_DIRECTIONS)
 
 
+def _moved(position: jax.Array) -> jax.Array:
+    """i32[...]: where tool and food are, by `distinct.position_id`."""
+    return position % distinct.NUM_CELLS**2
+
+
 def is_goal(position: jax.Array) -> jax.Array:
     """bool[...]: whether agent and food share a cell, by `distinct.position_id`."""
     return position // distinct.NUM_CELLS**2 == position % distinct.NUM_CELLS
 
 
-def shortest_ways(walks: jax.Array) -> jax.Array:
-    """u8[144^3]: steps to the goal over walks i32[T + 1, W]: V(s) = min(V(s), 1 + V(s')).
+def shortest_ways(*walks: jax.Array) -> jax.Array:
+    """u8[144^3]: steps to the goal over walks, i32[T + 1, W] each: V(s) = min(V(s), 1 + V(s')).
 
     Each sweep goes back in time, so that what is known at the end of a walk reaches its
     beginning at once; further sweeps carry it over to walks that were met.
     """
-    goals = jnp.where(is_goal(walks[-1]), walks[-1], distinct.NUM_POSITIONS)
-    steps = jnp.full(distinct.NUM_POSITIONS, UNKNOWN, jnp.uint8).at[goals].set(0, mode="drop")
+    steps = jnp.full(distinct.NUM_POSITIONS, UNKNOWN, jnp.uint8)
+    for last in (walk[-1] for walk in walks):
+        goals = jnp.where(is_goal(last), last, distinct.NUM_POSITIONS)
+        steps = steps.at[goals].set(0, mode="drop")
 
     def back(steps: jax.Array, transition: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         before, after = transition
@@ -194,5 +203,6 @@ def shortest_ways(walks: jax.Array) -> jax.Array:
         return steps.at[before].min(beyond + (beyond < UNKNOWN - 1).astype(jnp.uint8)), None
 
     for _ in range(SWEEPS):
-        steps, _ = jax.lax.scan(back, steps, (walks[:-1], walks[1:]), reverse=True)
+        for walk in walks:
+            steps, _ = jax.lax.scan(back, steps, (walk[:-1], walk[1:]), reverse=True)
     return steps

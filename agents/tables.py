@@ -169,9 +169,12 @@ def cost_table(record: Record) -> Table:
     """How long the training was."""
     everything = [entry["aggregate"] for entry in record["algorithms"]]
     whole = any(found.get("process_seconds") for found in everything)
-    walked = any((found.get("steps_walked") or {}).get("mean") for found in everything)
+    steps = [
+        (found.get("environment_steps") or found["transitions"])["mean"] for found in everything
+    ]
+    walked = steps != [found["transitions"]["mean"] for found in everything]
     rows = []
-    for entry, found in zip(record["algorithms"], everything, strict=True):
+    for entry, found, all_steps in zip(record["algorithms"], everything, steps, strict=True):
         iterations = sorted({run["iterations"] for run in entry["runs"]})
         cells = [
             _label(record, entry),
@@ -180,14 +183,14 @@ def cost_table(record: Record) -> Table:
             f"{found['transitions']['mean']:,.0f}",
         ]
         if walked:
-            cells.append(f"{(found.get('steps_walked') or {'mean': 0})['mean']:,.0f}")
+            cells.append(f"{all_steps:,.0f}")
         cells.append(duration(found["training_seconds"]["mean"]))
         if whole:
             process = found.get("process_seconds")
             cells.append(duration(process["mean"]) if process else NOTHING)
         rows.append(tuple(cells))
     heads = ["algorithm", "trials", "iterations", "transitions"]
-    heads += ["random walks' steps"] * walked + ["training time"] + ["with start-up"] * whole
+    heads += ["environment steps"] * walked + ["training time"] + ["with start-up"] * whole
     return Table("What a trial took, on average", tuple(heads), tuple(rows))
 
 

@@ -10,7 +10,18 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.agent import Agent
-from agents.dagger import Dataset, Lesson, advised_share, chart, joint_log_probs, loss, play
+from agents.dagger import (
+    Dataset,
+    Lesson,
+    advised_share,
+    chart,
+    go_on,
+    joint_log_probs,
+    loss,
+    play,
+)
+from agents.distinct import position_id
+from agents.explore import UNKNOWN
 from agents.network import Outputs
 
 CONFIG = Config(
@@ -71,6 +82,21 @@ def test_advice_that_is_always_followed_solves_the_task(played):
     assert (known[over] == 0).all()
     assert (right & ~known == 0).all()
     assert (right != known).any()
+
+
+def test_what_the_agent_has_done_is_known_too():
+    """The shortest plan, played with no walk that ever leaves the start."""
+    task, plan = tt.base_state(), tt.solve(tt.base_state())
+    states = [task]
+    for action in plan.actions:
+        states.append(tt.Environment().step(states[-1], jnp.asarray(action))[0])
+    episode = jnp.stack([position_id(state) for state in states])
+    walks = jnp.broadcast_to(episode[0], (5, 3))
+    config = Config.from_dict({**CONFIG.to_dict(), "agent_rounds": 0})
+    env, length = tt.Environment(), jnp.array([plan.length])
+    atlas = go_on(env, task, walks, episode[None], length, jax.random.key(0), config)
+    assert np.asarray(atlas.steps)[episode].tolist() == list(range(plan.length, -1, -1))
+    assert (np.asarray(atlas.steps) != UNKNOWN).sum() == plan.length + 1
 
 
 def test_the_dataset_replaces_its_oldest_episodes(played):

@@ -46,6 +46,17 @@ def successors(states: tt.State) -> tt.State:
     return step(states, actions)[0]
 
 
+def test_walks_start_where_tool_and_food_have_rarely_been():
+    config = Config.preset("best", walkers=64, walk_rounds=8)
+    task = tt.base_state()
+    walks = jax.jit(lambda key: explore(tt.Environment(), task, key, config))(jax.random.key(2))
+    moved = np.asarray(walks).reshape(51, 8, 64) % distinct.NUM_CELLS**2
+    visits = np.bincount(moved[:, :-1].reshape(-1), minlength=distinct.NUM_CELLS**2)
+    assert (moved[0, 0] == moved[0, 0, 0]).all()  # the first round starts where the task does
+    drawn = visits[moved[:, :-1]]  # of states drawn without choosing
+    assert np.median(visits[moved[0, -1]]) < np.median(drawn) / 10
+
+
 def test_positions_are_inverted():
     numbers = jnp.array([0, 1, 143, 144, 20_735, 20_736, distinct.NUM_POSITIONS - 1])
     state = tt.base_state()
@@ -141,6 +152,13 @@ def test_sweeps_find_the_shortest_way_over_several_walks():
     found = np.asarray(shortest_ways(walks)).astype(int)
     assert found[[GOAL, 3, 5, 4, 2, 1]].tolist() == [0, 1, 2, 3, 2, 3]
     assert np.flatnonzero(found != UNKNOWN).tolist() == [1, 2, 3, 4, 5, GOAL]
+
+
+def test_ways_go_from_walks_of_one_length_over_to_those_of_another():
+    walks, others = jnp.array([[1], [2], [3]]), jnp.array([[4, 8], [2, 8], [GOAL, 8], [GOAL, 8]])
+    found = np.asarray(shortest_ways(walks, others)).astype(int)
+    assert found[[GOAL, 2, 1, 4]].tolist() == [0, 1, 2, 2]
+    assert (found[[3, 8]] == UNKNOWN).all()
 
 
 def test_steps_stay_below_unknown():
