@@ -45,7 +45,7 @@ def played() -> tuple[Lesson, dict]:
 
 
 def test_the_share_of_advice_rises_over_the_episodes_of_a_task():
-    share = np.asarray(advised_share(Config.preset("best")))
+    share = np.asarray(advised_share(Config.preset("best", tasks=32)))
     assert share.shape == (32,)
     assert share[:8].tolist() == [0.0] * 8
     assert (np.diff(share[7:]) > 0).all()

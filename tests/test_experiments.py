@@ -411,7 +411,7 @@ def test_tables_hold_means_and_deviations(tmp_path):
 
 
 def test_walks_and_the_search_for_advice_are_counted():
-    config = Config.preset("best")
+    config = Config.preset("best", tasks=32, walkers=1024)
     walked = 32 * 1024 * 10 * 50
     assert config.environment_steps(3, 1000) == 3 * walked + 16 * 1000
     assert Config().environment_steps(3, 1000) == 1000
