@@ -7,10 +7,11 @@ its actions are now and then replaced by what the atlas advises, so that early o
 something to see beyond the start. Episodes of many iterations are kept and learnt from again.
 
 The atlas is nothing that an agent could not have found out by itself: it is made of steps in
-the environment, and knows only what they came across. The agent sees none of it, neither in
-its observations nor as a reward. It has to tell from observations what to do, and where they do
-not say (which opening is the exit), to try and to remember: the atlas knows that, the agent
-does not, and learns what is right on average until its own attempts have shown more.
+the environment, and knows only what they came across; `Config.environment_steps` counts them
+all. The agent sees none of it, neither in its observations nor as a reward. It has to tell from
+observations what to do, and where they do not say (which opening is the exit), to try and to
+remember: the atlas knows that, the agent does not, and learns what is right on average until its
+own attempts have shown more.
 
 Source: Ross, Gordon and Bagnell (2011), with Anthony, Tian and Barber (2017)'s idea that the
 expert be the learner's own search.
