@@ -19,13 +19,14 @@ import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import checkpoint, compilation_cache, pretrained, report
-from agents.agent import Agent, Params, Policy
+from agents import pretrained
+from agents.acting.rollout import greedy_action, rollout
 from agents.config import Config
-from agents.metrics import Optimality, Score
-from agents.rollout import greedy_action, rollout
-from agents.run_folder import RunFolder, write_json
-from agents.sharding import ALONE, DEFAULT_DEVICE, Placement, Shards
+from agents.networks.agent import Agent, Params, Policy
+from agents.parallel.sharding import ALONE, DEFAULT_DEVICE, Placement, Shards
+from agents.runs import checkpoint, compilation_cache, report
+from agents.runs.folder import RunFolder, write_json
+from agents.runs.metrics import Optimality, Score
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.registry import PAPER_TASK_SETS

@@ -13,11 +13,12 @@ import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import compilation_cache, processes
 from agents.config import PRESETS, Config
-from agents.run_folder import Run, RunFolder, write_json
-from agents.session import Session, Stopped, StopSignals
-from agents.sharding import Placement
+from agents.parallel import processes
+from agents.parallel.sharding import Placement
+from agents.runs import compilation_cache
+from agents.runs.folder import Run, RunFolder, write_json
+from agents.runs.session import Session, Stopped, StopSignals
 
 PROGRAM = "python -m agents.train"
 # Settings that do not shape what has been trained so far.

@@ -1,9 +1,10 @@
 """The methods of training by name."""
 
-from agents import dagger, ppo
 from agents.config import Config
-from agents.method import Train
-from agents.sharding import ALONE, Shards
+from agents.dagger import learner as dagger
+from agents.parallel.sharding import ALONE, Shards
+from agents.ppo import learner as ppo
+from agents.ppo.method import Train
 from trap_tube_jax.environment import Environment
 
 TrainState = ppo.TrainState | dagger.TrainState

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from agents.machine import machine
+from agents.runs.machine import machine
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import tyro
 
-from agents import tables
+from agents.experiments import tables
 
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"(?P<start><!-- table: (?P<name>\S+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)

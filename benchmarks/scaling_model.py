@@ -24,12 +24,12 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from agents.acting.rollout import rollout, sample_action
 from agents.config import PRESETS, Config
-from agents.network import Outputs
-from agents.ppo import make_train, prepare
-from agents.rollout import rollout, sample_action
-from agents.session import make_advance
-from agents.sharding import Placement
+from agents.networks.core import Outputs
+from agents.parallel.sharding import Placement
+from agents.ppo.learner import make_train, prepare
+from agents.runs.session import make_advance
 from benchmarks import harness
 from trap_tube_jax.objects import NUM_DIRECTIONS
 

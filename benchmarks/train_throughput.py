@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 from agents import Config, make_train
-from agents.agent import Params
+from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.config import PRESETS
-from agents.ppo import Batch, Train, TrainState, encode_episodes, make_optimizer, prepare
-from agents.rollout import Trajectory, rollout, sample_action
+from agents.networks.agent import Params
+from agents.ppo.learner import Batch, Train, TrainState, encode_episodes, make_optimizer, prepare
 from benchmarks import harness
 from trap_tube_jax import task_set
 

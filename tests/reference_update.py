@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.agent import Agent, Params
-from agents.rollout import Trajectory, action_log_prob
+from agents.acting.rollout import Trajectory, action_log_prob
+from agents.networks.agent import Agent, Params
 from trap_tube_jax.objects import AGENT, BASE_COLORS, FOOD, GROUND, TOOL, TUBE1
 
 PARAMETER_NAMES = {

@@ -10,10 +10,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from agents.checkpoint import Checkpoints, digest, to_arrays
 from agents.config import Config
 from agents.evaluate import Evaluator, evaluation_tasks
-from agents.sharding import Placement
+from agents.parallel.sharding import Placement
+from agents.runs.checkpoint import Checkpoints, digest, to_arrays
 from agents.training import make_train
 
 SEEDS = 2

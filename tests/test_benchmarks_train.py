@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from agents import Config
-from agents.agent import Agent
+from agents.networks.agent import Agent
 from benchmarks import scaling, train_throughput
 
 CONFIG = Config(

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.checkpoint import (
+from agents.runs.checkpoint import (
     CheckpointError,
     Checkpoints,
     digest,

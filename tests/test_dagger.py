@@ -9,8 +9,8 @@ import pytest
 
 import trap_tube_jax as tt
 from agents import Config, make_train
-from agents.agent import Agent
-from agents.dagger import (
+from agents.dagger.explore import UNKNOWN
+from agents.dagger.learner import (
     Dataset,
     Lesson,
     advised_share,
@@ -20,9 +20,9 @@ from agents.dagger import (
     loss,
     play,
 )
-from agents.distinct import position_id
-from agents.explore import UNKNOWN
-from agents.network import Outputs
+from agents.networks.agent import Agent
+from agents.networks.core import Outputs
+from agents.networks.distinct import position_id
 
 CONFIG = Config(
     env_id="sy", method="dagger", max_steps=20, episodes=32, minibatch=8, epochs=1, tasks=4,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import distinct
+from agents.networks import distinct
 
 ROWS, WIDTH = 37, 5
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import distinct
-from agents.encoder import Encoder, convolve, cut_into_windows, encode_by_windows
-from agents.network import draw
+from agents.networks import distinct
+from agents.networks.core import draw
+from agents.networks.encoder import Encoder, convolve, cut_into_windows, encode_by_windows
 
 EPISODES, STEPS = 3, 6
 encoder = Encoder((4, 6))

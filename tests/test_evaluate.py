@@ -7,10 +7,10 @@ from PIL import Image
 import trap_tube_jax as tt
 from agents import evaluate as evaluation
 from agents import make_train
-from agents.agent import Agent
 from agents.config import Config
 from agents.evaluate import Evaluation, Evaluator, evaluation_keys, evaluation_tasks, fixed_tasks
-from agents.metrics import Optimality, Score, wilson_interval
+from agents.networks.agent import Agent
+from agents.runs.metrics import Optimality, Score, wilson_interval
 from trap_tube_jax.registry import PAPER_TASK_SETS
 
 TINY = {

@@ -13,24 +13,17 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import (
-    evaluate,
-    experiments,
-    figures,
-    pretrained,
-    report,
-    results,
-    session,
-    tables,
-    tracking,
-)
-from agents.checkpoint import Checkpoints, digest, to_arrays
+from agents import evaluate, pretrained
 from agents.config import Config
-from agents.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
-from agents.ppo import make_train
-from agents.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
-from agents.run_folder import Run, RunFolder
-from agents.sharding import ALONE
+from agents.experiments import __main__ as experiments
+from agents.experiments import figures, results, tables
+from agents.experiments.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
+from agents.parallel.sharding import ALONE
+from agents.ppo.learner import make_train
+from agents.runs import report, session, tracking
+from agents.runs.checkpoint import Checkpoints, digest, to_arrays
+from agents.runs.folder import Run, RunFolder
+from agents.runs.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
 from benchmarks import readme_tables
 
 ROOT = Path(__file__).parent.parent

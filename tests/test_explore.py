@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import distinct
 from agents.config import Config
-from agents.explore import UNKNOWN, Atlas, explore, is_goal, look_ahead, shortest_ways, walk
+from agents.dagger.explore import UNKNOWN, Atlas, explore, is_goal, look_ahead, shortest_ways, walk
+from agents.networks import distinct
 from trap_tube_jax.solver.distance import Distances, distances
 
 CONFIG = Config.preset("best", walkers=128, walk_rounds=4, walk_steps=40)

@@ -10,9 +10,10 @@ import optax
 import pytest
 from reference_update import Recording, make_trajectory
 
-from agents import Config, ppo
-from agents.agent import Agent, num_parameters
-from agents.curiosity import intrinsic_reward
+from agents import Config
+from agents.curiosity.modules import intrinsic_reward
+from agents.networks.agent import Agent, num_parameters
+from agents.ppo import learner as ppo
 
 CONFIG = Config.preset("paper", episodes=8, minibatch=8, epochs=5)
 

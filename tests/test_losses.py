@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from agents import losses
-from agents.curiosity import (
+from agents.curiosity.modules import (
     ICM,
     Prediction,
     Transition,
     forward_loss,
     intrinsic_reward,
 )
+from agents.ppo import losses
 
 CASES, CHOICES = 1_000, 4
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.agent import Agent
 from agents.config import Config
-from agents.object_encoder import MAX_OBJECTS, describe_board
+from agents.networks.agent import Agent
+from agents.networks.object_encoder import MAX_OBJECTS, describe_board
 from trap_tube_jax.objects import AGENT, FOOD
 
 PALETTE = np.asarray(tt.base_state().palette)

@@ -17,8 +17,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.config import Curiosity
-from agents.session import make_advance
-from agents.sharding import EPISODES, SEEDS, Placement
+from agents.parallel.sharding import EPISODES, SEEDS, Placement
+from agents.runs.session import make_advance
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 TINY = Config(

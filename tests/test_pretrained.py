@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from agents import evaluate, pretrained
-from agents.agent import Agent, Policy
-from agents.checkpoint import Checkpoints
 from agents.config import Config
+from agents.networks.agent import Agent, Policy
 from agents.pretrained.__main__ import main
-from agents.run_folder import Run, RunFolder
+from agents.runs.checkpoint import Checkpoints
+from agents.runs.folder import Run, RunFolder
 
 CONFIG = Config(
     env_id="SymbolicTrapTube-v0",

@@ -9,8 +9,8 @@ import probes
 import pytest
 
 from agents import Config, make_train
-from agents.network import Core
-from agents.rollout import Trajectory, greedy_action, rollout
+from agents.acting.rollout import Trajectory, greedy_action, rollout
+from agents.networks.core import Core
 
 DISCOUNT, ITERATIONS = 0.5, 100
 CONFIG = Config(

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, ppo
-from agents.agent import Agent
-from agents.replay import Replay
-from agents.rollout import Trajectory, place
+from agents import Config
+from agents.acting.rollout import Trajectory, place
+from agents.networks.agent import Agent
+from agents.ppo import learner as ppo
+from agents.ppo.replay import Replay
 
 STEPS, CAPACITY = 4, 3
 CONFIG = Config(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents import returns
+from agents.ppo import returns
 
 CASES, STEPS = 1_000, 23
 

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, distinct, ppo
-from agents.agent import Agent
-from agents.rollout import Trajectory, rollout, sample_action
+from agents import Config
+from agents.acting.rollout import Trajectory, rollout, sample_action
+from agents.networks import distinct
+from agents.networks.agent import Agent
+from agents.ppo import learner as ppo
 
 CONFIG = Config(
     env_id="psy", max_steps=7, episodes=12, minibatch=6, epochs=2, curiosity="icm-detached",
@@ -76,7 +78,7 @@ def test_every_observation_is_encoded_once(env_id, bits, monkeypatch):
         return map_rows(fn, chunk, params, rows, count)
 
     monkeypatch.setattr(distinct, "map_rows", counting)
-    monkeypatch.setattr("agents.rollout.SLOT_BITS", bits)
+    monkeypatch.setattr("agents.acting.rollout.SLOT_BITS", bits)
     config = Config.from_dict({**CONFIG.to_dict(), "env_id": env_id, "max_steps": 20})
     env, agent = tt.make(env_id, max_steps=config.max_steps), Agent(config)
     params = agent.init(jax.random.key(0))

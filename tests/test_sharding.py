@@ -14,12 +14,12 @@ import jax
 import numpy as np
 import pytest
 
-from agents import processes
-from agents.checkpoint import Checkpoints
+from agents.acting.rollout import greedy_action
 from agents.config import Config
-from agents.metrics import read_metrics
-from agents.rollout import greedy_action
-from agents.sharding import Placement, Shards
+from agents.parallel import processes
+from agents.parallel.sharding import Placement, Shards
+from agents.runs.checkpoint import Checkpoints
+from agents.runs.metrics import read_metrics
 from agents.train import main
 from benchmarks import scaling_model
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
+from agents.acting.rollout import cells_of, place
 from agents.config import Config
-from agents.dagger import Dataset
-from agents.rollout import cells_of, place
-from agents.symmetry import NUM_SYMMETRIES, Symmetry
+from agents.dagger.learner import Dataset
+from agents.dagger.symmetry import NUM_SYMMETRIES, Symmetry
 
 NUMBERS = range(NUM_SYMMETRIES)
 

@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents import compilation_cache, evaluate
-from agents.checkpoint import Checkpoints, digest
+from agents import evaluate
 from agents.config import PRESETS, Config, Curiosity
-from agents.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
-from agents.ppo import make_train
-from agents.run_folder import Run, RunFolder
-from agents.session import Progress, make_advance
+from agents.ppo.learner import make_train
+from agents.runs import compilation_cache
+from agents.runs.checkpoint import Checkpoints, digest
+from agents.runs.folder import Run, RunFolder
+from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
+from agents.runs.session import Progress, make_advance
 from agents.train import main, parse
 
 ROOT = Path(__file__).parent.parent

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.agent import Agent, Policy
-from agents.checkpoint import Arrays, digest, from_arrays, to_arrays
 from agents.config import Config
+from agents.networks.agent import Agent, Policy
+from agents.runs.checkpoint import Arrays, digest, from_arrays, to_arrays
 
 FORMAT = "trap-tube-jax parameters 1"
 SUFFIX = ".npz"

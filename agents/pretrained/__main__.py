@@ -9,9 +9,9 @@ from typing import Annotated
 import tyro
 
 from agents import pretrained
-from agents.agent import Policy
 from agents.evaluate import load_run
-from agents.run_folder import RunFolder
+from agents.networks.agent import Policy
+from agents.runs.folder import RunFolder
 
 PROGRAM = "python -m agents.pretrained"
 

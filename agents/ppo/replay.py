@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents.rollout import Trajectory
+from agents.acting.rollout import Trajectory
 from trap_tube_jax.state import State
 
 

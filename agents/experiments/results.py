@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.metrics import FirstSolved, Optimality, Row, Score, read_metrics
-from agents.run_folder import CONFIG_FILE, Run, RunFolder, read_json
-from agents.tracking import OVERALL, outcome
+from agents.runs.folder import CONFIG_FILE, Run, RunFolder, read_json
+from agents.runs.metrics import FirstSolved, Optimality, Row, Score, read_metrics
+from agents.runs.tracking import OVERALL, outcome
 
 FOLDER_NAME = re.compile(r"(?P<algorithm>.+)-seed\d+(to\d+)?")
 

@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents import distinct
-from agents.network import as_row, hidden_init
+from agents.networks import distinct
+from agents.networks.core import as_row, hidden_init
 from trap_tube_jax.objects import BOARD_SIZE
 
 WINDOW = 4  # cells a side, of which the first pooling sees one 2x2 block of features

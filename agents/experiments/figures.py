@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.metrics import Row
-from agents.tracking import OVERALL, PREFIX
+from agents.runs.metrics import Row
+from agents.runs.tracking import OVERALL, PREFIX
 
 Curves = Mapping[str, Sequence[Row]]
 

@@ -13,9 +13,6 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import processes, report
-from agents.agent import Policy, num_parameters
-from agents.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.config import Config
 from agents.evaluate import (
     ALL_SETS,
@@ -26,11 +23,15 @@ from agents.evaluate import (
     save_solved_episode,
     scores,
 )
-from agents.method import Train
-from agents.metrics import FirstSolved, MetricsLog, Row
-from agents.run_folder import Run, RunFolder, write_json
-from agents.sharding import DEFAULT_DEVICE, Placement
-from agents.tracking import Tracker
+from agents.networks.agent import Policy, num_parameters
+from agents.parallel import processes
+from agents.parallel.sharding import DEFAULT_DEVICE, Placement
+from agents.ppo.method import Train
+from agents.runs import report
+from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
+from agents.runs.folder import Run, RunFolder, write_json
+from agents.runs.metrics import FirstSolved, MetricsLog, Row
+from agents.runs.tracking import Tracker
 from agents.training import TrainState, make_train
 
 POLL_SECONDS = 0.005

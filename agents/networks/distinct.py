@@ -12,8 +12,8 @@ base task all episodes share their boards. So instead of encoding M observations
   4. hand every observation the features of its representative.
 
 The result is that of encoding all M observations, and so is the gradient, up to the order
-of float32 sums. Tests hold both against the plain encoder, which `agents.encoder` takes apart
-further, in the same way.
+of float32 sums. Tests hold both against the plain encoder, which `agents.networks.encoder`
+takes apart further, in the same way.
 """
 
 import functools

@@ -1,7 +1,7 @@
 """Learning from what walks found out: dataset aggregation with an adviser made of experience.
 
-Every iteration draws new tasks, has random walks explore them (`agents.explore`), and lets the
-agent play each of them many times. Whatever states it comes to, the atlas of the walks says
+Every iteration draws new tasks, has random walks explore them (`agents.dagger.explore`), and
+lets the agent play each of them many times. Whatever states it comes to, the atlas of the walks says
 which actions bring the goal nearest; the agent learns to take one of them. In some episodes
 its actions are now and then replaced by what the atlas advises, so that early on there is
 something to see beyond the start. Episodes of many iterations are kept and learnt from again.
@@ -24,18 +24,18 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from agents import losses
-from agents.agent import Agent, Params
+from agents.acting.observations import encode_episodes, observation_ids
+from agents.acting.rollout import Trajectory, place, rollout, sample_action
 from agents.config import Config
-from agents.distinct import position_id
-from agents.explore import UNKNOWN, Atlas, explore, look_ahead, walk
-from agents.method import Metrics, Train, environment
-from agents.network import Outputs
-from agents.observations import encode_episodes, observation_ids
-from agents.optimizer import cooldown, make_optimizer
-from agents.rollout import Trajectory, place, rollout, sample_action
-from agents.sharding import ALONE, Shards
-from agents.symmetry import NUM_SYMMETRIES, Symmetry
+from agents.dagger.explore import UNKNOWN, Atlas, explore, look_ahead, walk
+from agents.dagger.symmetry import NUM_SYMMETRIES, Symmetry
+from agents.networks.agent import Agent, Params
+from agents.networks.core import Outputs
+from agents.networks.distinct import position_id
+from agents.parallel.sharding import ALONE, Shards
+from agents.ppo import losses
+from agents.ppo.method import Metrics, Train, environment
+from agents.ppo.optimizer import cooldown, make_optimizer
 from trap_tube_jax.environment import Environment, action_from_index, action_to_index
 from trap_tube_jax.objects import NUM_ACTIONS
 from trap_tube_jax.registry import make

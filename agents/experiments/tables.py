@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rich.table import Table as RichTable
 
-from agents.report import TABLE_STYLE, duration
+from agents.runs.report import TABLE_STYLE, duration
 
 Record = Mapping[str, Any]
 

@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from agents import distinct
-from agents.agent import Agent, Params
+from agents.acting.rollout import Trajectory, place
 from agents.config import Config
-from agents.rollout import Trajectory, place
+from agents.networks import distinct
+from agents.networks.agent import Agent, Params
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State
 

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from agents.config import Config
-from agents.curiosity import ICM, RND, DetachedICM, Prediction, Transition
-from agents.encoder import Encoder, encode_by_windows
-from agents.network import Core, Heads, Outputs, draw
-from agents.object_encoder import ObjectEncoder
+from agents.curiosity.modules import ICM, RND, DetachedICM, Prediction, Transition
+from agents.networks.core import Core, Heads, Outputs, draw
+from agents.networks.encoder import Encoder, encode_by_windows
+from agents.networks.object_encoder import ObjectEncoder
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]

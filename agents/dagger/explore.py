@@ -19,9 +19,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents import distinct
+from agents.acting.rollout import place
 from agents.config import Config
-from agents.rollout import place
+from agents.networks import distinct
 from trap_tube_jax.environment import Environment, action_from_index
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.state import State

@@ -15,8 +15,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from agents.encoder import Encoder
-from agents.network import dense, output_dense
+from agents.networks.core import dense, output_dense
+from agents.networks.encoder import Encoder
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 

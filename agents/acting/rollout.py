@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents import distinct
-from agents.agent import Agent, Params
-from agents.losses import log_prob
-from agents.network import Outputs
-from agents.sharding import Shards
+from agents.networks import distinct
+from agents.networks.agent import Agent, Params
+from agents.networks.core import Outputs
+from agents.parallel.sharding import Shards
+from agents.ppo.losses import log_prob
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from agents import pretrained
-from agents.agent import Policy
 from agents.evaluate import Evaluation, Evaluator
-from agents.metrics import MetricsLog, Row
-from agents.run_folder import Run, RunFolder
+from agents.networks.agent import Policy
+from agents.runs.folder import Run, RunFolder
+from agents.runs.metrics import MetricsLog, Row
 from trap_tube_jax.state import State
 
 PREFIX = "greedy_"

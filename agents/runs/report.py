@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from agents.metrics import FirstSolved, Row, Score, column
+from agents.runs.metrics import FirstSolved, Row, Score, column
 from trap_tube_jax.gallery import episode_frames
 from trap_tube_jax.rendering import save_gif
 from trap_tube_jax.state import State

@@ -10,22 +10,22 @@ import jax.numpy as jnp
 import optax
 
 import trap_tube_jax as tt
-from agents import losses, returns
-from agents.agent import Agent, Params
-from agents.config import Config
-from agents.curiosity import Prediction, forward_loss, intrinsic_reward, visit_bonus
-from agents.method import Metrics, Train, environment
-from agents.observations import (
+from agents.acting.observations import (
     VISIT_SLOTS,
     encode_episodes,
     first_visits,
     observation_ids,
     visit_slots,
 )
-from agents.optimizer import cooldown, make_optimizer
-from agents.replay import Replay
-from agents.rollout import Trajectory, action_log_prob, rollout, sample_action
-from agents.sharding import ALONE, Shards
+from agents.acting.rollout import Trajectory, action_log_prob, rollout, sample_action
+from agents.config import Config
+from agents.curiosity.modules import Prediction, forward_loss, intrinsic_reward, visit_bonus
+from agents.networks.agent import Agent, Params
+from agents.parallel.sharding import ALONE, Shards
+from agents.ppo import losses, returns
+from agents.ppo.method import Metrics, Train, environment
+from agents.ppo.optimizer import cooldown, make_optimizer
+from agents.ppo.replay import Replay
 from trap_tube_jax.environment import Environment
 
 # Over [T, B] arrays.

@@ -20,11 +20,10 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 
 import trap_tube_jax as tt
-from agents import compilation_cache, figures, results, tables
 from agents.config import PRESETS, Config
 from agents.evaluate import ALL_SETS, evaluation_tasks, shortest_lengths
-from agents.machine import machine
-from agents.protocol import (
+from agents.experiments import figures, results, tables
+from agents.experiments.protocol import (
     ALGORITHMS,
     EXPERIMENTS,
     FIXED,
@@ -33,11 +32,13 @@ from agents.protocol import (
     Experiment,
     Protocol,
 )
-from agents.results import AlgorithmRun
-from agents.run_folder import Run, RunFolder, read_json, write_json
-from agents.session import Session, Stopped, StopSignals
-from agents.sharding import Placement
-from agents.tracking import Tracker
+from agents.experiments.results import AlgorithmRun
+from agents.parallel.sharding import Placement
+from agents.runs import compilation_cache
+from agents.runs.folder import Run, RunFolder, read_json, write_json
+from agents.runs.machine import machine
+from agents.runs.session import Session, Stopped, StopSignals
+from agents.runs.tracking import Tracker
 from trap_tube_jax.state import State
 
 PROGRAM = "python -m agents.experiments"

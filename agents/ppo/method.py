@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 
-from agents.agent import Agent
 from agents.config import Config
-from agents.sharding import Shards
+from agents.networks.agent import Agent
+from agents.parallel.sharding import Shards
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.registry import make
 
