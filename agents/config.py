@@ -7,11 +7,8 @@ import dataclasses
 import difflib
 from typing import Any, Literal, Self, get_args
 
-from trap_tube_jax.objects import NUM_ACTIONS
-
 Curiosity = Literal["icm", "icm-detached", "rnd", "counts", "none"]
 EncoderName = Literal["paper", "objects"]
-Method = Literal["ppo", "dagger"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,14 +19,11 @@ class Config:
       env_id: the task set to train on, by id or short name.
       num_features: N, feature channels of the observation; 3 is RGB.
       max_steps: steps after which an episode is truncated.
-      method: `ppo`, or `dagger`: random walks explore every task, and the agent learns to do
-        in all states that it comes to what they have found to bring the goal nearest.
       iterations: rollouts to train for, at most.
       stop_when_solved: stop early once the greedy policy solves this share of the
         evaluation tasks of `env_id`; 0 never stops early.
       episodes: episodes per iteration.
-      epochs: passes over each iteration's episodes; with `dagger`, as many gradient steps
-        as they take.
+      epochs: passes over each iteration's episodes.
       minibatch: whole episodes per gradient step; divides `episodes`.
       discount: gamma.
       gae_lambda: lambda of the advantage estimates.
@@ -51,20 +45,6 @@ class Config:
         their episode.
       imitation_coef: weight of imitating the agent's own solved episodes; 0 for none.
       imitation_episodes: the newest solved episodes that are remembered and imitated.
-      task_sets: with `dagger`, the sets that tasks are drawn from in equal parts, by id or
-        short name; `env_id` alone if there are none.
-      tasks: new tasks per iteration with `dagger`; divides `episodes`.
-      walkers: random walks at a time that explore a task.
-      walk_rounds: how often they start again, where few have been.
-      walk_steps: steps of each round.
-      agent_rounds: further rounds, which start where the agent has come to.
-      restarts: share of a task's episodes that start anywhere that the walks came from to the
-        goal; the others start where the task does.
-      advised: share of a task's episodes in which actions are replaced by advice.
-      advice: share of the actions that are, at most; among the advised episodes it rises from
-        0 to this.
-      dataset: the newest episodes that `dagger` learns from; a multiple of `episodes`.
-      mirrored: whether `dagger` learns from episodes under the eight symmetries of the board.
       reward_rate: weight of the past in the moving moments that normalise both rewards.
       encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
         seen from agent and food is all that is encoded.
@@ -79,7 +59,6 @@ class Config:
     env_id: str = "TrapTube-v0"
     num_features: int = 3
     max_steps: int = 50
-    method: Method = "ppo"
     iterations: int = 250
     stop_when_solved: float = 0.0
     episodes: int = 1024
@@ -100,17 +79,6 @@ class Config:
     episodic_novelty: bool = False
     imitation_coef: float = 0.0
     imitation_episodes: int = 16
-    task_sets: tuple[str, ...] = ()
-    tasks: int = 64
-    walkers: int = 512
-    walk_rounds: int = 8
-    walk_steps: int = 50
-    agent_rounds: int = 2
-    restarts: float = 0.25
-    advised: float = 0.75
-    advice: float = 0.9
-    dataset: int = 16_384
-    mirrored: bool = True
     reward_rate: float = 0.9
     encoder: EncoderName = "paper"
     filters: tuple[int, int] = (32, 64)
@@ -136,35 +104,11 @@ class Config:
             if getattr(self, name) not in get_args(choices):
                 allowed = ", ".join(get_args(choices))
                 raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}")
-        if self.method == "dagger":
-            self._check_dagger()
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
             raise ValueError(
                 f"minibatch must divide episodes={self.episodes}, got {self.minibatch}; "
                 f"allowed: {', '.join(map(str, divisors))}"
-            )
-
-    def _check_dagger(self) -> None:
-        if self.curiosity != "none":
-            raise ValueError(
-                f"curiosity must be none with method='dagger', which knows no reward, got "
-                f"{self.curiosity!r}"
-            )
-        if self.episodes % self.tasks:
-            raise ValueError(f"tasks must divide episodes={self.episodes}, got {self.tasks}")
-        if self.tasks % max(len(self.task_sets), 1):
-            raise ValueError(
-                f"tasks must be a multiple of the number of task_sets={self.task_sets}, got "
-                f"{self.tasks}"
-            )
-        if self.walk_steps > self.max_steps:
-            raise ValueError(
-                f"walk_steps must be at most max_steps={self.max_steps}, got {self.walk_steps}"
-            )
-        if self.dataset % self.episodes:
-            raise ValueError(
-                f"dataset must be a multiple of episodes={self.episodes}, got {self.dataset}"
             )
 
     @classmethod
@@ -205,25 +149,8 @@ class Config:
         """The largest number of environment steps of one iteration."""
         return self.episodes * self.max_steps
 
-    def environment_steps(self, iterations: int, transitions: int) -> int:
-        """All steps of the environment that so much training takes.
 
-        Where `dagger` plays, all actions are tried in every state that the agent comes to, to
-        see which one brings it nearer; what the agent does is one of them. Random walks come on
-        top.
-
-        Args:
-          iterations: how many.
-          transitions: steps of the agent in these.
-        """
-        if self.method != "dagger":
-            return transitions
-        rounds = self.walk_rounds + self.agent_rounds
-        walked = self.tasks * self.walkers * rounds * self.walk_steps
-        return iterations * walked + NUM_ACTIONS * transitions
-
-
-_CHOICES = {"curiosity": Curiosity, "encoder": EncoderName, "method": Method}
+_CHOICES = {"curiosity": Curiosity, "encoder": EncoderName}
 _INFINITY = float("inf")
 _RANGES: dict[str, tuple[float, float]] = {
     "num_features": (1, 256),
@@ -247,15 +174,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "imitation_coef": (0, _INFINITY),
     "imitation_episodes": (1, _INFINITY),
     "reward_rate": (0, 1),
-    "tasks": (1, _INFINITY),
-    "walkers": (1, _INFINITY),
-    "walk_rounds": (1, 1000),
-    "walk_steps": (1, 10_000),
-    "agent_rounds": (0, 1000),
-    "restarts": (0, 1),
-    "advised": (0, 1),
-    "advice": (0, 1),
-    "dataset": (1, _INFINITY),
     "filters": (1, 4096),
     "hidden": (1, 65_536),
     "embedding": (1, 65_536),
@@ -280,21 +198,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "intrinsic_scale": 0.3,
         "imitation_coef": 1.0,
     },
-    # Learns all task sets from {P, St, Sy} and the fifth of it that is hard: random walks
-    # find out what is right, and the encoder sees objects instead of colours.
+    # Trained on {P, St, Sy}: the encoder sees objects instead of colours.
     "best": {
         "env_id": "pstsy",
-        "method": "dagger",
-        "iterations": 300,
+        "iterations": 800,
+        "epochs": 4,
         "curiosity": "none",
-        "learning_rate": 3e-3,
-        "cooldown": 0.3,
-        "epochs": 6,
-        "minibatch": 64,
-        "task_sets": ("pst", "pstsy"),
-        "tasks": 32,
-        "walkers": 1024,
-        "dataset": 32_768,
+        "entropy_coef": 3e-3,
         "encoder": "objects",
         "filters": (64, 64),
         "hidden": 128,
@@ -309,15 +219,13 @@ def _check_type(field: dataclasses.Field, value: Any) -> None:
     elif isinstance(default, float):
         matches = isinstance(value, int | float)
     elif isinstance(default, tuple):
-        kind = str if field.name == "task_sets" else int
         matches = (
             isinstance(value, tuple)
-            and len(value) == (len(default) or len(value))
-            and all(isinstance(item, kind) for item in value)
+            and len(value) == len(default)
+            and all(isinstance(item, int) for item in value)
         )
     else:
         matches = isinstance(value, type(default))
     if not matches:
-        names = {"filters": "2 integers", "task_sets": "names of task sets"}
-        wanted = names.get(field.name, type(default).__name__)
+        wanted = "2 integers" if isinstance(default, tuple) else type(default).__name__
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")

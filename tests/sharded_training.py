@@ -13,8 +13,8 @@ import numpy as np
 from agents.config import Config
 from agents.evaluate import Evaluator, evaluation_tasks
 from agents.parallel.sharding import Placement
+from agents.ppo.learner import make_train
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays
-from agents.training import make_train
 
 SEEDS = 2
 CONFIG = Config.preset(
@@ -33,33 +33,13 @@ CONFIG = Config.preset(
     chunk=8,
 )
 
-DAGGER = Config.preset(
-    "best",
-    task_sets=("sy", "psy"),
-    episodes=32,
-    minibatch=8,
-    epochs=1,
-    max_steps=20,
-    filters=(4, 4),
-    hidden=4,
-    embedding=2,
-    eval_episodes=3,
-    chunk=8,
-    tasks=8,
-    walkers=256,
-    walk_rounds=3,
-    walk_steps=20,
-    agent_rounds=1,
-    dataset=64,
-)
-
 
 class Trainer:
     """Training with one seed a device, from the default device and back to it."""
 
-    def __init__(self, placement, seeds, config=CONFIG):
+    def __init__(self, placement, seeds):
         self.placement = placement
-        train = make_train(config, shards=placement.episodes)
+        train = make_train(CONFIG, shards=placement.episodes)
         self.init = jax.jit(jax.vmap(train.init))
         assert placement.local_seeds(seeds) == 1
 
@@ -92,9 +72,9 @@ def rows_of(tree, index):
     return jax.tree.map(lambda x: x[index : index + 1], tree)
 
 
-def on_one_device(state, iterations, config=CONFIG):
+def on_one_device(state, iterations):
     """Each seed alone, then side by side again."""
-    alone = Trainer(Placement.of(1, config, 1), 1, config)
+    alone = Trainer(Placement.of(1, CONFIG, 1), 1)
     results = [alone(rows_of(state, seed), iterations) for seed in range(SEEDS)]
     arrays = [to_arrays(state) for state, _ in results]
     return (
@@ -115,19 +95,6 @@ def difference(one, other):
     }
     worst = max(gap, key=lambda name: gap[name])
     return {"name": worst, "gap": float(gap[worst])}
-
-
-def advised(iterations):
-    """How far eight devices are from one where walks explore and advise."""
-    trainer = Trainer(Placement.of("all", DAGGER, SEEDS), SEEDS, DAGGER)
-    start = trainer.init(jax.vmap(jax.random.key)(np.arange(SEEDS, dtype=np.uint32)))
-    expected, expected_rows = on_one_device(start, iterations, DAGGER)
-    found, rows = trainer(start, iterations)
-    return {
-        "state": difference(expected, to_arrays(found)),
-        "metrics": [difference(*pair) for pair in zip(expected_rows, rows, strict=True)],
-        "labelled": float(np.min([row["labelled"] for row in rows])),
-    }
 
 
 def main(folder):
@@ -158,7 +125,6 @@ def main(folder):
         "imitation": [float(np.min(np.abs(row["imitation_loss"]))) for row in rows],
         "eight_to_one": difference(expected, from_eight),
         "eight_to_eight": digest(to_arrays(twice)) == digest(to_arrays(found)),
-        "advised": advised(2),
         "evaluation": all(jax.tree.leaves(same)),
         "tasks": {name: len(outcome.solved) for name, outcome in played[1].items()},
     }

@@ -14,7 +14,6 @@ import pytest
 
 import trap_tube_jax as tt
 from agents import evaluate, pretrained
-from agents.config import Config
 from agents.experiments import __main__ as experiments
 from agents.experiments import figures, results, tables
 from agents.experiments.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
@@ -397,17 +396,6 @@ def test_tables_hold_means_and_deviations(tmp_path):
     assert tables.percent_table(record).rows[0] == ("{P}", "55.6 ± 19.2", "25.0")
     cost = ("PPO + ICM", "3", "3–4", "3,333", "0:07")
     assert tables.cost_table(record).rows == (cost,)
-    found["environment_steps"]["mean"] = 5e6
-    table = tables.cost_table(record)
-    assert table.rows == ((*cost[:4], "5,000,000", cost[4]),)
-    assert table.heads[4] == "environment steps"
-
-
-def test_walks_and_the_search_for_advice_are_counted():
-    config = Config.preset("best", tasks=32, walkers=1024)
-    walked = 32 * 1024 * 10 * 50
-    assert config.environment_steps(3, 1000) == 3 * walked + 16 * 1000
-    assert Config().environment_steps(3, 1000) == 1000
 
 
 def test_curves_are_drawn_of_seeds_of_any_length(tmp_path):

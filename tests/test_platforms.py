@@ -25,10 +25,7 @@ TINY = Config(
     env_id="pstsy", max_steps=4, episodes=4, minibatch=2, epochs=1, filters=(2, 3), hidden=4,
     embedding=2, chunk=4,
 ).to_dict()  # fmt: skip
-DAGGER = {
-    "method": "dagger", "curiosity": "none", "encoder": "objects", "tasks": 2, "walkers": 4,
-    "walk_rounds": 1, "walk_steps": 4, "agent_rounds": 1, "dataset": 8,
-}  # fmt: skip
+OBJECTS = {"curiosity": "rnd", "encoder": "objects"}
 CURIOSITIES = get_args(Curiosity)
 # What XLA wants to know of a GPU that it cannot ask.
 H200 = """
@@ -73,9 +70,7 @@ def test_the_environment_lowers_for_accelerators():
     assert lowered_for(jax.vmap(env.reset), keys) == PLATFORMS
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"curiosity": "rnd"}, DAGGER], ids=["icm", "rnd", "dagger"]
-)
+@pytest.mark.parametrize("settings", [{}, OBJECTS], ids=["icm", "objects"])
 def test_training_lowers_for_accelerators(settings):
     train = make_train(Config.from_dict({**TINY, **settings}))
     state = jax.eval_shape(train.init, jax.random.key(0))
@@ -120,8 +115,8 @@ def test_the_environment_compiles_for_a_gpu(gpus, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [DAGGER, {"imitation_coef": 1.0}, *({"curiosity": name} for name in CURIOSITIES)],
-    ids=["dagger", "imitation", *CURIOSITIES],
+    [OBJECTS, {"imitation_coef": 1.0}, *({"curiosity": name} for name in CURIOSITIES)],
+    ids=["objects", "imitation", *CURIOSITIES],
 )
 def test_training_compiles_for_a_gpu(gpus, settings):
     train = make_train(Config.from_dict({**TINY, **settings}))
@@ -132,7 +127,7 @@ def test_training_compiles_for_a_gpu(gpus, settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [{}, DAGGER], ids=["icm", "dagger"])
+@pytest.mark.parametrize("settings", [{}, OBJECTS], ids=["icm", "objects"])
 def test_training_compiles_for_several_gpus(gpus, settings):
     mesh = Mesh(np.array(gpus).reshape(2, 2), (SEEDS, EPISODES))
     placement = Placement(mesh)

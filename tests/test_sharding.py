@@ -71,15 +71,6 @@ def test_eight_devices_train_as_one(eight):
 
 
 @pytest.mark.slow
-def test_eight_devices_advise_as_one(eight):
-    advised = eight["advised"]
-    assert advised["labelled"] > 0.1
-    assert advised["state"]["gap"] < 2e-6, advised["state"]
-    for metrics in advised["metrics"]:
-        assert metrics["gap"] < 2e-6, metrics
-
-
-@pytest.mark.slow
 def test_eight_devices_evaluate_as_one(eight):
     assert eight["tasks"] == {"base": 1, "st": 3}
     assert eight["evaluation"]

@@ -21,7 +21,6 @@ from trap_tube_jax.state import State
 SLOT_BITS = 20  # of an observation's hash, by which episodes remember what they met
 
 ChooseAction = Callable[[jax.Array, Outputs], jax.Array]
-ReplaceAction = Callable[[jax.Array, State, jax.Array], jax.Array]
 
 
 class Trajectory(NamedTuple):
@@ -125,7 +124,6 @@ def rollout(
     *,
     choose: ChooseAction,
     chunk: int,
-    replace: ReplaceAction | None = None,
 ) -> Trajectory:
     """Plays one episode from each of B initial states.
 
@@ -139,8 +137,6 @@ def rollout(
       key: PRNG key of the actions.
       choose: `sample_action` or `greedy_action`.
       chunk: distinct observations encoded at once.
-      replace: from a PRNG key, B states and the actions i32[B, 2] chosen in them to those that
-        are taken instead.
     """
     batch = initial.time.shape[0]
     layout_id = distinct.layout_ids(initial)
@@ -173,8 +169,6 @@ def rollout(
         embedding = agent.advance(params, carry.embedding, core_inputs)
         outputs = agent.act(params, embedding)
         action = choose(step_key, outputs)
-        if replace is not None:
-            action = replace(jax.random.fold_in(step_key, 0), carry.state, action)
         state, timestep = jax.vmap(env.step)(carry.state, action)
         alive = ~(carry.state.terminated | carry.state.truncated)
         record = {

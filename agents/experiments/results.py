@@ -100,9 +100,6 @@ def seed_record(entry: AlgorithmRun, seed: int, shortest: Lengths | None) -> dic
         "finished": bool(is_over),
         "episodes": int(last["episodes"]),
         "transitions": int(last["transitions"]),
-        "environment_steps": config.environment_steps(
-            int(last["iteration"]), int(last["transitions"])
-        ),
         "training_seconds": round(float(last["seconds"]), 1),
         "compile_seconds": summary.get("compile_seconds"),
         "machines": read_json(entry.folder.machines) or [],
@@ -127,7 +124,6 @@ def aggregate(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "solved": len(solved),
         "episodes_to_solve": mean_sd([first["episodes"] for first in solved]),
         "transitions": mean_sd([seed["transitions"] for seed in seeds]),
-        "environment_steps": mean_sd([seed["environment_steps"] for seed in seeds]),
         "training_seconds": mean_sd([seed["training_seconds"] for seed in seeds]),
         "process_seconds": mean_sd([seed.get("process_seconds") for seed in seeds]),
         "overall": mean_sd([entry["overall"] for entry in best]),

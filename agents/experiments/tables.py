@@ -169,12 +169,8 @@ def cost_table(record: Record) -> Table:
     """How long the training was."""
     everything = [entry["aggregate"] for entry in record["algorithms"]]
     whole = any(found.get("process_seconds") for found in everything)
-    steps = [
-        (found.get("environment_steps") or found["transitions"])["mean"] for found in everything
-    ]
-    walked = steps != [found["transitions"]["mean"] for found in everything]
     rows = []
-    for entry, found, all_steps in zip(record["algorithms"], everything, steps, strict=True):
+    for entry, found in zip(record["algorithms"], everything, strict=True):
         iterations = sorted({run["iterations"] for run in entry["runs"]})
         cells = [
             _label(record, entry),
@@ -182,15 +178,13 @@ def cost_table(record: Record) -> Table:
             "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
             f"{found['transitions']['mean']:,.0f}",
         ]
-        if walked:
-            cells.append(f"{all_steps:,.0f}")
         cells.append(duration(found["training_seconds"]["mean"]))
         if whole:
             process = found.get("process_seconds")
             cells.append(duration(process["mean"]) if process else NOTHING)
         rows.append(tuple(cells))
     heads = ["algorithm", "trials", "iterations", "transitions"]
-    heads += ["environment steps"] * walked + ["training time"] + ["with start-up"] * whole
+    heads += ["training time"] + ["with start-up"] * whole
     return Table("What a trial took, on average", tuple(heads), tuple(rows))
 
 

@@ -29,7 +29,6 @@ from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import State
 
 NUM_CELLS = BOARD_SIZE * BOARD_SIZE
-NUM_POSITIONS = NUM_CELLS**3  # of agent, tool and food together
 ROW_SLOT_BITS = 16  # of a hash, in the table that `group_rows` looks up
 REMEMBERED_BYTES = 2**26  # by one `map_rows`; changes speed, not results
 
@@ -127,13 +126,6 @@ def position_id(state: State) -> jax.Array:
     cells = [state.agent, state.tool, state.food]
     agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
     return (agent * NUM_CELLS + tool) * NUM_CELLS + food
-
-
-def cells_at(position: jax.Array) -> jax.Array:
-    """u8[3, 2]: the cells of agent, tool and food with this id; inverse of `position_id`."""
-    agent_and_tool, food = jnp.divmod(position, NUM_CELLS)
-    cell = jnp.stack([*jnp.divmod(agent_and_tool, NUM_CELLS), food])
-    return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)
 
 
 def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:

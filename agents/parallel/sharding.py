@@ -131,10 +131,9 @@ class Placement:
         wanted = available if devices == "all" else devices
         allowed = [n for n in range(1, available + 1) if _is_even(n, processes, config, seeds)]
         if wanted not in allowed:
-            tasks = f", tasks={config.tasks}" if config.method == "dagger" else ""
             raise ValueError(
                 f"devices must be a number that {available} {jax.default_backend()} devices of "
-                f"{processes} process(es), minibatch={config.minibatch}{tasks} and seeds={seeds} "
+                f"{processes} process(es), minibatch={config.minibatch} and seeds={seeds} "
                 f"divide into, got {wanted}; allowed: {', '.join(map(str, allowed)) or 'none'}"
             )
         if wanted == processes == 1:
@@ -246,5 +245,4 @@ def _is_even(devices: int, processes: int, config: Config, seeds: int) -> bool:
     per_process, rest = divmod(devices, processes)
     shards = devices // math.gcd(devices, seeds)
     enough = per_process <= jax.local_device_count()
-    shared = (config.minibatch, config.tasks if config.method == "dagger" else shards)
-    return rest == 0 and enough and all(number % shards == 0 for number in shared)
+    return rest == 0 and enough and config.minibatch % shards == 0

@@ -214,7 +214,6 @@ PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("curiosity losses", ("forward_loss", "inverse_loss"), "weighted loss"),
     ("entropy", ("entropy",), "nats, grasp + move"),
     ("gradient norm", ("gradient_norm",), "before clipping"),
-    ("advice", ("right", "labelled"), "share of steps"),
 )
 
 

@@ -26,13 +26,13 @@ from agents.evaluate import (
 from agents.networks.agent import Policy, num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import DEFAULT_DEVICE, Placement
+from agents.ppo.learner import TrainState, make_train
 from agents.ppo.method import Train
 from agents.runs import report
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.metrics import FirstSolved, MetricsLog, Row
 from agents.runs.tracking import Tracker
-from agents.training import TrainState, make_train
 
 POLL_SECONDS = 0.005
 
