@@ -1,91 +1,135 @@
 """Every setting of training in one frozen record, and the named presets.
 
-Source of the `paper` preset: agent specification, "PPO", "ICM" and "Network".
+Source of the `paper` preset: agents/agent.md.
 """
 
 import dataclasses
 import difflib
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, get_args, get_type_hints
 
-Curiosity = Literal["icm", "icm-detached", "rnd", "counts", "none"]
-EncoderName = Literal["paper", "objects"]
+from agents import registry
+
+_NO_LIMIT = float("inf")
+
+
+def _setting(
+    default: Any,
+    low: float | None = None,
+    high: float = _NO_LIMIT,
+    *,
+    unused: dict[str, tuple[Any, ...]] | None = None,
+) -> Any:
+    """A field of `Config` with all that is to be known of it.
+
+    Args:
+      default: the paper's value.
+      low: smallest value, for numbers.
+      high: largest value.
+      unused: values of other settings with which this one has no effect.
+    """
+    limits = None if low is None else (low, high)
+    metadata = {"limits": limits, "unused": unused or {}}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The settings of one training run; the defaults are the paper's.
+    """The settings of one training run.
+
+    `Config()` is the preset `paper`. The command line starts from the preset `fast`.
 
     Attributes:
       env_id: the task set to train on, by id or short name.
       num_features: N, feature channels of the observation; 3 is RGB.
       max_steps: steps after which an episode is truncated.
+
       iterations: rollouts to train for, at most.
       stop_when_solved: stop early once the greedy policy solves this share of the
         evaluation tasks of `env_id`; 0 never stops early.
+      eval_episodes: fixed evaluation tasks per task set.
+
       episodes: episodes per iteration.
       epochs: passes over each iteration's episodes.
       minibatch: whole episodes per gradient step; divides `episodes`.
+
       discount: gamma.
       gae_lambda: lambda of the advantage estimates.
+      bootstrap: what follows the last step of an episode. `value`: nothing after a terminated
+        episode, the value of the last observation after a truncated one; the value's target is
+        advantage + value. `baseline`: as in the paper's published baseline, the value of the
+        board that stays after a terminated episode, and the last step's own value after a
+        truncated one; the value's target is the discounted sum of rewards.
       clip: half-width of PPO's interval of probability ratios.
       value_coef: weight of the squared error of the value.
       entropy_coef: weight of the entropy bonus, summed over grasp and move.
+
       learning_rate: Adam's step size.
-      cooldown: share of the iterations, the last ones, over which the step size falls
-        linearly to nothing.
+      cooldown: share of the gradient steps, the last ones, over which the step size falls
+        linearly to 0.
       adam_epsilon: Adam's epsilon.
       max_gradient_norm: global norm to which gradients are clipped.
+
       curiosity: source of the intrinsic reward. `icm`: the paper's, forward and inverse
         models over the policy's GRU outputs. `icm-detached`: an encoder of its own, trained
         by the inverse loss alone. `rnd`: imitation of a random network. `counts`: how seldom
-        training has seen an observation. `none`: plain PPO.
+        training has seen an observation. `none`: plain PPO. Or a name that you registered.
       intrinsic_scale: weight of the normalised intrinsic reward.
       curiosity_coef: weight of the curiosity's losses.
       episodic_novelty: pay the intrinsic reward only for observations that are new in
         their episode.
+      reward_rate: weight of the past in the moving moments that normalise both rewards.
+
       imitation_coef: weight of imitating the agent's own solved episodes; 0 for none.
       imitation_episodes: the newest solved episodes that are remembered and imitated.
-      reward_rate: weight of the past in the moving moments that normalise both rewards.
+
       encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
         seen from agent and food is all that is encoded.
-      filters: channels of the first convolutions, and of all later ones; units of the layers
+      filters: channels of the first convolution, and of all later ones; units of the layers
         of `objects`.
       hidden: units of the GRU, of the layer before it and of the inverse model.
       embedding: units of each action embedding and of the reward's.
-      eval_episodes: fixed evaluation tasks per task set.
       chunk: distinct observations that are encoded at once; changes speed, not results.
     """
 
-    env_id: str = "TrapTube-v0"
-    num_features: int = 3
-    max_steps: int = 50
-    iterations: int = 250
-    stop_when_solved: float = 0.0
-    episodes: int = 1024
-    epochs: int = 10
-    minibatch: int = 128
-    discount: float = 0.99
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    value_coef: float = 0.01
-    entropy_coef: float = 1e-4
-    learning_rate: float = 1e-3
-    cooldown: float = 0.0
-    adam_epsilon: float = 1e-7
-    max_gradient_norm: float = 1.0
-    curiosity: Curiosity = "icm"
-    intrinsic_scale: float = 0.1
-    curiosity_coef: float = 10.0
-    episodic_novelty: bool = False
-    imitation_coef: float = 0.0
-    imitation_episodes: int = 16
-    reward_rate: float = 0.9
-    encoder: EncoderName = "paper"
-    filters: tuple[int, int] = (32, 64)
-    hidden: int = 64
-    embedding: int = 8
-    eval_episodes: int = 128
-    chunk: int = 64
+    # The task.
+    env_id: str = _setting("TrapTube-v0")
+    num_features: int = _setting(3, 1, 256)
+    max_steps: int = _setting(50, 1, 10_000)
+    # How long, and how it is judged.
+    iterations: int = _setting(250, 1)
+    stop_when_solved: float = _setting(0.0, 0, 1)
+    eval_episodes: int = _setting(128, 1)
+    # Episodes and gradient steps of an iteration.
+    episodes: int = _setting(1024, 1)
+    epochs: int = _setting(10, 1)
+    minibatch: int = _setting(128, 1)
+    # PPO.
+    discount: float = _setting(0.99, 0, 1)
+    gae_lambda: float = _setting(0.95, 0, 1)
+    bootstrap: Literal["value", "baseline"] = _setting("baseline")
+    clip: float = _setting(0.2, 0)
+    value_coef: float = _setting(0.01, 0)
+    entropy_coef: float = _setting(1e-4, 0)
+    # The optimizer.
+    learning_rate: float = _setting(1e-3, 0)
+    cooldown: float = _setting(0.0, 0, 1)
+    adam_epsilon: float = _setting(1e-7, 0)
+    max_gradient_norm: float = _setting(1.0, 0)
+    # Intrinsic reward.
+    curiosity: str = _setting("icm")
+    intrinsic_scale: float = _setting(0.1, 0, unused={"curiosity": ("none",)})
+    curiosity_coef: float = _setting(10.0, 0, unused={"curiosity": ("none", "counts")})
+    episodic_novelty: bool = _setting(False, unused={"curiosity": ("none",)})
+    reward_rate: float = _setting(0.9, 0, 1)
+    # Imitation of the agent's own successes.
+    imitation_coef: float = _setting(0.0, 0)
+    imitation_episodes: int = _setting(16, 1, unused={"imitation_coef": (0,)})
+    # The network.
+    encoder: Literal["paper", "objects"] = _setting("paper")
+    filters: tuple[int, int] = _setting((32, 64), 1, 4096)
+    hidden: int = _setting(64, 1, 65_536)
+    embedding: int = _setting(8, 1, 65_536)
+    chunk: int = _setting(64, 1)
 
     def __post_init__(self) -> None:
         """Refuses settings that cannot be trained with.
@@ -94,22 +138,31 @@ class Config:
           ValueError: naming the setting, its value and what is allowed.
         """
         for field in dataclasses.fields(self):
-            _check_type(field, getattr(self, field.name))
-        for name, (low, high) in _RANGES.items():
-            values = getattr(self, name)
-            for value in values if isinstance(values, tuple) else (values,):
-                if not low <= value <= high:
-                    raise ValueError(f"{name} must lie in [{low}, {high}], got {value}")
-        for name, choices in _CHOICES.items():
-            if getattr(self, name) not in get_args(choices):
-                allowed = ", ".join(get_args(choices))
-                raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}")
+            value = getattr(self, field.name)
+            _check_type(field, value)
+            _check_value(field, value)
+        registry.curiosity_factory(self.curiosity)
+        for field in dataclasses.fields(self):
+            self._check_use(field)
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
             raise ValueError(
                 f"minibatch must divide episodes={self.episodes}, got {self.minibatch}; "
                 f"allowed: {', '.join(map(str, divisors))}"
             )
+
+    def _check_use(self, field: dataclasses.Field) -> None:
+        """Refuses a setting without effect, unless a preset has brought its value along."""
+        value = getattr(self, field.name)
+        usual = [field.default, *(p[field.name] for p in PRESETS.values() if field.name in p)]
+        if value in usual:
+            return
+        for name, values in field.metadata["unused"].items():
+            if getattr(self, name) in values:
+                raise ValueError(
+                    f"{field.name}={value!r} has no effect with {name}={getattr(self, name)!r}; "
+                    f"leave it at {field.default!r}"
+                )
 
     @classmethod
     def preset(cls, name: str = "paper", **overrides: Any) -> Self:
@@ -149,37 +202,11 @@ class Config:
         """The largest number of environment steps of one iteration."""
         return self.episodes * self.max_steps
 
+    @property
+    def gradient_steps(self) -> int:
+        """The number of gradient steps of one iteration."""
+        return self.epochs * (self.episodes // self.minibatch)
 
-_CHOICES = {"curiosity": Curiosity, "encoder": EncoderName}
-_INFINITY = float("inf")
-_RANGES: dict[str, tuple[float, float]] = {
-    "num_features": (1, 256),
-    "max_steps": (1, 10_000),
-    "iterations": (1, _INFINITY),
-    "stop_when_solved": (0, 1),
-    "episodes": (1, _INFINITY),
-    "epochs": (1, _INFINITY),
-    "minibatch": (1, _INFINITY),
-    "discount": (0, 1),
-    "gae_lambda": (0, 1),
-    "clip": (0, _INFINITY),
-    "value_coef": (0, _INFINITY),
-    "entropy_coef": (0, _INFINITY),
-    "learning_rate": (0, _INFINITY),
-    "cooldown": (0, 1),
-    "adam_epsilon": (0, _INFINITY),
-    "max_gradient_norm": (0, _INFINITY),
-    "intrinsic_scale": (0, _INFINITY),
-    "curiosity_coef": (0, _INFINITY),
-    "imitation_coef": (0, _INFINITY),
-    "imitation_episodes": (1, _INFINITY),
-    "reward_rate": (0, 1),
-    "filters": (1, 4096),
-    "hidden": (1, 65_536),
-    "embedding": (1, 65_536),
-    "eval_episodes": (1, _INFINITY),
-    "chunk": (1, _INFINITY),
-}
 
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
@@ -191,6 +218,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "episodes": 256,
         "minibatch": 64,
         "epochs": 8,
+        "bootstrap": "value",
         "filters": (16, 32),
         "entropy_coef": 3e-3,
         "curiosity": "counts",
@@ -203,6 +231,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "env_id": "pstsy",
         "iterations": 800,
         "epochs": 4,
+        "bootstrap": "value",
         "curiosity": "none",
         "entropy_coef": 3e-3,
         "encoder": "objects",
@@ -229,3 +258,14 @@ def _check_type(field: dataclasses.Field, value: Any) -> None:
     if not matches:
         wanted = "2 integers" if isinstance(default, tuple) else type(default).__name__
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
+
+
+def _check_value(field: dataclasses.Field, value: Any) -> None:
+    limits, choices = field.metadata["limits"], get_args(get_type_hints(Config)[field.name])
+    if limits is not None:
+        low, high = limits
+        for number in value if isinstance(value, tuple) else (value,):
+            if not low <= number <= high:
+                raise ValueError(f"{field.name} must lie in [{low}, {high}], got {number}")
+    if isinstance(field.default, str) and choices and value not in choices:
+        raise ValueError(f"{field.name} must be one of {', '.join(choices)}, got {value!r}")

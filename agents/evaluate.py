@@ -123,7 +123,8 @@ def evaluate(
     chunk = min(chunk, tasks.time.shape[0])
     unused_key = jax.random.key(0)
     played = rollout(agent, params, env, tasks, unused_key, choose=greedy_action, chunk=chunk)
-    outcome = Evaluation(played.solved, played.length, played.action.swapaxes(0, 1))
+    episodes = played.episodes
+    outcome = Evaluation(episodes.solved, episodes.length, episodes.action.swapaxes(0, 1))
     return outcome if shards.count == 1 else _rows(shards.whole(outcome), slice(num_tasks))
 
 

@@ -24,11 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from agents.acting.rollout import rollout, sample_action
+from agents.acting.rollout import sample_action
 from agents.config import PRESETS, Config
-from agents.networks.core import Outputs
+from agents.networks.actions import ActionDistribution
 from agents.parallel.sharding import Placement
-from agents.ppo.learner import make_train, prepare
+from agents.ppo.learner import make_train
 from agents.runs.session import make_advance
 from benchmarks import harness
 from trap_tube_jax.objects import NUM_DIRECTIONS
@@ -151,23 +151,16 @@ def repeated_seconds(config: Config, repeats: int = 5) -> float:
     curiosity = "counts" if config.curiosity == "counts" else "none"
     train = make_train(dataclasses.replace(config, curiosity=curiosity))
     state = jax.jit(train.init)(jax.random.key(0))
-    reset_keys = jax.random.split(jax.random.key(1), config.episodes)
-    initial, _ = jax.jit(jax.vmap(train.env.reset))(reset_keys)
     logits = jnp.zeros((config.episodes, NUM_DIRECTIONS))
     step_keys = jax.random.split(jax.random.key(2), config.max_steps)
 
     @jax.jit
-    def play(key: jax.Array) -> Any:
-        chosen = {"choose": sample_action, "chunk": config.chunk}
-        return rollout(train.agent, state.params, train.env, initial, key, **chosen)
-
-    @jax.jit
     def repeat(trajectory: Any) -> Any:
-        outputs = Outputs(logits, logits, logits[:, 0])
-        actions = jax.lax.map(lambda key: sample_action(key, outputs), step_keys)
-        return actions, prepare(train.agent, train.config, state, trajectory)
+        distribution = ActionDistribution(logits, logits)
+        actions = jax.lax.map(lambda key: sample_action(key, distribution), step_keys)
+        return actions, train.prepare(state, trajectory)
 
-    trajectory = play(jax.random.key(3))
+    trajectory = jax.jit(train.play)(state.params, jax.random.key(1), jax.random.key(3))
     return harness.measure(lambda _: repeat(trajectory), repeats).median_s
 
 

@@ -6,6 +6,7 @@ parts are separate programs, so they add up to the iteration only roughly.
 """
 
 import dataclasses
+import functools
 import math
 import pathlib
 from collections.abc import Callable
@@ -19,10 +20,14 @@ from rich.console import Console
 from rich.table import Table
 
 from agents import Config, make_train
-from agents.acting.rollout import Trajectory, rollout, sample_action
+from agents.acting.encodings import encode_episodes
+from agents.acting.episodes import take
+from agents.acting.rollout import Trajectory
 from agents.config import PRESETS
+from agents.curiosity import Experience
 from agents.networks.agent import Params
-from agents.ppo.learner import Batch, Train, TrainState, encode_episodes, make_optimizer, prepare
+from agents.networks.windows import encode_rows
+from agents.ppo.learner import Batch, Train, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
 
@@ -84,12 +89,12 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     iterate = jax.jit(train.iterate)
     for _ in range(warm):
         state, _ = iterate(state)
-    play = jax.jit(lambda state: _play(train, state))
+    play = jax.jit(lambda state: train.play(state.params, *jax.random.split(state.key)))
     trajectory = play(state)
-    batch, _, _ = jax.jit(lambda *x: prepare(train.agent, config, *x))(state, trajectory)
+    batch, _, _ = jax.jit(train.prepare)(state, trajectory)
     per_observation = matrix_flop(
         jax.make_jaxpr(train.agent.encoder.apply)(
-            state.params["encoder"], trajectory.observations()[0, :1]
+            state.params["encoder"], trajectory.episodes.observations()[0, :1]
         )
     )
     distinct = jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch)
@@ -135,21 +140,6 @@ def matrix_product_flops(repeats: int = 5) -> float:
     return 2.0 * MATRIX**3 / timing.median_s
 
 
-def _play(train: Train, state: TrainState) -> Trajectory:
-    config = train.config
-    reset_key, action_key = jax.random.split(state.key)
-    initial, _ = jax.vmap(train.env.reset)(jax.random.split(reset_key, config.episodes))
-    return rollout(
-        train.agent,
-        state.params,
-        train.env,
-        initial,
-        action_key,
-        choose=sample_action,
-        chunk=config.chunk,
-    )
-
-
 def _minibatches(config: Config) -> jax.Array:
     """i32[epochs * minibatches, minibatch]: episodes, shuffled anew in each epoch."""
     keys = jax.random.split(jax.random.key(0), config.epochs)
@@ -179,13 +169,19 @@ def _accumulate(config: Config, gradient: Callable[[jax.Array], Params], params:
 
 def _encoder_only(train: Train, state: TrainState, batch: Batch) -> Params:
     def total(params: Params, part: Batch) -> jax.Array:
-        where = (part.observation_id, part.layout, part.cells)
-        features = encode_episodes(params, train.agent, train.config, *where)
+        encode = functools.partial(encode_rows, train.agent.encoder)
+        features = encode_episodes(
+            encode,
+            params["encoder"],
+            part.episodes,
+            part.observation_id,
+            chunk=train.config.chunk,
+        )
         return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
 
     return _accumulate(
         train.config,
-        lambda episodes: jax.grad(total)(state.params, batch.take(episodes)),
+        lambda episodes: jax.grad(total)(state.params, take(batch, episodes)),
         state.params,
     )
 
@@ -194,19 +190,27 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
     agent = train.agent
 
     def total(params: Params, features: jax.Array, part: Batch) -> jax.Array:
-        given = (params, features, part.action, part.reward)
-        if agent.curiosity is None:
-            everything = [*agent.act(params, agent.unroll(*given))]
-        else:
+        given = (params, features, part.episodes.action, part.episodes.reward)
+        if train.curiosity.needs_embeddings:
             embedding, following = agent.unroll_both(*given)
-            prediction = agent.predict(params, embedding, following, features, part.action)
-            everything = [*agent.act(params, embedding), *jax.tree.leaves(prediction)]
+            experience = Experience(
+                part.episodes,
+                part.observation_id,
+                features[..., :0],
+                embedding,
+                following,
+                agent.embed_action(params, part.episodes.action),
+            )
+            own = train.curiosity.losses(params["curiosity"], experience)
+        else:
+            embedding, own = agent.unroll(*given), {}
+        everything = jax.tree.leaves((agent.act(params, embedding), own))
         return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 
     def gradient(episodes: jax.Array) -> Params:
         features = trajectory.features[:, episodes]
         by_params, by_features = jax.grad(total, (0, 1))(
-            state.params, features, batch.take(episodes)
+            state.params, features, take(batch, episodes)
         )
         # The derivative by the features is part of the work, so something must need it.
         return jax.tree.map(lambda x: x + 1e-30 * jnp.sum(by_features), by_params)
@@ -215,7 +219,7 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
 
 
 def _optimizer_only(train: Train, state: TrainState) -> Params:
-    optimizer = make_optimizer(train.config)
+    optimizer = train.optimizer
 
     def update(carry: Any, _: jax.Array) -> tuple[Any, None]:
         params, opt_state = carry

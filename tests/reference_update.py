@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.acting.rollout import Trajectory, action_log_prob
+from agents.acting.episodes import Episodes
+from agents.acting.rollout import Trajectory
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.objects import AGENT, BASE_COLORS, FOOD, GROUND, TOOL, TUBE1
 
@@ -111,13 +112,16 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
     embedding = agent.unroll(params, features, action, reward)
     outputs = agent.act(params, embedding)
     return Trajectory(
-        layout=initial,
-        cells=cells,
-        action=action,
-        reward=reward,
-        mask=jnp.asarray(recording.steps("batch/weight")),
+        episodes=Episodes(
+            layout=initial,
+            cells=cells,
+            action=action,
+            reward=reward,
+            discount=jnp.full_like(reward, jnp.nan),  # which the baseline does not look at
+            mask=jnp.asarray(recording.steps("batch/weight")),
+        ),
         features=features,
-        log_prob=action_log_prob(outputs, action),
-        value=outputs.value,
         embedding=embedding,
+        log_prob=outputs.actions.log_prob(action),
+        value=jnp.concatenate([outputs.value, jnp.full_like(outputs.value[:1], jnp.nan)]),
     )

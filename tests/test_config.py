@@ -18,7 +18,7 @@ def test_paper_preset_is_the_specification():
         "learning_rate": 1e-3, "adam_epsilon": 1e-7, "max_gradient_norm": 1.0,
         "curiosity": "icm", "intrinsic_scale": 0.1, "curiosity_coef": 10.0, "reward_rate": 0.9,
         "filters": (32, 64), "hidden": 64, "embedding": 8, "iterations": 250,
-        "episodic_novelty": False,
+        "episodic_novelty": False, "bootstrap": "baseline",
     }  # fmt: skip
     assert {name: getattr(config, name) for name in expected} == expected
 
@@ -49,6 +49,10 @@ def test_every_setting_is_documented():
         ({"filters": (0, 64)}, ["filters", "0"]),
         ({"learning_rate": "fast"}, ["learning_rate", "float", "fast"]),
         ({"episodic_novelty": 1}, ["episodic_novelty", "bool", "1"]),
+        ({"bootstrap": "none"}, ["bootstrap", "none", "value, baseline"]),
+        ({"curiosity": "none", "intrinsic_scale": 0.7}, ["intrinsic_scale", "0.7", "'none'"]),
+        ({"curiosity": "counts", "curiosity_coef": 1.0}, ["curiosity_coef", "'counts'", "10.0"]),
+        ({"imitation_episodes": 3}, ["imitation_episodes", "imitation_coef=0"]),
         ({"num_features": 0}, ["num_features", "0"]),
         ({"max_steps": 0}, ["max_steps", "0"]),
         ({"epsiodes": 3}, ["epsiodes", "did you mean 'episodes'", "minibatch"]),
@@ -59,6 +63,11 @@ def test_refusals_name_the_value_and_what_is_allowed(settings, words):
         Config.preset("paper", **settings)
     for word in words:
         assert word in str(error.value)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_can_be_had_without_curiosity(name):
+    assert Config.preset(name, curiosity="none", imitation_coef=0.0).curiosity == "none"
 
 
 def test_unknown_preset_lists_the_known():

@@ -1,12 +1,13 @@
-"""The fast path of the encoder against the plain one."""
+"""Grouping equal elements, and functions of rows chunk by chunk."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import trap_tube_jax as tt
-from agents.networks import distinct
+from agents.networks import chunks
+from agents.networks.grouping import group
+from agents.networks.shared_maximum import shared_maximum
 
 ROWS, WIDTH = 37, 5
 
@@ -15,49 +16,12 @@ ROWS, WIDTH = 37, 5
 def test_groups_are_those_of_numpy(seed):
     rng = np.random.default_rng(seed)
     keys = rng.integers(0, 6, (2, 200)).astype(np.int32)
-    groups = distinct.group(*map(jnp.asarray, keys))
+    groups = group(*map(jnp.asarray, keys))
     _, expected = np.unique(keys, axis=1, return_inverse=True)
     np.testing.assert_array_equal(groups.number, expected)
     assert groups.total == expected.max() + 1
     representative = np.asarray(groups.representative)[expected]
     np.testing.assert_array_equal(keys[:, representative], keys)
-
-
-def test_layouts_share_an_id_only_if_equal():
-    env = tt.make("pstsy")
-    keys = jax.random.split(jax.random.key(0), 40)
-    states, _ = jax.jit(jax.vmap(env.reset))(jnp.concatenate([keys, keys[::-1]]))
-    ids = np.asarray(distinct.layout_ids(states))
-    content = [
-        tuple(np.concatenate([np.ravel(leaf[i]) for leaf in parts]).tolist())
-        for parts in [(states.board, states.palette, states.tool_extent)]
-        for i in range(80)
-    ]
-    same = np.array([[a == b for a in content] for b in content])
-    np.testing.assert_array_equal(ids[:, None] == ids[None], same)
-    assert len(set(ids.tolist())) == len(set(content))
-
-
-def test_equal_hashes_do_not_merge_layouts(monkeypatch):
-    """With a hash that says nothing, layouts are still told apart by their content."""
-
-    class Zeros:
-        def integers(self, low: int, high: int, size: int, dtype: type) -> np.ndarray:
-            del low, high
-            return np.zeros(size, dtype)
-
-    monkeypatch.setattr(np.random, "default_rng", lambda seed: Zeros())
-    states, _ = jax.vmap(tt.make("st").reset)(jax.random.split(jax.random.key(1), 6))
-    assert len(set(np.asarray(distinct.layout_ids(states)).tolist())) == 6
-
-
-def test_positions_are_told_apart():
-    state = tt.base_state()
-    cells = np.random.default_rng(0).integers(0, 12, (500, 3, 2)).astype(np.int32)
-    ids = jax.vmap(lambda c: distinct.position_id(state.replace(agent=c[0], tool=c[1], food=c[2])))(
-        cells
-    )
-    assert len(set(np.asarray(ids).tolist())) == len(np.unique(cells, axis=0))
 
 
 def plain(params: dict[str, jax.Array], rows: jax.Array) -> jax.Array:
@@ -73,7 +37,7 @@ def remembering(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     product = rows @ params["w"]
     if remembered is not None:
-        product = distinct.recall(product, remembered["product"])
+        product = chunks.recall(product, remembered["product"])
     return jnp.tanh(product + params["b"].reshape(1, -1)), {"product": product}
 
 
@@ -91,12 +55,12 @@ def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
 @pytest.mark.parametrize("chunk", [1, 8, 37, 64])
 @pytest.mark.parametrize("count", [0, 1, 8, 9, ROWS])
 def test_map_rows_and_its_gradient(problem, fn, chunk, count, monkeypatch):
-    monkeypatch.setattr(distinct, "REMEMBERED_BYTES", 16 * 4 * WIDTH)
+    monkeypatch.setattr(chunks, "REMEMBERED_BYTES", 16 * 4 * WIDTH)
     params, rows, cotangent = problem
     valid = (jnp.arange(ROWS) < count)[:, None]
 
     def ours(params):
-        features = distinct.map_rows(fn, chunk, params, rows, jnp.int32(count))
+        features = chunks.map_rows(fn, chunk, params, rows, jnp.int32(count))
         return jnp.sum(jnp.where(valid, features, 0) * cotangent)
 
     def reference(params):
@@ -113,7 +77,7 @@ def test_map_rows_under_vmap_with_different_counts(problem):
 
     def gradient(params, count):
         def total(params):
-            features = distinct.map_rows(remembering, 8, params, rows, count)
+            features = chunks.map_rows(remembering, 8, params, rows, count)
             return jnp.sum(features * cotangent * (jnp.arange(ROWS) < count)[:, None])
 
         return jax.grad(total)(params)
@@ -130,5 +94,5 @@ def test_map_rows_under_vmap_with_different_counts(problem):
 
 
 def test_shared_maximum_is_unbatched():
-    doubled = jax.vmap(jax.vmap(lambda x: x + distinct.shared_maximum(x)))
+    doubled = jax.vmap(jax.vmap(lambda x: x + shared_maximum(x)))
     np.testing.assert_array_equal(doubled(jnp.array([[1, 2], [3, 4]])), [[5, 6], [7, 8]])

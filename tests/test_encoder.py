@@ -1,6 +1,5 @@
 """The paper's encoder by distinct windows against the plain one."""
 
-import functools
 from typing import Any
 
 import jax
@@ -9,9 +8,11 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.networks import distinct
-from agents.networks.core import draw
-from agents.networks.encoder import Encoder, convolve, cut_into_windows, encode_by_windows
+from agents.networks import chunks
+from agents.networks.convolution import convolve
+from agents.networks.encoder import Encoder
+from agents.networks.grouping import group_rows
+from agents.networks.windows import cut_into_windows, encode_by_windows
 
 EPISODES, STEPS = 3, 6
 encoder = Encoder((4, 6))
@@ -38,21 +39,19 @@ def observation(request: pytest.FixtureRequest) -> jax.Array:
 
 
 def parameters(observation: jax.Array) -> dict:
-    deviations = encoder.init(jax.random.key(0), observation[:1])
+    params: Any = encoder.init(jax.random.key(3), observation[:1])
     # Biases too: what lies beyond the edge is zero only because nothing is added to it.
-    deviations = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else leaf + 0.1, deviations)
-    return draw(jax.random.key(3), deviations)
+    return jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else leaf + 0.1, params)
 
 
 @pytest.mark.parametrize("remembered_bytes", [0, 2**20])
 def test_windows_give_the_plain_features_and_gradient(observation, remembered_bytes, monkeypatch):
-    monkeypatch.setattr(distinct, "REMEMBERED_BYTES", remembered_bytes)
+    monkeypatch.setattr(chunks, "REMEMBERED_BYTES", remembered_bytes)
     params = parameters(observation)
     count = jnp.int32(len(observation))
 
     def by_windows(params):
-        rows = functools.partial(encode_by_windows, encoder)
-        return jnp.sin(distinct.map_rows(rows, 4, params, observation, count))
+        return jnp.sin(chunks.map_rows(encode_by_windows, 4, params, observation, count))
 
     def plain(params: Any) -> Any:
         features: Any = encoder.apply(params, observation)
@@ -106,7 +105,7 @@ def test_windows_are_the_parts_of_the_board():
 
 def test_few_windows_of_an_episode_are_distinct():
     window, block = cut_into_windows(jax.jit(boards, static_argnums=(0, 1))("base", 3))
-    groups = distinct.group_rows(jnp.concatenate([window, block[:, None]], axis=1))
+    groups = group_rows(jnp.concatenate([window, block[:, None]], axis=1))
     assert 36 < groups.total < len(window) / 5
     np.testing.assert_array_equal(window[groups.representative[groups.number]], window)
     np.testing.assert_array_equal(block[groups.representative[groups.number]], block)

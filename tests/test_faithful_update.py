@@ -4,16 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 from reference_update import Recording, make_trajectory
 
 from agents import Config
-from agents.curiosity.modules import intrinsic_reward
-from agents.networks.agent import Agent, num_parameters
-from agents.ppo import learner as ppo
+from agents.networks.agent import num_parameters
+from agents.ppo.learner import make_train
 
 CONFIG = Config.preset("paper", episodes=8, minibatch=8, epochs=5)
 
@@ -26,45 +24,38 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def ours(recording: Recording) -> dict[str, Any]:
-    agent = Agent(CONFIG)
-    params = recording.params("param", agent.init(jax.random.key(0)))
+    train = make_train(CONFIG)
+    params = recording.params("param", train.init_params(jax.random.key(0)))
 
     @jax.jit
     def run(params):
-        trajectory = make_trajectory(agent, params, recording)
-        train = ppo.make_train(CONFIG)
+        trajectory = make_trajectory(train.agent, params, recording)
         state = train.init(jax.random.key(0))._replace(params=params)
-        _, next_embedding = agent.unroll_both(
-            params, trajectory.features, trajectory.action, trajectory.reward
-        )
-        prediction = agent.predict(
-            params, trajectory.embedding, next_embedding, trajectory.features, trajectory.action
-        )
-        batch, state, _ = ppo.prepare(agent, CONFIG, state, trajectory)
+        experience = train.acting_experience(params, trajectory)
+        prediction = train.curiosity.predict(params["curiosity"], experience)
+        raw, _ = train.intrinsic_reward(state, trajectory)
+        batch, state, _ = train.prepare(state, trajectory)
         moments = (state.extrinsic, state.intrinsic)
-        return trajectory, next_embedding, prediction, batch, moments, state.replay
+        return trajectory, experience.next_embedding, prediction, raw, batch, moments, state.replay
 
-    names = ("trajectory", "next_embedding", "prediction", "batch", "moments", "replay")
-    return {"agent": agent, "params": params, **dict(zip(names, run(params), strict=True))}
+    names = ("trajectory", "next_embedding", "prediction", "raw", "batch", "moments", "replay")
+    return {"train": train, "params": params, **dict(zip(names, run(params), strict=True))}
 
 
 @pytest.fixture(scope="module")
 def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
-    agent, batch = ours["agent"], ours["batch"]
-    optimizer = ppo.make_optimizer(CONFIG)
+    train, batch = ours["train"], ours["batch"]
     clip = optax.clip_by_global_norm(CONFIG.max_gradient_norm)
 
     @jax.jit
     def update(params, opt_state):
-        gradient, terms = jax.grad(ppo.loss, has_aux=True)(
-            params, agent, CONFIG, batch, ours["replay"]
-        )
-        step, opt_state = optimizer.update(gradient, opt_state, params)
+        gradient, terms = jax.grad(train.loss, has_aux=True)(params, batch, ours["replay"])
+        step, opt_state = train.optimizer.update(gradient, opt_state, params)
         clipped, _ = clip.update(gradient, clip.init(params))
         params = optax.apply_updates(params, step)
         return params, opt_state, clipped, {**terms, "gradient_norm": optax.tree.norm(gradient)}
 
-    params, opt_state, done = ours["params"], optimizer.init(ours["params"]), []
+    params, opt_state, done = ours["params"], train.optimizer.init(ours["params"]), []
     for _ in range(5):
         params, opt_state, clipped, terms = update(params, opt_state)
         done.append({"params": params, "clipped": clipped, "terms": terms})
@@ -92,34 +83,32 @@ def test_parameter_count(ours):
 
 
 def test_replayed_boards_are_the_recorded_ones(recording, ours):
-    boards = jax.jit(lambda trajectory: trajectory.observations())(ours["trajectory"])
+    boards = jax.jit(lambda episodes: episodes.observations())(ours["trajectory"].episodes)
     np.testing.assert_array_equal(boards, recording.steps("batch/observation_rgb"))
 
 
 def test_network_outputs(recording, ours):
-    trajectory, prediction = ours["trajectory"], ours["prediction"]
-    outputs = ours["agent"].act(ours["params"], trajectory.embedding)
-    grasp, move = jax.nn.softmax(outputs.grasp_logits), jax.nn.softmax(outputs.move_logits)
-    entropy = -jnp.sum(grasp * jnp.log(grasp), -1) - jnp.sum(move * jnp.log(move), -1)
+    trajectory, (error, inferred) = ours["trajectory"], ours["prediction"]
+    actions, _ = ours["train"].agent.act(ours["params"], trajectory.embedding)
     assert_close(trajectory.embedding, recording.steps("out/embedding"))
     assert_close(trajectory.log_prob, recording.steps("out/log_probs"))
-    assert_close(entropy, recording.steps("out/entropy"))
-    assert_close(trajectory.value, recording.steps("out/values"))
+    assert_close(actions.entropy(), recording.steps("out/entropy"))
+    assert_close(trajectory.value[:-1], recording.steps("out/values"))
     assert_close(ours["next_embedding"], recording.steps("out/embedding_next"))
-    error = recording.steps("out/embedding_next_pred") - recording.steps("out/embedding_next")
-    assert_close(prediction.error, np.square(error))
-    assert_close(jax.nn.softmax(prediction.grasp_logits), recording.steps("out/move_pred"))
-    assert_close(jax.nn.softmax(prediction.move_logits), recording.steps("out/grasp_pred"))
+    expected = recording.steps("out/embedding_next_pred") - recording.steps("out/embedding_next")
+    assert_close(error, np.square(expected))
+    assert_close(jax.nn.softmax(inferred.grasp_logits), recording.steps("out/move_pred"))
+    assert_close(jax.nn.softmax(inferred.move_logits), recording.steps("out/grasp_pred"))
 
 
 def test_rewards_and_targets(recording, ours):
     extrinsic, intrinsic = ours["moments"]
     mask = recording.steps("batch/weight")
-    raw = intrinsic_reward(ours["prediction"])
+    raw = ours["raw"]
     assert_close(raw * mask, recording.steps("reward/intrinsic") * mask)
     assert_close(extrinsic.deviation, recording["reward/extrinsic_std"])
     assert_close(intrinsic.deviation, recording["reward/intrinsic_std"])
-    reward = ours["trajectory"].reward / extrinsic.deviation
+    reward = ours["trajectory"].episodes.reward / extrinsic.deviation
     reward = reward + CONFIG.intrinsic_scale * raw * mask / intrinsic.deviation
     assert_close(reward, recording.steps("reward/total") * mask)
     assert_close(ours["batch"].advantage, recording.steps("target/advantages") * mask)

@@ -1,18 +1,18 @@
 """The terms of the loss against float64 NumPy, on random cases with masks."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from agents.curiosity.modules import (
-    ICM,
-    Prediction,
-    Transition,
-    forward_loss,
-    intrinsic_reward,
-)
+from agents.acting.episodes import Episodes
+from agents.config import Config
+from agents.curiosity import Experience
+from agents.curiosity.icm import ICM
+from agents.networks.actions import ActionDistribution
 from agents.ppo import losses
 
 CASES, CHOICES = 1_000, 4
@@ -36,19 +36,40 @@ def softmax(logits: np.ndarray) -> np.ndarray:
     return exponentials / exponentials.sum(-1, keepdims=True)
 
 
-def test_log_prob_and_entropy(cases):
-    probs = softmax(cases["logits"])
-    expected = np.log(probs[np.arange(CASES), cases["choice"]])
-    result = losses.log_prob(jnp.asarray(cases["logits"]), jnp.asarray(cases["choice"]))
+def distribution(logits: jax.Array) -> ActionDistribution:
+    """Grasp by these logits, move by the same in reverse order."""
+    return ActionDistribution(logits, logits[..., ::-1])
+
+
+def test_log_prob_and_entropy_of_actions(cases):
+    probs, everyone = softmax(cases["logits"]), np.arange(CASES)
+    grasp, move = cases["choice"], np.roll(cases["choice"], 1)
+    actions = distribution(jnp.asarray(cases["logits"]))
+    expected = np.log(probs[everyone, grasp]) + np.log(probs[everyone, CHOICES - 1 - move])
+    result = actions.log_prob(jnp.stack([grasp, move], axis=-1))
     np.testing.assert_allclose(result, expected, rtol=1e-5, atol=1e-5)
-    expected = -(probs * np.log(probs)).sum(-1)
-    result = losses.entropy(jnp.asarray(cases["logits"]))
-    np.testing.assert_allclose(result, expected, rtol=1e-4, atol=1e-5)
+    expected = -2 * (probs * np.log(probs)).sum(-1)
+    np.testing.assert_allclose(actions.entropy(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_mode_is_the_most_probable_action(cases):
+    mode = distribution(jnp.asarray(cases["logits"])).mode()
+    best = cases["logits"].argmax(-1)
+    np.testing.assert_array_equal(mode, np.stack([best, CHOICES - 1 - best], axis=-1))
+
+
+def test_samples_have_the_joint_frequencies():
+    logits = jnp.broadcast_to(jnp.log(jnp.array([0.1, 0.2, 0.3, 0.4])), (20_000, CHOICES))
+    action = distribution(logits).sample(jax.random.key(0))
+    counts = np.zeros((CHOICES, CHOICES))
+    np.add.at(counts, tuple(np.asarray(action).T), 1 / len(action))
+    expected = np.outer([0.1, 0.2, 0.3, 0.4], [0.4, 0.3, 0.2, 0.1])
+    np.testing.assert_allclose(counts, expected, atol=0.01)
 
 
 def test_entropy_of_certainty_is_zero_and_its_gradient_finite():
     logits = jnp.array([0.0, -1e4, -1e4, -1e4])
-    value, gradient = jax.value_and_grad(losses.entropy)(logits)
+    value, gradient = jax.value_and_grad(lambda x: distribution(x).entropy())(logits)
     assert value == 0
     assert np.all(np.isfinite(gradient))
 
@@ -74,8 +95,8 @@ def test_clipping_stops_the_gradient_only_where_it_would_go_further(ratio, advan
     assert bool(gradient != 0) == moves
 
 
-def test_masked_mean_divides_by_all_steps(cases):
-    result = losses.masked_mean(jnp.asarray(cases["new"]), jnp.asarray(cases["mask"]))
+def test_padded_mean_divides_by_all_steps(cases):
+    result = losses.padded_mean(jnp.asarray(cases["new"]), jnp.asarray(cases["mask"]))
     expected = (cases["new"].astype(np.float64) * cases["mask"]).sum() / CASES
     np.testing.assert_allclose(result, expected, rtol=1e-5)
 
@@ -83,11 +104,12 @@ def test_masked_mean_divides_by_all_steps(cases):
 @pytest.mark.parametrize("name", ["log_prob", "entropy", "clipped_surrogate", "squared_error"])
 def test_gradients_by_finite_differences(cases, name):
     logits, choice = jnp.asarray(cases["logits"][:16]) / 3, jnp.asarray(cases["choice"][:16])
+    action = jnp.stack([choice, choice], axis=-1)
     new, old = jnp.asarray(cases["new"][:16]), jnp.asarray(cases["old"][:16])
     advantage = jnp.asarray(cases["advantage"][:16])
     fun, args = {
-        "log_prob": (lambda x: losses.log_prob(x, choice), (logits,)),
-        "entropy": (losses.entropy, (logits,)),
+        "log_prob": (lambda x: distribution(x).log_prob(action), (logits,)),
+        "entropy": (lambda x: distribution(x).entropy(), (logits,)),
         # A wide interval: the kink of the clip has no derivative to compare.
         "clipped_surrogate": (lambda x: losses.clipped_surrogate(x, old, advantage, 9.0), (new,)),
         "squared_error": (losses.squared_error, (new, old)),
@@ -95,34 +117,37 @@ def test_gradients_by_finite_differences(cases, name):
     check_grads(fun, args, order=1, modes=["rev"], atol=2e-2, rtol=2e-2)
 
 
-def test_icm_is_the_forward_error_and_the_inverse_logits():
+def test_icm_is_the_forward_error_and_the_inverse_likelihood():
     """The curiosity's arrays against a NumPy reading of its equations."""
     rng = np.random.default_rng(2)
-    units, width = 6, 4
-    embedding, next_embedding = rng.normal(size=(2, CASES, units)).astype(np.float32)
-    action_embedding = rng.normal(size=(CASES, width)).astype(np.float32)
-    action = jnp.zeros((CASES, 2), jnp.int32)
-    nothing = jnp.zeros((CASES, 0))
-    transition = Transition(
-        jnp.asarray(embedding), jnp.asarray(next_embedding), jnp.asarray(action_embedding),
-        nothing, nothing, action,
-    )  # fmt: skip
-    icm = ICM(hidden=5)
-    params = icm.init(jax.random.key(0), transition, method="predict")
-    prediction = icm.apply(params, transition, method="predict")
-    assert isinstance(prediction, Prediction)
+    config = Config(hidden=6, embedding=2)
+    embedding, next_embedding = rng.normal(size=(2, 1, CASES, 6)).astype(np.float32)
+    action_embedding = rng.normal(size=(1, CASES, 4)).astype(np.float32)
+    action = rng.integers(0, CHOICES, (1, CASES, 2))
+    nothing: Any = None
+    episodes = Episodes(nothing, nothing, jnp.asarray(action), nothing, nothing, nothing)
+    experience = Experience(
+        episodes, nothing, nothing, *map(jnp.asarray, (embedding, next_embedding, action_embedding))
+    )
+    icm = ICM(config)
+    params = icm.init(jax.random.key(0), nothing)
 
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params["params"])
     forward = weights["forward"]["Dense_0"]
     both = np.concatenate([embedding, action_embedding], -1)
     error = embedding + both @ forward["kernel"] + forward["bias"] - next_embedding
-    np.testing.assert_allclose(intrinsic_reward(prediction), (error**2).sum(-1), rtol=1e-4)
-    np.testing.assert_allclose(forward_loss(prediction), (error**2).mean(-1), rtol=1e-4)
+    reward, memory = icm.reward(params, (), experience)
+    found = icm.losses(params, experience)
+    assert memory == ()
+    np.testing.assert_allclose(reward, (error**2).sum(-1), rtol=1e-4)
+    np.testing.assert_allclose(found["forward_loss"], (error**2).mean(-1), rtol=1e-4)
 
     inverse = weights["inverse"]
     both = np.concatenate([embedding, next_embedding], -1)
     x = both @ inverse["Dense_0"]["kernel"] + inverse["Dense_0"]["bias"]
     x = x / (1 + np.exp(-x))
-    for name, logits in (("grasp", prediction.grasp_logits), ("move", prediction.move_logits)):
-        expected = x @ inverse[name]["kernel"] + inverse[name]["bias"]
-        np.testing.assert_allclose(np.asarray(logits), expected, rtol=1e-3, atol=1e-4)
+    expected = np.zeros((1, CASES))
+    for part, name in enumerate(("grasp", "move")):
+        probs = softmax(x @ inverse[name]["kernel"] + inverse[name]["bias"])
+        expected -= np.log(np.take_along_axis(probs, action[..., part, None], -1)[..., 0])
+    np.testing.assert_allclose(found["inverse_loss"], expected, rtol=1e-4, atol=1e-5)

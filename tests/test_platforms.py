@@ -5,7 +5,7 @@ slow tests/test_platforms.py` has XLA compile them for H200 GPUs, which need not
 runs them.
 """
 
-from typing import Any, get_args
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +16,17 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import trap_tube_jax as tt
 from agents import Config, make_train
-from agents.config import Curiosity
 from agents.parallel.sharding import EPISODES, SEEDS, Placement
+from agents.registry import curiosities
 from agents.runs.session import make_advance
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 TINY = Config(
-    env_id="pstsy", max_steps=4, episodes=4, minibatch=2, epochs=1, filters=(2, 3), hidden=4,
+    env_id="sy", max_steps=4, episodes=4, minibatch=2, epochs=1, filters=(2, 3), hidden=4,
     embedding=2, chunk=4,
 ).to_dict()  # fmt: skip
 OBJECTS = {"curiosity": "rnd", "encoder": "objects"}
-CURIOSITIES = get_args(Curiosity)
+CURIOSITIES = curiosities()
 # What XLA wants to know of a GPU that it cannot ask.
 H200 = """
 platform_name: "CUDA"

@@ -61,7 +61,7 @@ def learn() -> Learner:
 def test_value_of_a_certain_reward(learn):
     reward, played = learn("value")
     np.testing.assert_allclose(played.value[0], reward, rtol=0.1)
-    np.testing.assert_allclose(played.value[1:] / reward, 0.0, atol=0.1)
+    np.testing.assert_allclose(played.value[1:-1] / reward, 0.0, atol=0.1)
 
 
 def test_value_is_discounted(learn):
@@ -74,7 +74,7 @@ def test_value_is_discounted(learn):
 @pytest.mark.parametrize("kind", ["policy", "cue", "credit", "memory"])
 def test_policy_earns_all_there_is(learn, kind):
     _, played = learn(kind)
-    np.testing.assert_array_equal(jnp.sum(played.reward, axis=0), 1)
+    np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)
 
 
 def test_memory_needs_the_gru(monkeypatch):
@@ -84,5 +84,5 @@ def test_memory_needs_the_gru(monkeypatch):
         Core, "advance", lambda core, state, inputs: advance(core, jnp.zeros_like(state), inputs)
     )
     learn = make_learner()
-    assert jnp.mean(jnp.sum(learn("memory")[1].reward, axis=0)) < 0.8
-    np.testing.assert_array_equal(jnp.sum(learn("cue")[1].reward, axis=0), 1)
+    assert jnp.mean(jnp.sum(learn("memory")[1].episodes.reward, axis=0)) < 0.8
+    np.testing.assert_array_equal(jnp.sum(learn("cue")[1].episodes.reward, axis=0), 1)

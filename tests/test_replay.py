@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config
-from agents.acting.rollout import Trajectory, place
-from agents.networks.agent import Agent
-from agents.ppo import learner as ppo
-from agents.ppo.replay import Replay
+from agents import Config, make_train
+from agents.acting.episodes import Episodes, place
+from agents.ppo import replay
 
 STEPS, CAPACITY = 4, 3
 CONFIG = Config(
@@ -19,68 +17,66 @@ CONFIG = Config(
 )  # fmt: skip
 
 
-def played(marks: list[int], solved: list[bool]) -> Trajectory:
+def played(marks: list[int], solved: list[bool]) -> Episodes:
     """Episodes whose first action's grasp is their mark; the solved ones end at step 2."""
     batch = len(marks)
     action = jnp.zeros((STEPS, batch, 2), jnp.int32).at[0, :, 0].set(jnp.array(marks))
     won = jnp.array(solved)
     base = tt.base_state()
-    return Trajectory(
+    return Episodes(
         layout=jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), base),
         cells=jnp.zeros((STEPS + 1, batch, 3, 2), jnp.uint8).at[..., 1].set(5),
         action=action,
         reward=jnp.zeros((STEPS, batch)).at[1].set(won * 1.0),
+        discount=jnp.ones((STEPS, batch)).at[1:].set(1.0 - won),
         mask=jnp.ones((STEPS, batch)).at[2:].set(1.0 - won),
-        features=jnp.zeros((STEPS + 1, batch, 3)),
-        log_prob=jnp.zeros((STEPS, batch)),
-        value=jnp.zeros((STEPS, batch)),
-        embedding=jnp.zeros((STEPS, batch, 4)),
     )
 
 
-def remembered(replay: Replay) -> list[int]:
+def remembered(memory: Episodes) -> list[int]:
     return [
-        int(replay.action[0, place, 0])
+        int(memory.action[0, place, 0])
         for place in range(CAPACITY)
-        if bool(jnp.any(replay.mask[:, place] > 0))
+        if bool(jnp.any(memory.mask[:, place] > 0))
     ]
 
 
 @pytest.fixture
-def empty() -> Replay:
-    return Replay.empty(tt.base_state(), CAPACITY, STEPS)
+def empty() -> Episodes:
+    return replay.empty(tt.base_state(), CAPACITY, STEPS)
 
 
 def test_solved_episodes_come_first_and_the_oldest_fall_out(empty):
     assert remembered(empty) == []
-    replay = empty.remember(played([0, 1, 2], [False, False, False]))
-    assert remembered(replay) == []
-    replay = replay.remember(played([0, 1, 2], [False, True, False]))
-    assert remembered(replay) == [1]
-    replay = replay.remember(played([2, 3, 0], [True, False, False]))
-    assert remembered(replay) == [2, 1]
-    replay = replay.remember(played([0, 3, 3, 0], [True, True, False, False]))
-    assert remembered(replay) == [0, 3, 2]
+    memory = replay.remember(empty, played([0, 1, 2], [False, False, False]))
+    assert remembered(memory) == []
+    memory = replay.remember(memory, played([0, 1, 2], [False, True, False]))
+    assert remembered(memory) == [1]
+    memory = replay.remember(memory, played([2, 3, 0], [True, False, False]))
+    assert remembered(memory) == [2, 1]
+    memory = replay.remember(memory, played([0, 3, 3, 0], [True, True, False, False]))
+    assert remembered(memory) == [0, 3, 2]
 
 
 def test_more_successes_than_places(empty):
-    replay = empty.remember(played([0, 1, 2, 3], [True] * 4))
-    assert len(remembered(replay)) == CAPACITY
+    memory = replay.remember(empty, played([0, 1, 2, 3], [True] * 4))
+    assert len(remembered(memory)) == CAPACITY
 
 
 def test_imitation_loss_is_the_weighted_log_likelihood(empty):
-    agent = Agent(CONFIG)
-    params = agent.init(jax.random.key(0))
-    replay = empty.remember(played([3, 1], [True, False]))
-    loss = jax.jit(lambda params: ppo.imitation_loss(params, agent, CONFIG, replay))(params)
+    train = make_train(CONFIG)
+    params = train.init_params(jax.random.key(0))
+    memory = replay.remember(empty, played([3, 1], [True, False]))
+    loss = jax.jit(lambda params: train.imitation_loss(params, memory))(params)
 
-    boards = jax.vmap(lambda cells: tt.observe(place(tt.base_state(), cells)))(replay.cells[:, 0])
+    boards = jax.vmap(lambda cells: tt.observe(place(tt.base_state(), cells)))(memory.cells[:, 0])
 
     @jax.jit
     def log_probs(params):
+        agent = train.agent
         features = agent.encode(params, boards)[:, None]
-        embedding = agent.unroll(params, features, replay.action[:, :1], replay.reward[:, :1])
-        return ppo.action_log_prob(agent.act(params, embedding), replay.action[:, :1])[:, 0]
+        embedding = agent.unroll(params, features, memory.action[:, :1], memory.reward[:, :1])
+        return agent.act(params, embedding).actions.log_prob(memory.action[:, :1])[:, 0]
 
     log_prob = log_probs(params)
     expected = -2.0 * (0.5 * log_prob[0] + 1.0 * log_prob[1]) / 2
@@ -88,17 +84,9 @@ def test_imitation_loss_is_the_weighted_log_likelihood(empty):
 
 
 def test_nothing_remembered_nothing_imitated(empty):
-    agent = Agent(CONFIG)
-    params = agent.init(jax.random.key(0))
-    imitate = jax.jit(lambda params: ppo.imitation_loss(params, agent, CONFIG, empty))
+    train = make_train(CONFIG)
+    params = train.init_params(jax.random.key(0))
+    imitate = jax.jit(lambda params: train.imitation_loss(params, empty))
     loss, gradient = imitate(params), jax.jit(jax.grad(imitate))(params)
     assert loss == 0
     assert all(bool(jnp.all(leaf == 0)) for leaf in jax.tree.leaves(gradient))
-
-
-def test_visits_are_counted_and_pay_by_their_root():
-    slot = jnp.array([[3, 3], [5, 3]])
-    mask = jnp.array([[1.0, 1.0], [1.0, 0.0]])
-    bonus, visits = ppo.visit_bonus(jnp.zeros(8).at[5].set(3.0), slot, mask)
-    np.testing.assert_allclose(bonus, [[2**-0.5, 2**-0.5], [0.5, 0.0]], rtol=1e-6)
-    np.testing.assert_array_equal(visits, [0, 0, 0, 2, 0, 4, 0, 0])

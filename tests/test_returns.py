@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.ppo import returns
+from agents.acting.episodes import Episodes
+from agents.config import PRESETS, Config
+from agents.ppo import learner, returns
 
 CASES, STEPS = 1_000, 23
 
@@ -22,7 +24,8 @@ def episodes() -> dict[str, np.ndarray]:
         "mask": mask,
         "reward": (rng.normal(size=mask.shape) * mask).astype(np.float32),
         "value": rng.normal(size=mask.shape).astype(np.float32),
-        "bootstrap": rng.normal(size=CASES).astype(np.float32),
+        "values": rng.normal(size=(CASES, STEPS + 1)).astype(np.float32),
+        "discounts": rng.uniform(0, 1, mask.shape).astype(np.float32),
         "discount": rng.uniform(0, 1, CASES).astype(np.float32),
         "lambda": rng.uniform(0, 1, CASES).astype(np.float32),
     }
@@ -44,38 +47,75 @@ def test_returns(episodes):
 
 def test_advantages_by_hand():
     result = returns.generalized_advantages(
-        jnp.array([0.0, 1.0]), jnp.array([0.5, 0.25]), jnp.float32(2.0), jnp.ones(2), 0.5, 0.5
+        jnp.array([0.0, 1.0]), jnp.array([0.5, 0.5]), jnp.array([0.5, 0.25, 2.0]), jnp.ones(2), 0.5
     )
     delta = [0.0 + 0.5 * 0.25 - 0.5, 1.0 + 0.5 * 2.0 - 0.25]
     np.testing.assert_allclose(result, [delta[0] + 0.25 * delta[1], delta[1]])
 
 
 def test_advantages(episodes):
-    names = ("reward", "value", "bootstrap", "mask", "discount", "lambda")
+    names = ("reward", "discounts", "values", "mask", "lambda")
     result = jax.vmap(returns.generalized_advantages)(*(episodes[name] for name in names))
     for case in range(CASES):
-        reward, value, bootstrap, mask, discount, lambda_ = (
+        reward, discount, value, mask, lambda_ = (
             episodes[name][case].astype(np.float64) for name in names
         )
-        after = np.append(value[1:], bootstrap)
-        delta = mask * (reward + discount * after - value)
-        powers = (discount * lambda_) ** np.arange(STEPS)
-        expected = [delta[t:] @ powers[: STEPS - t] for t in range(STEPS)]
+        delta = mask * (reward + discount * value[1:] - value[:-1])
+        expected, following = np.zeros(STEPS), 0.0
+        for t in reversed(range(STEPS)):
+            expected[t] = following = delta[t] + discount[t] * lambda_ * following
         np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
 
 
 def test_advantages_without_lambda_are_errors_and_with_it_are_returns(episodes):
     """At lambda 0 the advantage is one step's error, at lambda 1 return less value."""
     ones = np.ones_like(episodes["mask"])
-    gae: Any = jax.vmap(returns.generalized_advantages, in_axes=(0, 0, 0, 0, 0, None))
-    args: list[Any] = [episodes["reward"], episodes["value"], np.zeros(CASES, np.float32), ones]
-    after = np.append(episodes["value"][:, 1:], np.zeros((CASES, 1)), axis=1)
-    error = episodes["reward"] + episodes["discount"][:, None] * after - episodes["value"]
-    np.testing.assert_allclose(gae(*args, episodes["discount"], 0.0), error, atol=1e-5)
+    value = episodes["values"] * np.append(ones, np.zeros((CASES, 1), np.float32), axis=1)
+    discount = np.broadcast_to(episodes["discount"][:, None], ones.shape)
+    gae: Any = jax.vmap(returns.generalized_advantages, in_axes=(0, 0, 0, 0, None))
+    args: list[Any] = [episodes["reward"], discount, value, ones]
+    error = episodes["reward"] + discount * value[:, 1:] - value[:, :-1]
+    np.testing.assert_allclose(gae(*args, 0.0), error, atol=1e-5)
     full = jax.vmap(returns.discounted_returns)(episodes["reward"], episodes["discount"])
-    np.testing.assert_allclose(
-        gae(*args, episodes["discount"], 1.0), full - episodes["value"], atol=1e-4
-    )
+    np.testing.assert_allclose(gae(*args, 1.0), full - value[:, :-1], atol=1e-4)
+
+
+def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[Any, Any]:
+    """Advantages and targets of one episode: rewards 1, values 10, 20, 30, 40, gamma .5."""
+    config = Config(discount=0.5, gae_lambda=0.0, bootstrap=bootstrap)  # pyright: ignore[reportArgumentType]
+    nothing: Any = None
+    column = [jnp.array(x)[:, None] for x in (discount, mask)]
+    episodes = Episodes(nothing, nothing, nothing, nothing, *column)
+    value = jnp.array([10.0, 20.0, 30.0, 40.0])[:, None]
+    found = learner.advantages_and_targets(config, column[1], episodes, value)
+    return tuple(x[:, 0] for x in found)
+
+
+def test_nothing_follows_a_terminated_episode():
+    advantage, target = targets("value", [1, 0, 0], [1, 1, 0])
+    np.testing.assert_allclose(advantage, [1 + 0.5 * 20 - 10, 1 - 20, 0])
+    np.testing.assert_allclose(target[:2], [11, 1])
+
+
+def test_the_value_of_the_last_observation_follows_a_truncated_episode():
+    advantage, target = targets("value", [1, 1, 1], [1, 1, 1])
+    np.testing.assert_allclose(advantage, [1, -4, 1 + 0.5 * 40 - 30])
+    np.testing.assert_allclose(target, [11, 16, 21])
+
+
+def test_the_baseline_goes_on_with_the_values_that_it_has():
+    """After termination that of the board that stays, after truncation the last step's own."""
+    advantage, target = targets("baseline", [1, 0, 0], [1, 1, 0])
+    np.testing.assert_allclose(advantage, [1, 1 + 0.5 * 30 - 20, 0])
+    np.testing.assert_allclose(target, [1.5, 1, 0])
+    advantage, target = targets("baseline", [1, 1, 1], [1, 1, 1])
+    np.testing.assert_allclose(advantage, [1, -4, 1 + 0.5 * 30 - 30])
+    np.testing.assert_allclose(target, [1.75, 1.5, 1])
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_paper_alone_has_the_baselines_rule(name):
+    assert (Config.preset(name).bootstrap == "baseline") == (name == "paper")
 
 
 def test_masked_moments_and_normalize(episodes):

@@ -1,118 +1,66 @@
 """Episodes, as one scan over time.
 
-Source: agent specification "PPO"; paper section "Experimental Setup".
+Source: paper, section "Experimental Setup".
 """
 
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from agents.networks import distinct
+from agents.acting.encodings import Cache
+from agents.acting.episodes import Episodes, cells_of
+from agents.acting.identity import layout_ids
+from agents.networks.actions import ActionDistribution
 from agents.networks.agent import Agent, Params
 from agents.networks.core import Outputs
-from agents.parallel.sharding import Shards
-from agents.ppo.losses import log_prob
+from agents.networks.windows import encode_rows
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State
 
-SLOT_BITS = 20  # of an observation's hash, by which episodes remember what they met
-
-ChooseAction = Callable[[jax.Array, Outputs], jax.Array]
+ChooseAction = Callable[[jax.Array, ActionDistribution], jax.Array]
 
 
 class Trajectory(NamedTuple):
-    """B episodes of T steps, padded after an early end with what does not change any more.
+    """Episodes and what the network made of them, under the parameters that acted.
 
     Attributes:
-      layout: B states, of which board, palette and tool extent hold for the episode.
-      cells: u8[T + 1, B, 3, 2], the (row, column) of agent, tool and food.
-      action: i32[T, B, 2], (grasp, move).
-      reward: f32[T, B], extrinsic.
-      mask: f32[T, B], 1 on steps taken before the episode's end.
-      features: f32[T + 1, B, F], the observations as encoded by the acting parameters.
-      log_prob: f32[T, B], of the actions, grasp plus move.
-      value: f32[T, B].
+      episodes: B episodes of T steps.
+      features: f32[T + 1, B, F], the encoded observations.
       embedding: f32[T, B, hidden], the GRU's outputs.
+      log_prob: f32[T, B], of the actions.
+      value: f32[T + 1, B], of every observation, the last one included.
     """
 
-    layout: State
-    cells: jax.Array
-    action: jax.Array
-    reward: jax.Array
-    mask: jax.Array
+    episodes: Episodes
     features: jax.Array
+    embedding: jax.Array
     log_prob: jax.Array
     value: jax.Array
-    embedding: jax.Array
-
-    @property
-    def solved(self) -> jax.Array:
-        """bool[B]: episodes that earned their reward."""
-        return jnp.any(self.reward > 0, axis=0)
-
-    @property
-    def length(self) -> jax.Array:
-        """i32[B]: steps taken."""
-        return jnp.sum(self.mask, axis=0).astype(jnp.int32)
-
-    def gathered(self, shards: Shards) -> "Trajectory":
-        """The episodes of all devices; with several, without features and embeddings."""
-        if shards.count == 1:
-            return self
-        light = self._replace(layout=None, features=None, embedding=None)
-        return shards.whole(light, axis=1)._replace(layout=shards.whole(self.layout))
-
-    def observations(self) -> jax.Array:
-        """All boards, u8[T + 1, B, 12, 12, N]."""
-        one_time = jax.vmap(lambda layout, cells: observe(place(layout, cells)))
-        return jax.vmap(one_time, in_axes=(None, 0))(self.layout, self.cells)
-
-
-class _Memory(NamedTuple):
-    """What has been encoded so far.
-
-    Attributes:
-      position: i32[T + 1, B].
-      features: f32[T + 1, B, F].
-      newest: i32[S], by hash of an observation, where above (time * B + episode) it was last
-        met; -1 where it never was. Of observations with the same hash, one is forgotten.
-    """
-
-    position: jax.Array
-    features: jax.Array
-    newest: jax.Array
 
 
 class _Carry(NamedTuple):
+    """What one step of the scan hands to the next; `_tm1` is of the step before."""
+
     state: State
     embedding: jax.Array
     action_tm1: jax.Array
     reward_tm1: jax.Array
-    memory: _Memory
+    cache: Cache
 
 
-def sample_action(key: jax.Array, outputs: Outputs) -> jax.Array:
-    """Draws grasp and move i32[B, 2] independently from their logits."""
-    grasp_key, move_key = jax.random.split(key)
-    grasp = jax.random.categorical(grasp_key, outputs.grasp_logits)
-    move = jax.random.categorical(move_key, outputs.move_logits)
-    return jnp.stack([grasp, move], axis=-1).astype(jnp.int32)
+def sample_action(key: jax.Array, actions: ActionDistribution) -> jax.Array:
+    """Draws actions i32[B, 2]."""
+    return actions.sample(key)
 
 
-def greedy_action(key: jax.Array, outputs: Outputs) -> jax.Array:
-    """The most probable grasp and move i32[B, 2]; the key is not used."""
+def greedy_action(key: jax.Array, actions: ActionDistribution) -> jax.Array:
+    """The most probable actions i32[B, 2]; the key is not used."""
     del key
-    choices = [jnp.argmax(outputs.grasp_logits, -1), jnp.argmax(outputs.move_logits, -1)]
-    return jnp.stack(choices, axis=-1).astype(jnp.int32)
-
-
-def place(layout: State, cells: jax.Array) -> State:
-    """The state with agent, tool and food at `cells` u8[3, 2]."""
-    agent, tool, food = cells.astype(jnp.int32)
-    return layout.replace(agent=agent, tool=tool, food=food)
+    return actions.mode()
 
 
 def rollout(
@@ -127,8 +75,6 @@ def rollout(
 ) -> Trajectory:
     """Plays one episode from each of B initial states.
 
-    Observations are encoded once each, whichever of the episodes meet them and when.
-
     Args:
       agent: the network.
       params: its parameters.
@@ -138,75 +84,60 @@ def rollout(
       choose: `sample_action` or `greedy_action`.
       chunk: distinct observations encoded at once.
     """
-    batch = initial.time.shape[0]
-    layout_id = distinct.layout_ids(initial)
+    encode = functools.partial(encode_rows, agent.encoder)
 
-    def encode(state: State, memory: _Memory, time: jax.Array | int) -> tuple[jax.Array, _Memory]:
-        position = jax.vmap(distinct.position_id)(state)
-        slot = distinct.slots(jnp.stack([layout_id, position], axis=1), SLOT_BITS)
-        met = memory.newest[slot]
-        same_layout = layout_id[met % batch] == layout_id
-        seen = (met >= 0) & same_layout & (memory.position.reshape(-1)[met] == position)
-        recalled = memory.features.reshape(-1, memory.features.shape[-1])[met]
-        groups = distinct.group(seen.astype(jnp.int32), layout_id, position)
-        num_new = jnp.max(jnp.where(seen, -1, groups.number)) + 1
-        rows = jax.vmap(observe)(state)[groups.representative]
-        new = distinct.map_rows(
-            agent.encode_rows, chunk, agent.encoding_params(params), rows, num_new
+    def see(carry: _Carry, time: jax.Array | int) -> tuple[_Carry, Outputs]:
+        """The network's step: it encodes the observation and updates its memory."""
+        features, cache = carry.cache.encode(
+            encode, params["encoder"], carry.state, time, chunk=chunk
         )
-        features = jnp.where(seen[:, None], recalled, new[groups.number])
-        memory = _Memory(
-            position=memory.position.at[time].set(position),
-            features=memory.features.at[time].set(features),
-            newest=memory.newest.at[slot].max(time * batch + jnp.arange(batch)),
-        )
-        return features, memory
+        inputs = agent.core_inputs(params, features, carry.action_tm1, carry.reward_tm1)
+        embedding = agent.advance(params, carry.embedding, inputs)
+        carry = carry._replace(embedding=embedding, cache=cache)
+        return carry, agent.act(params, embedding)
 
-    def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[_Carry, Any]:
+    def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[_Carry, dict]:
         time, step_key = inputs
-        features, memory = encode(carry.state, carry.memory, time)
-        core_inputs = agent.core_inputs(params, features, carry.action_tm1, carry.reward_tm1)
-        embedding = agent.advance(params, carry.embedding, core_inputs)
-        outputs = agent.act(params, embedding)
-        action = choose(step_key, outputs)
-        state, timestep = jax.vmap(env.step)(carry.state, action)
-        alive = ~(carry.state.terminated | carry.state.truncated)
+        carry, outputs = see(carry, time)
+        action = choose(step_key, outputs.actions)
+        before = carry.state
+        state, timestep = jax.vmap(env.step)(before, action)
         record = {
-            "cells": cells_of(carry.state),
+            "cells": cells_of(before),
             "action": action,
             "reward": timestep.reward,
-            "mask": alive.astype(jnp.float32),
-            "log_prob": action_log_prob(outputs, action),
+            "discount": timestep.discount,
+            "mask": 1.0 - (before.terminated | before.truncated),
+            "embedding": carry.embedding,
+            "log_prob": outputs.actions.log_prob(action),
             "value": outputs.value,
-            "embedding": embedding,
         }
-        return _Carry(state, embedding, action, timestep.reward, memory), record
+        return carry._replace(state=state, action_tm1=action, reward_tm1=timestep.reward), record
 
-    width = jax.eval_shape(agent.encode, params, jax.vmap(observe)(initial)).shape[-1]
-    start = _Carry(
+    times, keys = jnp.arange(env.max_steps), jax.random.split(key, env.max_steps)
+    end, record = jax.lax.scan(step, _first(agent, params, env, initial), (times, keys))
+    end, outputs = see(end, env.max_steps)
+    return Trajectory(
+        episodes=Episodes(
+            layout=initial,
+            cells=jnp.concatenate([record["cells"], cells_of(end.state)[None]]),
+            **{name: record[name] for name in ("action", "reward", "discount", "mask")},
+        ),
+        features=end.cache.features,
+        embedding=record["embedding"],
+        log_prob=record["log_prob"],
+        value=jnp.concatenate([record["value"], outputs.value[None]]),
+    )
+
+
+def _first(agent: Agent, params: Params, env: Environment, initial: State) -> _Carry:
+    """Before the first step: no action, no reward, nothing encoded."""
+    batch = len(initial.time)
+    features = jax.eval_shape(agent.encode, params, jax.vmap(observe)(initial))
+    return _Carry(
         state=initial,
         embedding=agent.initial_state(params, batch),
         action_tm1=jnp.zeros((batch, 2), jnp.int32),
         reward_tm1=jnp.zeros(batch),
-        memory=_Memory(
-            position=jnp.zeros((env.max_steps + 1, batch), jnp.int32),
-            features=jnp.zeros((env.max_steps + 1, batch, width)),
-            newest=jnp.full(2**SLOT_BITS, -1),
-        ),
+        cache=Cache.empty(layout_ids(initial), env.max_steps, features.shape[-1]),
     )
-    times = jnp.arange(env.max_steps)
-    end, record = jax.lax.scan(step, start, (times, jax.random.split(key, env.max_steps)))
-    _, memory = encode(end.state, end.memory, env.max_steps)
-    record["cells"] = jnp.concatenate([record["cells"], cells_of(end.state)[None]])
-    return Trajectory(layout=initial, features=memory.features, **record)
-
-
-def action_log_prob(outputs: Outputs, action: jax.Array) -> jax.Array:
-    """The log-probability f32[...] of actions i32[..., 2], grasp plus move."""
-    grasp, move = action[..., 0], action[..., 1]
-    return log_prob(outputs.grasp_logits, grasp) + log_prob(outputs.move_logits, move)
-
-
-def cells_of(state: State) -> jax.Array:
-    """u8[B, 3, 2]: the cells of agent, tool and food."""
-    return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)

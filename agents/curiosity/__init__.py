@@ -1,0 +1,28 @@
+"""Intrinsic rewards, one module each, by the names that `Config.curiosity` knows."""
+
+from agents.config import Config
+from agents.curiosity.base import Curiosity, Experience
+from agents.curiosity.counts import Counts
+from agents.curiosity.icm import ICM
+from agents.curiosity.icm_detached import DetachedICM
+from agents.curiosity.rnd import RND
+from agents.registry import curiosity_factory
+from agents.registry import register_curiosity as register
+from trap_tube_jax.environment import Environment
+
+__all__ = ["Curiosity", "Experience", "make", "register"]
+
+register("icm", lambda config, env: ICM(config))
+register("icm-detached", lambda config, env: DetachedICM(config))
+register("rnd", lambda config, env: RND(config))
+register("counts", lambda config, env: Counts(env))
+register("none", lambda config, env: Curiosity())
+
+
+def make(config: Config, env: Environment) -> Curiosity:
+    """The curiosity of `config.curiosity`.
+
+    Raises:
+      ValueError: it is unknown, or not for this environment.
+    """
+    return curiosity_factory(config.curiosity)(config, env)

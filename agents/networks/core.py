@@ -1,74 +1,37 @@
-"""The agent's network beyond its encoder: recurrent core and heads, and how all are initialised.
+"""The agent's network beyond its encoder: the recurrent core and the heads.
 
-The parts are separate because they are evaluated separately: the encoder once per
-distinct observation, the core once per step, the heads on whatever is needed.
+The parts are separate modules because they are evaluated separately: the encoder once per
+distinct observation, the core once per step, the heads where action or value is needed.
 
-Source: paper section "Results", agent specification "Network".
+Source: paper, section "Results"; agents/agent.md, "Network".
 """
 
 import functools
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from agents.networks.actions import ActionDistribution
+from agents.networks.layers import as_row, dense, hidden_init, output_dense
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
-def variance_scaling(scale: float) -> nn.initializers.Initializer:
-    """Declares the deviation sqrt(scale / fan_in) of a parameter, the same everywhere in it.
-
-    The modules of this package initialise to deviations, not to samples: `draw` turns
-    all of them into parameters with a single draw, which compiles many times faster than
-    one draw per parameter.
-    """
-
-    def init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> jax.Array:
-        del key
-        return jnp.full(shape, np.sqrt(scale / np.prod(shape[:-1])), dtype)
-
-    return init
-
-
-def draw(key: jax.Array, deviations: Any) -> Any:
-    """Parameters from a pytree of deviations: normal, truncated at two deviations.
-
-    The draws are rescaled, so that truncation does not lower their deviation.
-    """
-    leaves, structure = jax.tree.flatten(deviations)
-    sizes = [leaf.size for leaf in leaves]
-    noise = jax.random.truncated_normal(key, -2, 2, (sum(sizes),)) / TRUNCATED_DEVIATION
-    parts = jnp.split(noise, np.cumsum(sizes)[:-1])
-    drawn = [leaf * part.reshape(leaf.shape) for leaf, part in zip(leaves, parts, strict=True)]
-    return jax.tree.unflatten(structure, drawn)
-
-
-TRUNCATED_DEVIATION = 0.87962566103423978  # of a standard normal variable cut off at -2 and 2
-hidden_init = variance_scaling(2.0)
-output_init = variance_scaling(1.0)
-dense = functools.partial(nn.Dense, kernel_init=hidden_init)
-output_dense = functools.partial(nn.Dense, kernel_init=output_init)
-
-
 class Outputs(NamedTuple):
-    """What the heads say of an embedding.
+    """What the heads yield.
 
     Attributes:
-      grasp_logits: f32[..., 4].
-      move_logits: f32[..., 4].
+      actions: the policy's distribution of actions, leading axes [...].
       value: f32[...].
     """
 
-    grasp_logits: jax.Array
-    move_logits: jax.Array
+    actions: ActionDistribution
     value: jax.Array
 
 
 class Core(nn.Module):
-    """What the agent remembers: previous action and reward beside the features, and a GRU.
+    """The recurrent part: mixes features, previous action and previous reward; then a GRU.
 
     The GRU is of the "reset after" form, with a bias on either side:
       z, r, n = x W + b_0 and z', r', n' = h R + b_1, split in three;
@@ -96,6 +59,12 @@ class Core(nn.Module):
         self.state_kernel = self.param("state_kernel", hidden_init, (self.hidden, gates))
         self.bias = self.param("bias", nn.initializers.zeros, (2, gates))
         self.initial = self.param("initial", nn.initializers.zeros, (self.hidden,))
+
+    def __call__(
+        self, state: jax.Array, features: jax.Array, action_tm1: jax.Array, reward_tm1: jax.Array
+    ) -> jax.Array:
+        """The state f32[..., hidden] after one step; see `inputs` and `advance`."""
+        return self.advance(state, self.inputs(features, action_tm1, reward_tm1))
 
     def inputs(
         self, features: jax.Array, action_tm1: jax.Array, reward_tm1: jax.Array
@@ -150,13 +119,7 @@ class Heads(nn.Module):
     @nn.compact
     def __call__(self, embedding: jax.Array) -> Outputs:
         """Maps f32[..., hidden] to `Outputs`."""
-        return Outputs(
-            grasp_logits=output_dense(NUM_DIRECTIONS, name="grasp")(embedding),
-            move_logits=output_dense(NUM_DIRECTIONS, name="move")(embedding),
-            value=output_dense(1, name="value")(embedding)[..., 0],
-        )
-
-
-def as_row(vector: jax.Array, ndim: int) -> jax.Array:
-    """f32[1, ..., 1, C], to add f32[C] along the last axis."""
-    return vector.reshape((1,) * (ndim - 1) + (-1,))
+        grasp = output_dense(NUM_DIRECTIONS, name="grasp")(embedding)
+        move = output_dense(NUM_DIRECTIONS, name="move")(embedding)
+        value = output_dense(1, name="value")(embedding)[..., 0]
+        return Outputs(ActionDistribution(grasp, move), value)

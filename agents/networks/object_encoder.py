@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.networks.core import dense
+from agents.networks.layers import dense
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS
 from trap_tube_jax.state import base_state
 

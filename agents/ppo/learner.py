@@ -1,37 +1,41 @@
 """PPO with curiosity: one iteration of training as one pure function.
 
-Source: agent specification "PPO" and "ICM"; paper section "Results".
+Read `Train.iterate` first: it plays episodes, prepares a batch of them (rewards, advantages) and
+takes gradient steps on minibatches.
+
+Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO" and "Curiosity".
 """
 
+import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-import trap_tube_jax as tt
-from agents.acting.observations import (
-    VISIT_SLOTS,
-    encode_episodes,
-    first_visits,
-    observation_ids,
-    visit_slots,
-)
-from agents.acting.rollout import Trajectory, action_log_prob, rollout, sample_action
+from agents import curiosity as curiosities
+from agents.acting.encodings import encode_episodes
+from agents.acting.episodes import Episodes, along_episodes, take
+from agents.acting.identity import first_visits, observation_ids
+from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.config import Config
-from agents.curiosity.modules import Prediction, forward_loss, intrinsic_reward, visit_bonus
+from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
+from agents.networks.windows import encode_rows
 from agents.parallel.sharding import ALONE, Shards
-from agents.ppo import losses, returns
-from agents.ppo.method import Metrics, Train, environment
-from agents.ppo.optimizer import cooldown, make_optimizer
-from agents.ppo.replay import Replay
+from agents.ppo import losses, replay, returns
+from agents.ppo.optimizer import make_optimizer
 from trap_tube_jax.environment import Environment
+from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.registry import make
+
+Metrics = dict[str, jax.Array]
 
 # Over [T, B] arrays.
 discounted_returns = jax.vmap(returns.discounted_returns, in_axes=(1, None), out_axes=1)
 generalized_advantages = jax.vmap(
-    returns.generalized_advantages, in_axes=(1, 1, 0, 1, None, None), out_axes=1
+    returns.generalized_advantages, in_axes=(1, 1, 1, 1, None), out_axes=1
 )
 
 
@@ -39,12 +43,11 @@ class TrainState(NamedTuple):
     """Everything that training carries from one iteration to the next.
 
     Attributes:
-      params: the network's parameters.
-      opt_state: the optimiser's state.
+      params: `encoder`, `core`, `heads` of the policy network, and `curiosity`.
+      opt_state: the optimizer's state.
       extrinsic: moments of the extrinsic reward.
       intrinsic: moments of the intrinsic reward.
-      visits: f32[S], how often observations were seen, by slot of a hash table; one unused
-        slot without the curiosity `counts`.
+      memory: what the curiosity carries along.
       replay: the newest solved episodes; never filled without imitation.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
@@ -56,8 +59,8 @@ class TrainState(NamedTuple):
     opt_state: Any
     extrinsic: returns.Moments
     intrinsic: returns.Moments
-    visits: jax.Array
-    replay: Replay
+    memory: Any
+    replay: Episodes
     key: jax.Array
     iteration: jax.Array
     episodes: jax.Array
@@ -65,35 +68,293 @@ class TrainState(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What one gradient step sees of its episodes, [T, B, ...] each.
+    """What gradient steps see of B episodes.
 
     Attributes:
+      episodes: the episodes.
       observation_id: i32[T + 1, B], equal only for equal observations.
-      layout: B states; `cells`: u8[T + 1, B, 3, 2]; together the observations.
-      cells: see `layout`.
-      action: i32[T, B, 2].
-      reward: f32[T, B], extrinsic, as the network sees it.
-      mask: f32[T, B].
-      log_prob: f32[T, B], under the acting parameters.
-      advantage: f32[T, B].
+      log_prob: f32[T, B], of the actions under the acting parameters.
+      advantage: f32[T, B], normalised.
       value_target: f32[T, B].
     """
 
+    episodes: Episodes
     observation_id: jax.Array
-    layout: tt.State
-    cells: jax.Array
-    action: jax.Array
-    reward: jax.Array
-    mask: jax.Array
     log_prob: jax.Array
     advantage: jax.Array
     value_target: jax.Array
 
-    def take(self, episodes: jax.Array) -> "Batch":
-        """The batch of these episodes, i32[M]."""
-        rest = self._replace(layout=None)
-        taken = jax.tree.map(lambda x: x[:, episodes], rest)
-        return taken._replace(layout=jax.tree.map(lambda x: x[episodes], self.layout))
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Train:
+    """Training: `init` and `iterate` are pure functions; jit them, and vmap them over seeds.
+
+    Attributes:
+      config: the settings.
+      env: the environment.
+      agent: the policy network's functions.
+      curiosity: the intrinsic reward.
+      optimizer: clip and Adam.
+      shards: how `iterate` divides its episodes over devices.
+    """
+
+    config: Config
+    env: Environment
+    agent: Agent
+    curiosity: Curiosity
+    optimizer: optax.GradientTransformation
+    shards: Shards = ALONE
+
+    def init(self, key: jax.Array) -> TrainState:
+        """The first state."""
+        params_key, key = jax.random.split(key)
+        params = self.init_params(params_key)
+        zero = jnp.zeros((), jnp.int32)
+        return TrainState(
+            params=params,
+            opt_state=self.optimizer.init(params),
+            extrinsic=returns.Moments.zero(),
+            intrinsic=returns.Moments.zero(),
+            memory=self.curiosity.memory(),
+            replay=replay.empty(
+                self.env.base, self.config.imitation_episodes, self.config.max_steps
+            ),
+            key=key,
+            iteration=zero,
+            episodes=zero,
+            transitions=zero,
+        )
+
+    def init_params(self, key: jax.Array) -> Params:
+        """Fresh parameters of the policy network, and of the curiosity where it has any."""
+        agent_key, curiosity_key = jax.random.split(key)
+        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
+        own = self.curiosity.init(curiosity_key, board)
+        return self.agent.init(agent_key) | ({"curiosity": own} if own else {})
+
+    def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """Plays, prepares, learns: the next state, and metrics f32[] each."""
+        reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
+        trajectory = self.play(state.params, reset_key, action_key)
+        batch, state, play_metrics = self.prepare(state, trajectory)
+        params, opt_state, loss_metrics = self.optimize(state, batch, update_key)
+        state = state._replace(
+            params=params,
+            opt_state=opt_state,
+            key=key,
+            iteration=state.iteration + 1,
+            episodes=state.episodes + self.config.episodes,
+        )
+        return state, {**play_metrics, **loss_metrics}
+
+    def play(self, params: Params, reset_key: jax.Array, action_key: jax.Array) -> Trajectory:
+        """Plays this device's share of an iteration's episodes."""
+        reset_keys = jax.random.split(reset_key, self.config.episodes)
+        initial, _ = jax.vmap(self.env.reset)(self.shards.part(reset_keys))
+        choose = self.shards.drawing(sample_action)
+        chunk = self.config.chunk
+        return rollout(
+            self.agent, params, self.env, initial, action_key, choose=choose, chunk=chunk
+        )
+
+    def prepare(
+        self, state: TrainState, trajectory: Trajectory
+    ) -> tuple[Batch, TrainState, Metrics]:
+        """Turns episodes into what the gradient steps learn from, under the acting parameters.
+
+        Args:
+          state: the state of training.
+          trajectory: this device's episodes.
+
+        Returns:
+          The batch of all devices' episodes; the state with rewards' moments, curiosity's
+          memory, replay and transitions brought up to date; and metrics of play.
+        """
+        config = self.config
+        novelty, memory = self.intrinsic_reward(state, trajectory)
+        episodes = self._whole(trajectory.episodes)
+        log_prob, value = self.shards.whole((trajectory.log_prob, trajectory.value), axis=1)
+        observation_id = observation_ids(episodes)
+        novelty = novelty * episodes.mask
+        if config.episodic_novelty:
+            novelty = novelty * first_visits(observation_id)[1:]
+        extrinsic = state.extrinsic.update(episodes.reward, episodes.mask, config.reward_rate)
+        intrinsic = state.intrinsic.update(novelty, episodes.mask, config.reward_rate)
+        reward = episodes.reward / extrinsic.deviation
+        reward = reward + config.intrinsic_scale * novelty / intrinsic.deviation
+        advantage, target = advantages_and_targets(config, reward, episodes, value)
+        batch = Batch(
+            episodes=episodes,
+            observation_id=observation_id,
+            log_prob=log_prob,
+            advantage=returns.normalize(advantage, episodes.mask),
+            value_target=target,
+        )
+        metrics = {
+            "success": jnp.mean(episodes.solved.astype(jnp.float32)),
+            "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
+            "intrinsic_reward": jnp.sum(novelty) / jnp.sum(episodes.mask),
+            "distinct_observations": jnp.max(observation_id) + 1,
+        }
+        state = state._replace(
+            extrinsic=extrinsic,
+            intrinsic=intrinsic,
+            memory=memory,
+            transitions=state.transitions + jnp.sum(episodes.length),
+        )
+        if config.imitation_coef:
+            state = state._replace(replay=replay.remember(state.replay, episodes))
+        return batch, state, metrics
+
+    def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
+        """The curiosity's reward f32[T, B] of all devices' episodes, and its new memory."""
+        experience = self.acting_experience(state.params, trajectory)
+        everyone = self.curiosity.needs_all_episodes
+        if everyone:
+            experience = self._whole(experience)
+        own = state.params.get("curiosity", {})
+        reward, memory = self.curiosity.reward(own, state.memory, experience)
+        return reward if everyone else self.shards.whole(reward, axis=1), memory
+
+    def acting_experience(self, params: Params, trajectory: Trajectory) -> Experience:
+        """What the curiosity sees of episodes when it pays for them."""
+        episodes = trajectory.episodes
+        observation_id = observation_ids(episodes)
+        features = jnp.zeros((*observation_id.shape, 0))
+        if self._curiosity_width:
+            encode = _without_memory(self.curiosity.encode)
+            features = encode_episodes(
+                encode, params["curiosity"], episodes, observation_id, chunk=self.config.chunk
+            )
+        experience = Experience(episodes, observation_id, features)
+        if not self.curiosity.needs_embeddings:
+            return experience
+        _, after = self.agent.unroll_both(
+            params, trajectory.features, episodes.action, episodes.reward
+        )
+        return experience._replace(
+            embedding=trajectory.embedding,
+            next_embedding=after,
+            action_embedding=self.agent.embed_action(params, episodes.action),
+        )
+
+    def optimize(
+        self, state: TrainState, batch: Batch, key: jax.Array
+    ) -> tuple[Params, Any, Metrics]:
+        """All epochs of gradient steps on minibatches of whole episodes, shuffled in each.
+
+        Every device differentiates its part of each minibatch; the mean is everyone's gradient.
+        """
+        config = self.config
+
+        def update(carry: tuple[Params, Any], places: jax.Array) -> tuple[Any, Metrics]:
+            params, opt_state = carry
+            own = take(batch, self.shards.part(places))
+            gradient, metrics = self.shards.mean(
+                jax.grad(self.loss, has_aux=True)(params, own, state.replay)
+            )
+            updates, opt_state = self.optimizer.update(gradient, opt_state, params)
+            metrics["gradient_norm"] = optax.tree.norm(gradient)
+            metrics["entropy"] /= metrics.pop("steps")
+            return (optax.apply_updates(params, updates), opt_state), metrics
+
+        def permute(epoch_key: jax.Array) -> jax.Array:
+            order = jax.random.permutation(epoch_key, config.episodes)
+            return order.reshape(-1, config.minibatch)
+
+        minibatches = jax.vmap(permute)(jax.random.split(key, config.epochs))
+        (params, opt_state), metrics = jax.lax.scan(
+            update, (state.params, state.opt_state), minibatches.reshape(-1, config.minibatch)
+        )
+        return params, opt_state, jax.tree.map(jnp.mean, metrics)
+
+    def loss(self, params: Params, batch: Batch, solved: Episodes) -> tuple[jax.Array, Metrics]:
+        """The total loss f32[] and its terms, weighted as they enter it; means over devices.
+
+          L = policy + value - entropy + curiosity_coef * curiosity's losses + imitation
+
+        Beside the terms: the sums of the entropy over `steps`, and of those.
+
+        Args:
+          params: the parameters to differentiate by.
+          batch: this device's part of a minibatch.
+          solved: the episodes to imitate, of all devices.
+        """
+        config, mask = self.config, batch.episodes.mask
+        embedding, experience = self.learning_experience(params, batch)
+        actions, value = self.agent.act(params, embedding)
+        log_prob = actions.log_prob(batch.episodes.action)
+        surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
+        value_error = losses.squared_error(value, batch.value_target)
+        entropy = actions.entropy()
+        terms = {
+            "policy_loss": losses.padded_mean(surrogate, mask),
+            "value_loss": config.value_coef * losses.padded_mean(value_error, mask),
+            "entropy_loss": -config.entropy_coef * losses.padded_mean(entropy, mask),
+        }
+        own = self.curiosity.losses(params.get("curiosity", {}), experience)
+        for name, term in own.items():
+            terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
+        if config.imitation_coef:
+            terms["imitation_loss"] = self.imitation_loss(params, solved)
+        total = sum(terms.values(), jnp.zeros(()))
+        sums = {"entropy": jnp.sum(entropy * mask), "steps": jnp.sum(mask)}
+        return total, {**terms, "loss": total, **sums}
+
+    def learning_experience(self, params: Params, batch: Batch) -> tuple[jax.Array, Experience]:
+        """The GRU's outputs f32[T, B, hidden] on a batch, and what the curiosity sees of it."""
+        episodes, observation_id = batch.episodes, batch.observation_id
+        read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
+        encode = functools.partial(_encode_both, self.agent, self.curiosity)
+        features = encode_episodes(encode, read, episodes, observation_id, chunk=self.config.chunk)
+        width = features.shape[-1] - self._curiosity_width
+        features, own = features[..., :width], features[..., width:]
+        experience = Experience(episodes, observation_id, own)
+        given = (params, features, episodes.action, episodes.reward)
+        if not self.curiosity.needs_embeddings:
+            return self.agent.unroll(*given), experience
+        embedding, after = self.agent.unroll_both(*given)
+        return embedding, experience._replace(
+            embedding=embedding,
+            next_embedding=after,
+            action_embedding=self.agent.embed_action(params, episodes.action),
+        )
+
+    def imitation_loss(self, params: Params, solved: Episodes) -> jax.Array:
+        """Minus the log-likelihood of remembered successes, each step weighted by its return.
+
+          imitation_coef * mean over steps of -G_t log pi(a_t | o_t)
+
+        Returns:
+          f32[], this device's share, of which the mean over devices is the loss; 0 while
+          nothing is remembered.
+        """
+        config, shards = self.config, self.shards
+        steps = jnp.maximum(jnp.sum(solved.mask), 1.0) / shards.count
+        if shards.count > 1:
+            places, is_own = shards.places(solved.mask.shape[1])
+            solved = take(solved, places)
+            solved = solved._replace(mask=solved.mask * is_own[None])
+        encode = functools.partial(encode_rows, self.agent.encoder)
+        features = encode_episodes(
+            encode, params["encoder"], solved, observation_ids(solved), chunk=config.chunk
+        )
+        embedding = self.agent.unroll(params, features, solved.action, solved.reward)
+        log_prob = self.agent.act(params, embedding).actions.log_prob(solved.action)
+        weight = discounted_returns(solved.reward, jnp.float32(config.discount)) * solved.mask
+        return -config.imitation_coef * jnp.sum(weight * log_prob) / steps
+
+    @functools.cached_property
+    def _curiosity_width(self) -> int:
+        """How many features the curiosity makes of an observation."""
+        shape = (1, BOARD_SIZE, BOARD_SIZE, self.config.num_features)
+        params = jax.eval_shape(self.init_params, jax.random.key(0)).get("curiosity", {})
+        board = jax.ShapeDtypeStruct(shape, jnp.uint8)
+        return jax.eval_shape(self.curiosity.encode, params, board).shape[-1]
+
+    def _whole(self, record: Any) -> Any:
+        """A record of all devices' episodes from those of each."""
+        return along_episodes(lambda axis, x: self.shards.whole(x, axis), record)
 
 
 def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Train:
@@ -105,251 +366,55 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
       shards: how to divide the episodes; more than one only within `Placement.shard`.
 
     Raises:
-      ValueError: `env` contradicts `config`.
+      ValueError: `env` contradicts `config`, or the curiosity is not for this environment.
     """
-    env = environment(config, env)
-    agent = Agent(config)
-    optimizer = make_optimizer(config)
-
-    def init(key: jax.Array) -> TrainState:
-        params_key, key = jax.random.split(key)
-        params = agent.init(params_key)
-        zero = jnp.zeros((), jnp.int32)
-        return TrainState(
-            params=params,
-            opt_state=optimizer.init(params),
-            extrinsic=returns.Moments.zero(),
-            intrinsic=returns.Moments.zero(),
-            visits=jnp.zeros(VISIT_SLOTS if config.curiosity == "counts" else 1),
-            replay=Replay.empty(env.base, config.imitation_episodes, config.max_steps),
-            key=key,
-            iteration=zero,
-            episodes=zero,
-            transitions=zero,
-        )
-
-    def iterate(state: TrainState) -> tuple[TrainState, Metrics]:
-        reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
-        reset_keys = shards.part(jax.random.split(reset_key, config.episodes))
-        initial, _ = jax.vmap(env.reset)(reset_keys)
-        trajectory = rollout(
-            agent,
-            state.params,
-            env,
-            initial,
-            action_key,
-            choose=shards.drawing(sample_action),
-            chunk=config.chunk,
-        )
-        batch, state, play_metrics = prepare(agent, config, state, trajectory, shards)
-        params, opt_state, loss_metrics = optimize(
-            agent, config, optimizer, state, batch, update_key, shards
-        )
-        state = state._replace(
-            params=params,
-            opt_state=opt_state,
-            key=key,
-            iteration=state.iteration + 1,
-            episodes=state.episodes + config.episodes,
-        )
-        return state, {**play_metrics, **loss_metrics}
-
-    return Train(init, iterate, agent, env, config, shards)
+    if env is None:
+        env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
+    for name in ("num_features", "max_steps"):
+        if getattr(env, name) != getattr(config, name):
+            raise ValueError(
+                f"the environment's {name} is {getattr(env, name)}, the config's "
+                f"{getattr(config, name)}; they must agree"
+            )
+    curiosity = curiosities.make(config, env)
+    return Train(config, env, Agent(config), curiosity, make_optimizer(config), shards)
 
 
-def prepare(
-    agent: Agent,
-    config: Config,
-    state: TrainState,
-    trajectory: Trajectory,
-    shards: Shards = ALONE,
-) -> tuple[Batch, TrainState, Metrics]:
-    """Turns episodes into what the gradient steps learn from, under the acting parameters.
+def advantages_and_targets(
+    config: Config, reward: jax.Array, episodes: Episodes, value: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Advantages and the values' targets, f32[T, B] each, by the rule of `config.bootstrap`.
+
+    `value`: gamma is 0 where a step terminates, the value of the last observation follows a
+    truncated episode, and the target is A_t + v_t. `baseline`: gamma is the same everywhere, the
+    last step's own value follows it, and the target is the discounted sum of rewards.
 
     Args:
-      agent: the network.
       config: the settings.
-      state: the state of training.
-      trajectory: this device's episodes.
-      shards: how the episodes are divided over devices.
-
-    Returns:
-      The batch of all devices' episodes, the state with the rewards' moments, the visits, the
-      replay and the transitions brought up to date, and metrics of play.
+      reward: f32[T, B], what the policy is to maximise.
+      episodes: the episodes.
+      value: f32[T + 1, B], of every observation.
     """
-    error = None
-    if agent.curiosity is not None:
-        error = shards.whole(_curiosity_reward(agent, state.params, trajectory), axis=1)
-    trajectory = trajectory.gathered(shards)
-    mask = trajectory.mask
-    observation_id = observation_ids(trajectory.layout, trajectory.cells)
-    extrinsic = state.extrinsic.update(trajectory.reward, mask, config.reward_rate)
-    reward = trajectory.reward / extrinsic.deviation
-    curiosity, intrinsic, visits = jnp.zeros_like(mask), state.intrinsic, state.visits
-    if config.curiosity != "none":
-        if error is None:
-            curiosity, visits = visit_bonus(visits, visit_slots(trajectory)[1:], mask)
-        else:
-            curiosity = mask * error
-        if config.episodic_novelty:
-            curiosity = curiosity * first_visits(observation_id)[1:]
-        intrinsic = intrinsic.update(curiosity, mask, config.reward_rate)
-        reward = reward + config.intrinsic_scale * curiosity / intrinsic.deviation
-
-    discount, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
-    advantage = generalized_advantages(
-        reward, trajectory.value, trajectory.value[-1], mask, discount, lambda_
-    )
-    batch = Batch(
-        observation_id=observation_id,
-        layout=trajectory.layout,
-        cells=trajectory.cells,
-        action=trajectory.action,
-        reward=trajectory.reward,
-        mask=mask,
-        log_prob=trajectory.log_prob,
-        advantage=returns.normalize(advantage, mask),
-        value_target=discounted_returns(reward, discount),
-    )
-    metrics = {
-        "success": jnp.mean(trajectory.solved.astype(jnp.float32)),
-        "episode_length": jnp.mean(trajectory.length.astype(jnp.float32)),
-        "intrinsic_reward": jnp.sum(curiosity) / jnp.sum(mask),
-        "distinct_observations": jnp.max(observation_id) + 1,
-    }
-    if config.imitation_coef:
-        state = state._replace(replay=state.replay.remember(trajectory))
-    transitions = state.transitions + jnp.sum(trajectory.length)
-    state = state._replace(
-        extrinsic=extrinsic, intrinsic=intrinsic, visits=visits, transitions=transitions
-    )
-    return batch, state, metrics
+    gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
+    if config.bootstrap == "value":
+        discount = gamma * episodes.discount
+        advantage = generalized_advantages(reward, discount, value, episodes.mask, lambda_)
+        return advantage, advantage + value[:-1]
+    value = jnp.concatenate([value[:-1], value[-2:-1]])
+    discount = jnp.full_like(reward, gamma)
+    advantage = generalized_advantages(reward, discount, value, episodes.mask, lambda_)
+    return advantage, discounted_returns(reward, gamma)
 
 
-def optimize(
-    agent: Agent,
-    config: Config,
-    optimizer: optax.GradientTransformation,
-    state: TrainState,
-    batch: Batch,
-    key: jax.Array,
-    shards: Shards = ALONE,
-) -> tuple[Params, Any, Metrics]:
-    """All epochs of gradient steps on minibatches of whole episodes, shuffled anew in each.
-
-    Every device differentiates its part of each minibatch; the mean is everyone's gradient.
-    """
-
-    def update(
-        carry: tuple[Params, Any], episodes: jax.Array
-    ) -> tuple[tuple[Params, Any], Metrics]:
-        params, opt_state = carry
-        own = batch.take(shards.part(episodes))
-        gradient, metrics = shards.mean(
-            jax.grad(loss, has_aux=True)(params, agent, config, own, state.replay, shards)
-        )
-        updates, opt_state = optimizer.update(gradient, opt_state, params)
-        updates = jax.tree.map(lambda update: rate * update, updates)
-        metrics["gradient_norm"] = optax.tree.norm(gradient)
-        metrics["entropy"] /= metrics.pop("steps")
-        params: Any = optax.apply_updates(params, updates)
-        return (params, opt_state), metrics
-
-    def permute(epoch_key: jax.Array) -> jax.Array:
-        order = jax.random.permutation(epoch_key, config.episodes)
-        return order.reshape(-1, config.minibatch)
-
-    rate = cooldown(config, state.iteration)
-    minibatches = jax.vmap(permute)(jax.random.split(key, config.epochs))
-    (params, opt_state), metrics = jax.lax.scan(
-        update, (state.params, state.opt_state), minibatches.reshape(-1, config.minibatch)
-    )
-    return params, opt_state, jax.tree.map(jnp.mean, metrics)
+def _encode_both(
+    agent: Agent, curiosity: Curiosity, params: Params, observation: jax.Array, remembered: Any
+) -> tuple[jax.Array, Any]:
+    """The policy's features, then the curiosity's; a row function of `chunks.map_rows`."""
+    features, remembered = encode_rows(agent.encoder, params["encoder"], observation, remembered)
+    own = curiosity.encode(params.get("curiosity", {}), observation)
+    return jnp.concatenate([features, own], axis=-1), remembered
 
 
-def loss(
-    params: Params,
-    agent: Agent,
-    config: Config,
-    batch: Batch,
-    replay: Replay,
-    shards: Shards = ALONE,
-) -> tuple[jax.Array, Metrics]:
-    """The total loss f32[] and its terms, weighted as they enter it; both as means over devices.
-
-    L = policy + value - entropy + curiosity_coef * (forward + inverse) + imitation
-
-    Beside the terms: the sums of the entropy over `steps`, and of those.
-    """
-    features = encode_episodes(
-        params, agent, config, batch.observation_id, batch.layout, batch.cells
-    )
-    curiosity_terms: Metrics = {}
-    if agent.curiosity is None:
-        embedding = agent.unroll(params, features, batch.action, batch.reward)
-    else:
-        embedding, following = agent.unroll_both(params, features, batch.action, batch.reward)
-        prediction = agent.predict(params, embedding, following, features, batch.action)
-        curiosity_terms = curiosity_losses(config, prediction, batch)
-    outputs = agent.act(params, embedding)
-    log_prob = action_log_prob(outputs, batch.action)
-    surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
-    value_error = losses.squared_error(outputs.value, batch.value_target)
-    entropy = losses.entropy(outputs.grasp_logits) + losses.entropy(outputs.move_logits)
-    terms = {
-        "policy_loss": losses.masked_mean(surrogate, batch.mask),
-        "value_loss": config.value_coef * losses.masked_mean(value_error, batch.mask),
-        "entropy_loss": -config.entropy_coef * losses.masked_mean(entropy, batch.mask),
-    }
-    terms |= curiosity_terms
-    if config.imitation_coef:
-        terms["imitation_loss"] = imitation_loss(params, agent, config, replay, shards)
-    total = sum(terms.values(), jnp.zeros(()))
-    sums = {"entropy": jnp.sum(entropy * batch.mask), "steps": jnp.sum(batch.mask)}
-    return total, {**terms, "loss": total, **sums}
-
-
-def curiosity_losses(config: Config, prediction: Prediction, batch: Batch) -> Metrics:
-    """The forward loss and, where there is an inverse model, the inverse loss, weighted."""
-    coef = config.curiosity_coef
-    terms = {"forward_loss": coef * losses.masked_mean(forward_loss(prediction), batch.mask)}
-    if prediction.grasp_logits is not None and prediction.move_logits is not None:
-        grasp = losses.log_prob(prediction.grasp_logits, batch.action[..., 0])
-        move = losses.log_prob(prediction.move_logits, batch.action[..., 1])
-        terms["inverse_loss"] = -coef * losses.masked_mean(grasp + move, batch.mask)
-    return terms
-
-
-def imitation_loss(
-    params: Params, agent: Agent, config: Config, replay: Replay, shards: Shards = ALONE
-) -> jax.Array:
-    """Minus the log-likelihood of remembered successes, each step weighted by its return.
-
-      imitation_coef * mean over steps of -G_t log pi(a_t | o_t)
-
-    Returns:
-      f32[], this device's share, of which the mean over devices is the loss; 0 while nothing
-      is remembered.
-    """
-    steps = jnp.maximum(jnp.sum(replay.mask), 1.0) / shards.count
-    if shards.count > 1:
-        place, is_own = shards.places(replay.mask.shape[1])
-        replay = replay.take(place)
-        replay = replay._replace(mask=replay.mask * is_own[None])
-    observation_id = observation_ids(replay.layout, replay.cells)
-    features = encode_episodes(params, agent, config, observation_id, replay.layout, replay.cells)
-    embedding = agent.unroll(params, features, replay.action, replay.reward)
-    log_prob = action_log_prob(agent.act(params, embedding), replay.action)
-    weight = discounted_returns(replay.reward, jnp.float32(config.discount)) * replay.mask
-    return -config.imitation_coef * jnp.sum(weight * log_prob) / steps
-
-
-def _curiosity_reward(agent: Agent, params: Params, trajectory: Trajectory) -> jax.Array:
-    """The raw intrinsic reward f32[T, B]."""
-    _, next_embedding = agent.unroll_both(
-        params, trajectory.features, trajectory.action, trajectory.reward
-    )
-    prediction = agent.predict(
-        params, trajectory.embedding, next_embedding, trajectory.features, trajectory.action
-    )
-    return intrinsic_reward(prediction)
+def _without_memory(encode: Any) -> Any:
+    """A row function of `chunks.map_rows` that remembers nothing."""
+    return lambda params, rows, _: (encode(params, rows), None)

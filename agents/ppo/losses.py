@@ -1,9 +1,6 @@
 """The terms of the loss: functions of arrays, one number per step.
 
-`masked_mean` reduces them as the published baseline does: the masked sum over the
-number of all steps, padded ones included.
-
-Source: agent specification "PPO" and "ICM".
+Source: agents/agent.md, "PPO".
 """
 
 import chex
@@ -11,23 +8,14 @@ import jax
 import jax.numpy as jnp
 
 
-def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
-    """The sum of `x` f32[...] where `mask` is 1, over the number of all elements."""
+def padded_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """The sum of `x` f32[...] where `mask` is 1, over the number of all elements.
+
+    So steps after an episode's end count as zeros, as in the published baseline: an episode that
+    ends early weighs less.
+    """
     chex.assert_equal_shape([x, mask])
     return jnp.mean(x * mask)
-
-
-def log_prob(logits: jax.Array, choice: jax.Array) -> jax.Array:
-    """The log-probability f32[...] of `choice` i32[...] under `logits` f32[..., K]."""
-    chex.assert_equal_shape_prefix([logits, choice[..., None]], choice.ndim)
-    log_probs = jax.nn.log_softmax(logits)
-    return jnp.take_along_axis(log_probs, choice[..., None], axis=-1)[..., 0]
-
-
-def entropy(logits: jax.Array) -> jax.Array:
-    """The entropy f32[...], in nats, of the distribution with `logits` f32[..., K]."""
-    log_probs = jax.nn.log_softmax(logits)
-    return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
 
 
 def clipped_surrogate(

@@ -24,7 +24,11 @@ class AdamState(NamedTuple):
 
 
 def adam(
-    learning_rate: float, *, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-7
+    learning_rate: optax.Schedule,
+    *,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-7,
 ) -> optax.GradientTransformation:
     """Adam with epsilon beside the uncorrected second moment.
 
@@ -36,7 +40,7 @@ def adam(
     a 30 times smaller bound, which shows in parameters whose gradient is near 1e-6.
 
     Args:
-      learning_rate: step size.
+      learning_rate: step size, by the number of updates so far.
       beta1: decay of the first moment.
       beta2: decay of the second moment.
       epsilon: added to the root of the second moment.
@@ -53,7 +57,7 @@ def adam(
         count = state.updates + 1
         first = optax.tree.update_moment(updates, state.first, beta1, 1)
         second = optax.tree.update_moment(updates, state.second, beta2, 2)
-        rate = learning_rate * jnp.sqrt(1 - beta2**count) / (1 - beta1**count)
+        rate = learning_rate(state.updates) * jnp.sqrt(1 - beta2**count) / (1 - beta1**count)
         step = jax.tree.map(lambda m, v: -rate * m / (jnp.sqrt(v) + epsilon), first, second)
         return step, AdamState(count, first, second)
 
@@ -64,13 +68,14 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
     """Adam behind a clip of the gradients' global norm."""
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
-        adam(config.learning_rate, epsilon=config.adam_epsilon),
+        adam(step_size(config), epsilon=config.adam_epsilon),
     )
 
 
-def cooldown(config: Config, iteration: jax.Array) -> jax.Array:
-    """f32[]: the factor of the step size, 1 until the last iterations and 0 after them."""
-    if not config.cooldown:
-        return jnp.ones(())
-    left = (config.iterations - iteration) / (config.cooldown * config.iterations)
-    return jnp.clip(left, 0.0, 1.0)
+def step_size(config: Config) -> optax.Schedule:
+    """The learning rate by gradient steps: constant, then linear to 0 in the cooldown."""
+    total = config.iterations * config.gradient_steps
+    falling = round(config.cooldown * total)
+    if not falling:
+        return optax.constant_schedule(config.learning_rate)
+    return optax.linear_schedule(config.learning_rate, 0.0, falling, total - falling)

@@ -1,9 +1,9 @@
 """Returns, advantages and the statistics that scale them: functions of arrays.
 
 Time ranges follow the paper's episodes of T steps: step t leads from observation t to
-observation t + 1. `mask` is 1 on steps that were really taken, 0 after the end.
+observation t + 1. `mask` is 1 on steps before the episode's end, 0 after it.
 
-Source: agent specification "PPO" and "ICM".
+Source: agents/agent.md, "PPO" and "Curiosity".
 """
 
 from typing import NamedTuple
@@ -31,34 +31,30 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
 
 def generalized_advantages(
     reward: jax.Array,
+    discount: jax.Array,
     value: jax.Array,
-    bootstrap: jax.Array,
     mask: jax.Array,
-    discount: float | jax.Array,
     lambda_: float | jax.Array,
 ) -> jax.Array:
     """Generalised advantage estimates over a padded episode (Schulman et al., 2016).
 
-      delta_t = mask_t (r_t + discount v_{t+1} - v_t),  v_T = bootstrap,
-      A_t = delta_t + discount * lambda * A_{t+1},  A_T = 0.
+      delta_t = mask_t (r_t + discount_t v_{t+1} - v_t),
+      A_t = delta_t + discount_t * lambda * A_{t+1},  A_T = 0.
 
     Args:
       reward: f32[T].
-      value: f32[T], the values v_0 to v_{T-1}; after an early end v_t is the value of
-        the last board.
-      bootstrap: f32[], the value after the last step.
+      discount: f32[T], of what follows each step: gamma, or 0 where a step terminates.
+      value: f32[T + 1], the values of all observations.
       mask: f32[T].
-      discount: scalar in [0, 1].
       lambda_: scalar in [0, 1].
 
     Returns:
       f32[T].
     """
-    chex.assert_rank([reward, value, bootstrap, mask, discount, lambda_], [1, 1, 0, 1, 0, 0])
-    chex.assert_equal_shape([reward, value, mask])
-    value_next = jnp.append(value[1:], bootstrap)
-    delta = mask * (reward + discount * value_next - value)
-    return _backward_sum(delta, jnp.full_like(delta, discount * lambda_))
+    chex.assert_rank([reward, discount, value, mask, lambda_], [1, 1, 1, 1, 0])
+    chex.assert_equal_shape([reward, discount, value[1:], mask])
+    delta = mask * (reward + discount * value[1:] - value[:-1])
+    return _backward_sum(delta, discount * lambda_)
 
 
 def masked_moments(x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:

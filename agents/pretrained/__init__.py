@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from agents.config import Config
-from agents.networks.agent import Agent, Policy
+from agents.networks.agent import Policy
+from agents.ppo.learner import make_train
 from agents.runs.checkpoint import Arrays, digest, from_arrays, to_arrays
 
 FORMAT = "trap-tube-jax parameters 1"
@@ -67,7 +68,7 @@ def load(path: Path | Traversable, name: str | None = None) -> Policy:
     try:
         config = Config.from_dict(header["config"])
         arrays = {key: array.astype(np.float32) for key, array in arrays.items()}
-        template = jax.eval_shape(Agent(config).init, jax.random.key(0))
+        template = jax.eval_shape(make_train(config).init_params, jax.random.key(0))
         params = jax.tree.map(jnp.asarray, from_arrays(arrays, template))
     except ValueError as error:
         raise ValueError(f"{path} does not fit this version: {error}") from error

@@ -26,8 +26,7 @@ from agents.evaluate import (
 from agents.networks.agent import Policy, num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import DEFAULT_DEVICE, Placement
-from agents.ppo.learner import TrainState, make_train
-from agents.ppo.method import Train
+from agents.ppo.learner import Train, TrainState, make_train
 from agents.runs import report
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json

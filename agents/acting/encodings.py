@@ -1,0 +1,108 @@
+"""Features of the observations of episodes, each distinct observation encoded once.
+
+`encode_episodes` does so for episodes that have been played. `Cache` does so while they are
+played: it remembers what any of them has met.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from agents.acting.episodes import Episodes, place
+from agents.acting.identity import position_id
+from agents.networks import chunks
+from agents.networks.grouping import group, slots
+from trap_tube_jax.observation import observe
+from trap_tube_jax.state import State
+
+SLOT_BITS = 20  # of an observation's hash, by which the cache finds it
+
+
+def encode_episodes(
+    encode_rows: chunks.RowFn,
+    params: Any,
+    episodes: Episodes,
+    observation_id: jax.Array,
+    *,
+    chunk: int,
+) -> Any:
+    """The features of all observations, f32[T + 1, B, F], or a tree of such arrays.
+
+    Args:
+      encode_rows: from observations u8[chunk, 12, 12, N] to features; see `chunks.RowFn`.
+      params: what `encode_rows` reads; the features are differentiable with respect to it.
+      episodes: the episodes.
+      observation_id: i32[T + 1, B], equal only for equal observations.
+      chunk: distinct observations encoded at once.
+    """
+    shape = observation_id.shape
+    groups = group(observation_id.reshape(-1))
+    time, episode = groups.representative // shape[1], groups.representative % shape[1]
+    rows = jax.vmap(lambda layout, cells: observe(place(layout, cells)))(
+        jax.tree.map(lambda x: x[episode], episodes.layout), episodes.cells[time, episode]
+    )
+    features = chunks.map_rows(encode_rows, chunk, params, rows, groups.total)
+    return jax.tree.map(lambda x: x[groups.number].reshape(*shape, -1), features)
+
+
+class Cache(NamedTuple):
+    """The features of all observations that B episodes have met so far.
+
+    Attributes:
+      layout_id: i32[B], equal only for equal layouts.
+      position: i32[T + 1, B], see `position_id`.
+      features: f32[T + 1, B, F].
+      newest: i32[S], by hash of an observation, where above (time * B + episode) it was last
+        met; -1 where it never was. Of observations with the same hash, one is forgotten.
+    """
+
+    layout_id: jax.Array
+    position: jax.Array
+    features: jax.Array
+    newest: jax.Array
+
+    @staticmethod
+    def empty(layout_id: jax.Array, num_steps: int, width: int) -> "Cache":
+        """A cache for episodes of `num_steps` steps and features of this width."""
+        shape = (num_steps + 1, len(layout_id))
+        return Cache(
+            layout_id=layout_id,
+            position=jnp.zeros(shape, jnp.int32),
+            features=jnp.zeros((*shape, width)),
+            newest=jnp.full(2**SLOT_BITS, -1),
+        )
+
+    def encode(
+        self,
+        encode_rows: chunks.RowFn,
+        params: Any,
+        state: State,
+        time: jax.Array | int,
+        *,
+        chunk: int,
+    ) -> tuple[jax.Array, "Cache"]:
+        """The features f32[B, F] of B states' observations at `time`, and the cache with them."""
+        position = jax.vmap(position_id)(state)
+        slot = slots(jnp.stack([self.layout_id, position], axis=1), SLOT_BITS)
+        is_known, known = self._look_up(position, slot)
+        # Of those that are not known, the distinct ones come first.
+        groups = group(is_known.astype(jnp.int32), self.layout_id, position)
+        num_new = jnp.max(jnp.where(is_known, -1, groups.number)) + 1
+        rows = jax.vmap(observe)(state)[groups.representative]
+        new = chunks.map_rows(encode_rows, chunk, params, rows, num_new)
+        features = jnp.where(is_known[:, None], known, new[groups.number])
+        batch = len(self.layout_id)
+        return features, self._replace(
+            position=self.position.at[time].set(position),
+            features=self.features.at[time].set(features),
+            newest=self.newest.at[slot].max(time * batch + jnp.arange(batch)),
+        )
+
+    def _look_up(self, position: jax.Array, slot: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Whether observations are known, bool[B], and their features f32[B, F] if they are."""
+        met = self.newest[slot]
+        same_layout = self.layout_id[met % len(self.layout_id)] == self.layout_id
+        same_position = self.position.reshape(-1)[met] == position
+        features = self.features.reshape(-1, self.features.shape[-1])[met]
+        return (met >= 0) & same_layout & same_position, features

@@ -1,0 +1,81 @@
+"""The record of episodes that acting, learning and remembering share."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from trap_tube_jax.observation import observe
+from trap_tube_jax.state import State
+
+Record = TypeVar("Record")
+
+
+class Episodes(NamedTuple):
+    """B episodes of T steps, padded after an early end with what does not change any more.
+
+    Attributes:
+      layout: B states, of which board, palette and tool extent hold for the episode.
+      cells: u8[T + 1, B, 3, 2], the (row, column) of agent, tool and food at each observation.
+      action: i32[T, B, 2], (grasp, move).
+      reward: f32[T, B], extrinsic.
+      discount: f32[T, B], 0 on the step that terminated the episode and after it, else 1.
+      mask: f32[T, B], 1 on steps taken before the episode's end.
+    """
+
+    layout: State
+    cells: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    discount: jax.Array
+    mask: jax.Array
+
+    @property
+    def solved(self) -> jax.Array:
+        """bool[B]: episodes that earned their reward."""
+        return jnp.any(self.reward > 0, axis=0)
+
+    @property
+    def length(self) -> jax.Array:
+        """i32[B]: steps taken."""
+        return jnp.sum(self.mask, axis=0).astype(jnp.int32)
+
+    def observations(self) -> jax.Array:
+        """All boards, u8[T + 1, B, 12, 12, N]."""
+        one_time = jax.vmap(lambda layout, cells: observe(place(layout, cells)))
+        return jax.vmap(one_time, in_axes=(None, 0))(self.layout, self.cells)
+
+
+def along_episodes(function: Callable[..., jax.Array], *records: Record) -> Record:
+    """Applies `function(axis, *arrays)` to the arrays of records of the same structure.
+
+    A record is `Episodes`, or a tree that holds one beside arrays [T, B, ...]. `axis` is where an
+    array has its episodes: 0 in layouts, 1 elsewhere.
+    """
+
+    def apply(*parts: Any) -> Any:
+        if not isinstance(parts[0], Episodes):
+            return function(1, *parts)
+        layouts = (part.layout for part in parts)
+        layout = jax.tree.map(lambda *x: function(0, *x), *layouts)
+        rest = (function(1, *x) for x in zip(*(part[1:] for part in parts), strict=True))
+        return Episodes(layout, *rest)
+
+    return jax.tree.map(apply, *records, is_leaf=lambda x: isinstance(x, Episodes))
+
+
+def take(record: Record, places: jax.Array) -> Record:
+    """The episodes at these places, i32[M], of any record; see `along_episodes`."""
+    return along_episodes(lambda axis, x: x[places] if axis == 0 else x[:, places], record)
+
+
+def place(layout: State, cells: jax.Array) -> State:
+    """The state with agent, tool and food at `cells` u8[3, 2]."""
+    agent, tool, food = cells.astype(jnp.int32)
+    return layout.replace(agent=agent, tool=tool, food=food)
+
+
+def cells_of(state: State) -> jax.Array:
+    """u8[B, 3, 2]: the cells of agent, tool and food in B states."""
+    return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)

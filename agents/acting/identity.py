@@ -1,0 +1,55 @@
+"""Which observations are the same, told by a few integers instead of by their pixels."""
+
+import jax
+import jax.numpy as jnp
+
+from agents.acting.episodes import Episodes, place
+from agents.networks.grouping import group, group_rows, hash_rows
+from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.state import State
+
+NUM_CELLS = BOARD_SIZE * BOARD_SIZE
+
+
+def layout_ids(layout: State) -> jax.Array:
+    """An id i32[B] for each of B states, equal only for equal boards, palettes, tool extents."""
+    return group_rows(_layout_content(layout)).number
+
+
+def layout_hashes(layout: State) -> jax.Array:
+    """A hash u32[B] of the boards, palettes and tool extents of B states."""
+    return hash_rows(_layout_content(layout))
+
+
+def position_id(state: State) -> jax.Array:
+    """An id i32[] of where agent, tool and food are; with the layout it fixes the observation."""
+    cells = [state.agent, state.tool, state.food]
+    agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
+    return (agent * NUM_CELLS + tool) * NUM_CELLS + food
+
+
+def position_ids(episodes: Episodes) -> jax.Array:
+    """i32[T + 1, B]: `position_id` at every observation."""
+    states = jax.vmap(jax.vmap(place), in_axes=(None, 0))(episodes.layout, episodes.cells)
+    return jax.vmap(jax.vmap(position_id))(states)
+
+
+def observation_ids(episodes: Episodes) -> jax.Array:
+    """i32[T + 1, B]: equal only for equal observations, numbered from 0."""
+    position = position_ids(episodes)
+    layout = jnp.broadcast_to(layout_ids(episodes.layout), position.shape)
+    return group(layout.reshape(-1), position.reshape(-1)).number.reshape(position.shape)
+
+
+def first_visits(observation_id: jax.Array) -> jax.Array:
+    """f32[T + 1, B]: 1 where an observation is new in its episode, 0 where it returns."""
+    time = jnp.arange(len(observation_id))
+    same = observation_id[:, None] == observation_id[None]
+    earlier = (time[:, None] > time[None])[..., None]
+    return 1.0 - jnp.any(same & earlier, axis=1)
+
+
+def _layout_content(layout: State) -> jax.Array:
+    """u8[B, ...]: all that an episode keeps, one row each."""
+    parts = (layout.board, layout.palette, layout.tool_extent.astype(jnp.uint8))
+    return jnp.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)

@@ -1,0 +1,94 @@
+"""ICM with an encoder of its own, which the inverse loss alone trains.
+
+The forward model sees the features but does not move them, so they cannot collapse to what is
+easily predicted, and the policy's encoder serves the policy only.
+
+Source: own; Burda et al. (2019a) discuss which features to predict.
+"""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from agents.config import Config
+from agents.curiosity.base import Curiosity, Experience, Params
+from agents.curiosity.models import ForwardModel, InverseModel
+from agents.networks.actions import ActionDistribution
+from agents.networks.encoder import Encoder
+from trap_tube_jax.objects import NUM_DIRECTIONS
+
+
+class Models(nn.Module):
+    """An encoder, and the two models over its features.
+
+    Attributes:
+      hidden: units of the inverse model.
+      filters: of the encoder.
+    """
+
+    hidden: int
+    filters: tuple[int, int]
+
+    def setup(self) -> None:
+        """Declares the encoder and the two models."""
+        self.encoder = Encoder(self.filters)
+        self.forward = ForwardModel()
+        self.inverse = InverseModel(self.hidden)
+
+    def __call__(
+        self, observation: jax.Array, next_observation: jax.Array, action: jax.Array
+    ) -> tuple[jax.Array, ActionDistribution]:
+        """All of it on single steps: u8[M, 12, 12, N] twice and i32[M, 2]; see `compare`."""
+        features = self.encode(observation), self.encode(next_observation)
+        return self.compare(*features, action)
+
+    def encode(self, observation: jax.Array) -> jax.Array:
+        """Features f32[M, filters[1]] of u8[M, 12, 12, N]."""
+        return self.encoder(observation)
+
+    def compare(
+        self, features: jax.Array, next_features: jax.Array, action: jax.Array
+    ) -> tuple[jax.Array, ActionDistribution]:
+        """The squared errors f32[..., F] of the predicted features; the inferred action."""
+        one_hot = jax.nn.one_hot(action, NUM_DIRECTIONS)
+        fixed, next_fixed = jax.lax.stop_gradient((features, next_features))
+        predicted = self.forward(fixed, one_hot.reshape(*action.shape[:-1], -1))
+        return jnp.square(predicted - next_fixed), self.inverse(features, next_features)
+
+
+class DetachedICM(Curiosity):
+    """Forward and inverse models over features of its own; reward and losses as in `ICM`."""
+
+    def __init__(self, config: Config):
+        self._models = Models(config.hidden, config.filters)
+
+    def init(self, key: jax.Array, board: jax.Array) -> Params:
+        """The parameters of the encoder and of both models."""
+        return self._models.init(key, board, board, jnp.zeros((1, 2), jnp.int32))
+
+    def encode(self, params: Params, observation: jax.Array) -> jax.Array:
+        """Features of its own encoder, f32[M, filters[1]]."""
+        features: Any = self._models.apply(params, observation, method=Models.encode)
+        return features
+
+    def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
+        """The sum over units of the forward model's squared errors."""
+        error, _ = self.predict(params, experience)
+        return jnp.sum(error, axis=-1), memory
+
+    def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
+        """The mean over units of the same errors, and -log p(action)."""
+        error, action = self.predict(params, experience)
+        return {
+            "forward_loss": jnp.mean(error, axis=-1),
+            "inverse_loss": -action.log_prob(experience.episodes.action),
+        }
+
+    def predict(self, params: Params, experience: Experience) -> Any:
+        """The squared errors f32[T, B, F] of the predicted features, and the inferred action."""
+        features, action = experience.features, experience.episodes.action
+        return self._models.apply(
+            params, features[:-1], features[1:], action, method=Models.compare
+        )

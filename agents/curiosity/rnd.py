@@ -1,0 +1,64 @@
+"""Random network distillation: the error in imitating a fixed random encoder.
+
+Source: Burda et al. (2019b).
+"""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from agents.config import Config
+from agents.curiosity.base import Curiosity, Experience, Params
+from agents.networks.encoder import Encoder
+from agents.networks.layers import dense, output_dense
+
+
+class Models(nn.Module):
+    """A fixed random target, and the predictor that imitates it.
+
+    Attributes:
+      hidden: units of the layer between the predictor's encoder and its output.
+      filters: of both encoders.
+    """
+
+    hidden: int
+    filters: tuple[int, int]
+
+    def setup(self) -> None:
+        """Declares both encoders and the predictor's last layers."""
+        self.target = Encoder(self.filters)
+        self.predictor = Encoder(self.filters)
+        self.readout = nn.Sequential([dense(self.hidden), nn.swish, output_dense(self.filters[1])])
+
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """The difference of prediction and target, f32[M, filters[1]]."""
+        target = jax.lax.stop_gradient(self.target(observation))
+        return self.readout(self.predictor(observation)) - target
+
+
+class RND(Curiosity):
+    """reward: the squared error at the next observation, summed over units; loss: its mean."""
+
+    def __init__(self, config: Config):
+        self._models = Models(config.hidden, config.filters)
+
+    def init(self, key: jax.Array, board: jax.Array) -> Params:
+        """The parameters of target and predictor; the target's get no gradient."""
+        return self._models.init(key, board)
+
+    def encode(self, params: Params, observation: jax.Array) -> jax.Array:
+        """The difference of prediction and target, f32[M, filters[1]]."""
+        difference: Any = self._models.apply(params, observation)
+        return difference
+
+    def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
+        """The sum over units of the squared error at the next observation."""
+        del params
+        return jnp.sum(jnp.square(experience.features[1:]), axis=-1), memory
+
+    def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
+        """The mean over units of the same errors."""
+        del params
+        return {"forward_loss": jnp.mean(jnp.square(experience.features[1:]), axis=-1)}

@@ -1,0 +1,77 @@
+"""Which of many elements or rows are equal, and hashes of rows."""
+
+import functools
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+SLOT_BITS = 16  # of a hash, in the table that `group_rows` looks up
+
+
+class Groups(NamedTuple):
+    """Elements gathered by equality.
+
+    Attributes:
+      number: i32[M], the group of every element, counted from 0.
+      representative: i32[M], an element of each group; only the first `total` count.
+      total: i32[], how many groups there are.
+    """
+
+    number: jax.Array
+    representative: jax.Array
+    total: jax.Array
+
+
+def group(*keys: jax.Array) -> Groups:
+    """Groups M elements that agree in all their keys, integer[M] each."""
+    chex.assert_rank(keys, 1)
+    chex.assert_equal_shape(keys)
+    size = keys[0].size
+    *ordered, element = jax.lax.sort((*keys, jnp.arange(size)), num_keys=len(keys))
+    first = functools.reduce(jnp.logical_or, (_differs_from_previous(key) for key in ordered))
+    number = jnp.cumsum(first, dtype=jnp.int32) - 1
+    zeros = jnp.zeros(size, jnp.int32)
+    return Groups(
+        number=zeros.at[element].set(number, unique_indices=True),
+        representative=zeros.at[number].max(element),
+        total=number[-1] + 1,
+    )
+
+
+def group_rows(content: jax.Array) -> Groups:
+    """Groups rows integer[M, K] that agree everywhere.
+
+    Every row looks up whom a table names at its hash, and joins them if they are equal. Equal
+    rows are in one group unless the table names another for them; different ones never are.
+    """
+    own = jnp.arange(len(content))
+    slot = slots(content, SLOT_BITS)
+    known = jnp.zeros(2**SLOT_BITS, jnp.int32).at[slot].max(own)[slot]
+    known = jnp.where(jnp.all(content[known] == content, axis=1), known, own)
+    first = known == own
+    number = jnp.cumsum(first, dtype=jnp.int32) - 1
+    zeros = jnp.zeros(len(content), jnp.int32)
+    return Groups(
+        number=number[known],
+        representative=zeros.at[jnp.where(first, number, len(content))].set(own, mode="drop"),
+        total=number[-1] + 1,
+    )
+
+
+def slots(content: jax.Array, bits: int) -> jax.Array:
+    """A hash i32[M] of rows integer[M, K], below 2**bits, to look them up in a table by."""
+    return (hash_rows(content) >> (32 - bits)).astype(jnp.int32)
+
+
+def hash_rows(content: jax.Array) -> jax.Array:
+    """A hash u32[M] of every row of integer[M, K]; its high bits are the best."""
+    weights = np.random.default_rng(0).integers(1, 2**32, content.shape[1], np.uint32)
+    return jnp.sum(content.astype(jnp.uint32) * weights[None], axis=1, dtype=jnp.uint32)
+
+
+def _differs_from_previous(key: jax.Array) -> jax.Array:
+    """bool[M]: whether an element differs from the one before it; true at the first."""
+    return jnp.concatenate([jnp.ones(1, bool), key[1:] != key[:-1]])

@@ -1,0 +1,97 @@
+"""Intrinsic rewards: the registry of names, a curiosity from outside, visit counts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents import Config, make_train, registry
+from agents.curiosity import Curiosity, register
+from agents.curiosity.counts import observation_slots, visit_bonus
+
+TINY = Config(
+    env_id="sy", max_steps=4, episodes=4, minibatch=2, epochs=1, filters=(2, 3), hidden=4,
+    embedding=2, chunk=4, curiosity="none",
+).to_dict()  # fmt: skip
+
+
+class Corners(Curiosity):
+    """Pays where the agent comes to a corner, and counts its calls."""
+
+    def memory(self):
+        return jnp.zeros((), jnp.int32)
+
+    def reward(self, params, memory, experience):
+        agent = experience.episodes.cells[1:, :, 0]
+        return jnp.all(agent % 11 == 0, axis=-1).astype(jnp.float32), memory + 1
+
+
+@pytest.fixture(autouse=True)
+def own_table(monkeypatch):
+    monkeypatch.setattr(registry, "_curiosities", dict(registry._curiosities))
+
+
+def test_a_curiosity_of_ones_own_is_trained_with():
+    register("corners", lambda config, env: Corners())
+    train = make_train(Config.from_dict({**TINY, "curiosity": "corners"}))
+    start = train.init(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1))
+    trajectory = jax.jit(train.play)(start.params, *keys)
+    episodes = trajectory.episodes
+    cells = episodes.cells.at[1, 0, 0].set(jnp.array([11, 0], jnp.uint8))
+    trajectory = trajectory._replace(episodes=episodes._replace(cells=cells))
+    reward, memory = train.intrinsic_reward(start, trajectory)
+    corner = np.isin(np.asarray(cells[1:, :, 0]), [0, 11]).all(-1)
+    np.testing.assert_array_equal(reward, corner)
+    assert reward[0, 0] == 1
+    assert memory == 1
+
+
+def test_names_are_checked_against_the_registry():
+    with pytest.raises(ValueError, match=r"unknown curiosity 'rdn'; known: icm, .*counts, none"):
+        Config(curiosity="rdn")
+    with pytest.raises(ValueError, match="curiosity 'icm' is registered already"):
+        register("icm", lambda config, env: Curiosity())
+
+
+@pytest.mark.parametrize("env_id", ["base", "sy"])
+def test_counts_are_for_tasks_that_return(env_id):
+    make_train(Config.preset("fast", env_id=env_id))
+
+
+@pytest.mark.parametrize("env_id", ["p", "st", "pstsy"])
+def test_counts_are_refused_where_tasks_do_not_return(env_id):
+    with pytest.raises(ValueError, match=r"'counts' needs tasks that return: base or Sy"):
+        make_train(Config.preset("fast", env_id=env_id))
+
+
+def test_visits_are_counted_and_pay_by_their_root():
+    slot = jnp.array([[3, 3], [5, 3]])
+    mask = jnp.array([[1.0, 1.0], [1.0, 0.0]])
+    bonus, visits = visit_bonus(jnp.zeros(8).at[5].set(3.0), slot, mask)
+    np.testing.assert_allclose(bonus, [[2**-0.5, 2**-0.5], [0.5, 0.0]], rtol=1e-6)
+    np.testing.assert_array_equal(visits, [0, 0, 0, 2, 0, 4, 0, 0])
+
+
+def test_few_observations_share_a_slot():
+    """Of layouts and positions of {Sy}, no more than chance would have it, here 1 %."""
+    env = tt.make("sy")
+    layout, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 40))
+    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"}))
+    played = train.play(train.init_params(jax.random.key(0)), *jax.random.split(jax.random.key(1)))
+    cells = jax.random.randint(jax.random.key(2), (300, 40, 3, 2), 0, 12).astype(jnp.uint8)
+    episodes = played.episodes._replace(layout=layout, cells=cells)
+    slot = np.asarray(observation_slots(episodes))
+    assert len(np.unique(slot)) > 0.98 * slot.size
+
+
+def test_every_observation_keeps_its_slot():
+    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"}))
+    played = train.play(train.init_params(jax.random.key(0)), *jax.random.split(jax.random.key(1)))
+    slot = np.asarray(observation_slots(played.episodes))
+    boards = np.asarray(played.episodes.observations()).reshape(slot.size, -1)
+    cells = np.asarray(played.episodes.cells).reshape(slot.size, -1)
+    _, same = np.unique(np.concatenate([boards, cells], axis=1), axis=0, return_inverse=True)
+    for number in range(same.max() + 1):
+        assert len(set(slot.reshape(-1)[same == number].tolist())) == 1
