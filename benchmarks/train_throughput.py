@@ -89,9 +89,9 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     iterate = jax.jit(train.iterate)
     for _ in range(warm):
         state, _ = iterate(state)
-    play = jax.jit(lambda state: train.play(state.params, *jax.random.split(state.key)))
+    play = jax.jit(lambda state: train.learner.play(state.params, *jax.random.split(state.key)))
     trajectory = play(state)
-    batch, _, _ = jax.jit(train.prepare)(state, trajectory)
+    batch, _, _ = jax.jit(train.learner.prepare)(state, trajectory)
     per_observation = matrix_flop(
         jax.make_jaxpr(train.agent.encoder.apply)(
             state.params["encoder"], trajectory.episodes.observations()[0, :1]
@@ -191,7 +191,7 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
 
     def total(params: Params, features: jax.Array, part: Batch) -> jax.Array:
         given = (params, features, part.episodes.action, part.episodes.reward)
-        if train.curiosity.needs_embeddings:
+        if train.learner.curiosity.needs_embeddings:
             embedding, following = agent.unroll_both(*given)
             experience = Experience(
                 part.episodes,
@@ -201,7 +201,7 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
                 following,
                 agent.embed_action(params, part.episodes.action),
             )
-            own = train.curiosity.losses(params["curiosity"], experience)
+            own = train.learner.curiosity.losses(params["curiosity"], experience)
         else:
             embedding, own = agent.unroll(*given), {}
         everything = jax.tree.leaves((agent.act(params, embedding), own))
@@ -219,7 +219,7 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
 
 
 def _optimizer_only(train: Train, state: TrainState) -> Params:
-    optimizer = train.optimizer
+    optimizer = train.learner.optimizer
 
     def update(carry: Any, _: jax.Array) -> tuple[Any, None]:
         params, opt_state = carry

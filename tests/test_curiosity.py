@@ -34,7 +34,7 @@ def own_table(monkeypatch):
 
 def test_a_curiosity_of_ones_own_is_trained_with():
     register("corners", lambda config, env: Corners())
-    train = make_train(Config.from_dict({**TINY, "curiosity": "corners"}))
+    train = make_train(Config.from_dict({**TINY, "curiosity": "corners"})).learner
     start = train.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1))
     trajectory = jax.jit(train.play)(start.params, *keys)
@@ -78,7 +78,7 @@ def test_few_observations_share_a_slot():
     """Of layouts and positions of {Sy}, no more than chance would have it, here 1 %."""
     env = tt.make("sy")
     layout, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 40))
-    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"}))
+    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"})).learner
     played = train.play(train.init_params(jax.random.key(0)), *jax.random.split(jax.random.key(1)))
     cells = jax.random.randint(jax.random.key(2), (300, 40, 3, 2), 0, 12).astype(jnp.uint8)
     episodes = played.episodes._replace(layout=layout, cells=cells)
@@ -87,7 +87,7 @@ def test_few_observations_share_a_slot():
 
 
 def test_every_observation_keeps_its_slot():
-    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"}))
+    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"})).learner
     played = train.play(train.init_params(jax.random.key(0)), *jax.random.split(jax.random.key(1)))
     slot = np.asarray(observation_slots(played.episodes))
     boards = np.asarray(played.episodes.observations()).reshape(slot.size, -1)

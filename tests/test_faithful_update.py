@@ -10,6 +10,7 @@ import pytest
 from reference_update import Recording, make_trajectory
 
 from agents import Config
+from agents.curiosity.icm import ICM
 from agents.networks.agent import num_parameters
 from agents.ppo.learner import make_train
 
@@ -24,7 +25,7 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def ours(recording: Recording) -> dict[str, Any]:
-    train = make_train(CONFIG)
+    train = make_train(CONFIG).learner
     params = recording.params("param", train.init_params(jax.random.key(0)))
 
     @jax.jit
@@ -32,6 +33,7 @@ def ours(recording: Recording) -> dict[str, Any]:
         trajectory = make_trajectory(train.agent, params, recording)
         state = train.init(jax.random.key(0))._replace(params=params)
         experience = train.acting_experience(params, trajectory)
+        assert isinstance(train.curiosity, ICM)
         prediction = train.curiosity.predict(params["curiosity"], experience)
         raw, _ = train.intrinsic_reward(state, trajectory)
         batch, state, _ = train.prepare(state, trajectory)

@@ -64,7 +64,7 @@ def test_more_successes_than_places(empty):
 
 
 def test_imitation_loss_is_the_weighted_log_likelihood(empty):
-    train = make_train(CONFIG)
+    train = make_train(CONFIG).learner
     params = train.init_params(jax.random.key(0))
     memory = replay.remember(empty, played([3, 1], [True, False]))
     loss = jax.jit(lambda params: train.imitation_loss(params, memory))(params)
@@ -84,7 +84,7 @@ def test_imitation_loss_is_the_weighted_log_likelihood(empty):
 
 
 def test_nothing_remembered_nothing_imitated(empty):
-    train = make_train(CONFIG)
+    train = make_train(CONFIG).learner
     params = train.init_params(jax.random.key(0))
     imitate = jax.jit(lambda params: train.imitation_loss(params, empty))
     loss, gradient = imitate(params), jax.jit(jax.grad(imitate))(params)

@@ -88,7 +88,7 @@ def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[A
     episodes = Episodes(nothing, nothing, nothing, nothing, *column)
     value = jnp.array([10.0, 20.0, 30.0, 40.0])[:, None]
     found = learner.advantages_and_targets(config, column[1], episodes, value)
-    return tuple(x[:, 0] for x in found)
+    return found[0][:, 0], found[1][:, 0]
 
 
 def test_nothing_follows_a_terminated_episode():

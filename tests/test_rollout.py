@@ -142,7 +142,7 @@ def acted(train, params, trajectory: Trajectory) -> Trajectory:
 @pytest.mark.parametrize("curiosity", ["icm", "icm-detached", "rnd", "none"])
 def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played, curiosity):
     trajectory = played[-1]
-    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity}))
+    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity})).learner
     state = train.init(jax.random.key(4))
     batch, _, _ = train.prepare(state, acted(train, state.params, trajectory))
 
@@ -170,7 +170,7 @@ def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played
 
 def test_gradient_of_the_whole_loss_by_finite_differences(played):
     """Along the gradient, with the paper's curiosity, whose losses stop no gradient."""
-    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": "icm"}))
+    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": "icm"})).learner
     state = train.init(jax.random.key(4))
     params = state.params
     batch, _, _ = train.prepare(state, acted(train, params, played[-1]))

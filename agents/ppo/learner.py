@@ -1,6 +1,6 @@
 """PPO with curiosity: one iteration of training as one pure function.
 
-Read `Train.iterate` first: it plays episodes, prepares a batch of them (rewards, advantages) and
+Read `Learner.iterate` first: it plays episodes, prepares a batch of them (rewards, advantages) and
 takes gradient steps on minibatches.
 
 Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO" and "Curiosity".
@@ -8,6 +8,7 @@ Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO"
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -86,8 +87,10 @@ class Batch(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Train:
-    """Training: `init` and `iterate` are pure functions; jit them, and vmap them over seeds.
+class Learner:
+    """The parts of training, and what one iteration does with them. Holds no parameters.
+
+    All methods are pure functions of arrays.
 
     Attributes:
       config: the settings.
@@ -357,6 +360,40 @@ class Train:
         return along_episodes(lambda axis, x: self.shards.whole(x, axis), record)
 
 
+class Train(NamedTuple):
+    """Training as two pure functions; jit them, and vmap them over seeds.
+
+    Attributes:
+      init: PRNG key to the first state.
+      iterate: a state to the next one and metrics, f32[] each.
+      learner: what they are made of.
+    """
+
+    init: Callable[[jax.Array], TrainState]
+    iterate: Callable[[TrainState], tuple[TrainState, Metrics]]
+    learner: Learner
+
+    @property
+    def config(self) -> Config:
+        """The settings."""
+        return self.learner.config
+
+    @property
+    def env(self) -> Environment:
+        """The environment."""
+        return self.learner.env
+
+    @property
+    def agent(self) -> Agent:
+        """The policy network's functions."""
+        return self.learner.agent
+
+    @property
+    def shards(self) -> Shards:
+        """How `iterate` divides its episodes over devices."""
+        return self.learner.shards
+
+
 def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Train:
     """Builds training from its settings.
 
@@ -377,7 +414,8 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
                 f"{getattr(config, name)}; they must agree"
             )
     curiosity = curiosities.make(config, env)
-    return Train(config, env, Agent(config), curiosity, make_optimizer(config), shards)
+    learner = Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
+    return Train(learner.init, learner.iterate, learner)
 
 
 def advantages_and_targets(
