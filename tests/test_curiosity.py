@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import trap_tube_jax as tt
 from agents import Config, make_train, registry
 from agents.curiosity import Curiosity, register
 from agents.curiosity.counts import observation_slots, visit_bonus
@@ -74,24 +73,28 @@ def test_visits_are_counted_and_pay_by_their_root():
     np.testing.assert_array_equal(visits, [0, 0, 0, 2, 0, 4, 0, 0])
 
 
-def test_few_observations_share_a_slot():
-    """Of layouts and positions of {Sy}, no more than chance would have it, here 1 %."""
-    env = tt.make("sy")
-    layout, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 40))
-    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"})).learner
-    played = train.play(train.init_params(jax.random.key(0)), *jax.random.split(jax.random.key(1)))
-    cells = jax.random.randint(jax.random.key(2), (300, 40, 3, 2), 0, 12).astype(jnp.uint8)
-    episodes = played.episodes._replace(layout=layout, cells=cells)
-    slot = np.asarray(observation_slots(episodes))
+@pytest.fixture(scope="module")
+def episodes():
+    """Random episodes of {Sy}, 40 of 4 steps."""
+    settings = {**TINY, "curiosity": "counts", "episodes": 40}
+    learner = make_train(Config.from_dict(settings)).learner
+    keys = jax.random.split(jax.random.key(1))
+    params = learner.init_params(jax.random.key(0))
+    return jax.jit(learner.play)(params, *keys).episodes
+
+
+def test_few_observations_share_a_slot(episodes):
+    """No more of the positions on layouts of {Sy} than chance would have it, here 1 %."""
+    cells = jax.random.randint(jax.random.key(2), (500, 40, 3, 2), 0, 12).astype(jnp.uint8)
+    slot = np.asarray(observation_slots(episodes._replace(cells=cells)))
     assert len(np.unique(slot)) > 0.98 * slot.size
 
 
-def test_every_observation_keeps_its_slot():
-    train = make_train(Config.from_dict({**TINY, "curiosity": "counts"})).learner
-    played = train.play(train.init_params(jax.random.key(0)), *jax.random.split(jax.random.key(1)))
-    slot = np.asarray(observation_slots(played.episodes))
-    boards = np.asarray(played.episodes.observations()).reshape(slot.size, -1)
-    cells = np.asarray(played.episodes.cells).reshape(slot.size, -1)
+def test_every_observation_keeps_its_slot(episodes):
+    slot = np.asarray(observation_slots(episodes))
+    boards = np.asarray(episodes.observations()).reshape(slot.size, -1)
+    cells = np.asarray(episodes.cells).reshape(slot.size, -1)
     _, same = np.unique(np.concatenate([boards, cells], axis=1), axis=0, return_inverse=True)
+    assert same.max() + 1 < slot.size
     for number in range(same.max() + 1):
-        assert len(set(slot.reshape(-1)[same == number].tolist())) == 1
+        assert len(set(slot.reshape(-1)[same.reshape(-1) == number].tolist())) == 1

@@ -16,6 +16,20 @@ MAY_IMPORT = {
     "agents": {"agents", "trap_tube_jax"},
     "benchmarks": {"benchmarks", "agents", "trap_tube_jax"},
 }
+# Lower rooms never import higher ones. Modules of `agents` itself are rooms of their own.
+ROOMS = (
+    ("registry",),
+    ("config",),
+    ("parallel",),
+    ("networks",),
+    ("acting",),
+    ("curiosity",),
+    ("ppo",),
+    ("pretrained", "runs", "evaluate"),
+    ("train",),
+    ("experiments",),
+)
+LEARNING = ("registry", "config", "parallel", "networks", "acting", "curiosity", "ppo")
 SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
 # The project's other dependencies, and what only its extras install.
 HEAVY = {"PIL", "chex", "gymnasium", "gymnax", "matplotlib", "optax", "orbax", "tyro"}
@@ -63,6 +77,38 @@ def test_imports_run_downward(path):
     package = module_name(path).split(".")[0]
     own = {name.split(".")[0] for name in imported_modules(path, ast.parse(path.read_text()))}
     assert own & (set(MAY_IMPORT) | {"tests"}) <= MAY_IMPORT[package]
+
+
+def room(module: str) -> str:
+    return module.split(".")[1] if "." in module else ""
+
+
+@pytest.mark.parametrize(
+    "path",
+    [path for path in SOURCES if "agents" in path.parts and path.parent.name != "tests"],
+    ids=module_name,
+)
+def test_rooms_import_downward(path):
+    level = {name: height for height, names in enumerate(ROOMS) for name in names}
+    own = room(module_name(path))
+    for name in imported_modules(path, ast.parse(path.read_text())) & MODULES:
+        if name.startswith("agents.") and own:
+            assert level[room(name)] <= level[own], name
+
+
+def test_training_imports_no_command_line(tmp_path):
+    """Nor tyro, rich or matplotlib: learning needs arrays alone."""
+    program = "import json, sys, agents; print(json.dumps(sorted(sys.modules)))"
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path}
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment, cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    modules = set(json.loads(result.stdout))
+    rooms = {room(name) for name in modules if name.startswith("agents.")}
+    assert rooms == set(LEARNING)
+    assert not modules & {"tyro", "matplotlib"}
 
 
 def test_no_module_needs_itself():

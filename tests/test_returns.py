@@ -84,7 +84,7 @@ def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[A
     """Advantages and targets of one episode: rewards 1, values 10, 20, 30, 40, gamma .5."""
     config = Config(discount=0.5, gae_lambda=0.0, bootstrap=bootstrap)  # pyright: ignore[reportArgumentType]
     nothing: Any = None
-    column = [jnp.array(x)[:, None] for x in (discount, mask)]
+    column = [jnp.array(x, jnp.float32)[:, None] for x in (discount, mask)]
     episodes = Episodes(nothing, nothing, nothing, nothing, *column)
     value = jnp.array([10.0, 20.0, 30.0, 40.0])[:, None]
     found = learner.advantages_and_targets(config, column[1], episodes, value)

@@ -212,12 +212,16 @@ class Learner:
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
         """The curiosity's reward f32[T, B] of all devices' episodes, and its new memory."""
         experience = self.acting_experience(state.params, trajectory)
-        everyone = self.curiosity.needs_all_episodes
-        if everyone:
+        if self.curiosity.needs_all_episodes:
             experience = self._whole(experience)
+            # Devices number their observations apart.
+            everyones = observation_ids(experience.episodes)
+            experience = experience._replace(observation_id=everyones)
         own = state.params.get("curiosity", {})
         reward, memory = self.curiosity.reward(own, state.memory, experience)
-        return reward if everyone else self.shards.whole(reward, axis=1), memory
+        if not self.curiosity.needs_all_episodes:
+            reward = self.shards.whole(reward, axis=1)
+        return reward, memory
 
     def acting_experience(self, params: Params, trajectory: Trajectory) -> Experience:
         """What the curiosity sees of episodes when it pays for them."""

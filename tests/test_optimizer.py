@@ -1,0 +1,37 @@
+"""The optimizer: Adam as the baseline has it, and the cooldown of its step size."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from agents import Config
+from agents.ppo.optimizer import adam, step_size
+
+
+def test_the_cooldown_counts_gradient_steps():
+    config = Config(
+        iterations=10, epochs=2, episodes=8, minibatch=4, cooldown=0.3, learning_rate=0.5
+    )
+    assert config.gradient_steps == 4
+    schedule = step_size(config)
+    for count, share in ((0, 1), (28, 1), (29, 11 / 12), (34, 0.5), (39, 1 / 12), (40, 0)):
+        np.testing.assert_allclose(schedule(jnp.int32(count)), 0.5 * share, rtol=1e-5)
+
+
+@pytest.mark.parametrize("cooldown", [0.0, 1.0])
+def test_none_or_all_of_training_may_be_cooldown(cooldown):
+    config = Config(iterations=1, epochs=2, episodes=8, minibatch=4, cooldown=cooldown)
+    rates = [float(step_size(config)(jnp.int32(count))) for count in range(4)]
+    expected = np.full(4, 1e-3) * (1 - cooldown * np.arange(4) / 4)
+    np.testing.assert_allclose(rates, expected, rtol=1e-5)
+
+
+def test_adam_takes_the_step_size_of_its_count():
+    """With a constant gradient each step is as long as the schedule says."""
+    optimizer = adam(lambda count: jnp.where(count < 1, 0.1, 0.01), epsilon=0.0)
+    params = jnp.zeros(3)
+    state, steps = optimizer.init(params), []
+    for _ in range(2):
+        step, state = optimizer.update(jnp.full(3, 2.0), state, params)
+        steps.append(step)
+    np.testing.assert_allclose(steps, np.outer([-0.1, -0.01], np.ones(3)), rtol=1e-4)
