@@ -12,6 +12,7 @@ from agents.networks import chunks
 from agents.networks.convolution import convolve
 from agents.networks.encoder import Encoder
 from agents.networks.grouping import group_rows
+from agents.networks.layers import draw
 from agents.networks.windows import cut_into_windows, encode_by_windows
 
 EPISODES, STEPS = 3, 6
@@ -39,9 +40,10 @@ def observation(request: pytest.FixtureRequest) -> jax.Array:
 
 
 def parameters(observation: jax.Array) -> dict:
-    params: Any = encoder.init(jax.random.key(3), observation[:1])
+    deviations = encoder.init(jax.random.key(0), observation[:1])
     # Biases too: what lies beyond the edge is zero only because nothing is added to it.
-    return jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else leaf + 0.1, params)
+    deviations = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else leaf + 0.1, deviations)
+    return draw(jax.random.key(3), deviations)
 
 
 @pytest.mark.parametrize("remembered_bytes", [0, 2**20])

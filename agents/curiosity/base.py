@@ -64,7 +64,7 @@ class Curiosity:
         """Parameters that are trained beside the policy's; {} if there are none.
 
         Args:
-          key: PRNG key.
+          key: PRNG key. `networks.layers.init_module` initialises modules of the layers there.
           board: u8[1, 12, 12, N], an observation, for its shape.
         """
         del key, board

@@ -13,6 +13,7 @@ from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.curiosity.models import ForwardModel, InverseModel
 from agents.networks.actions import ActionDistribution
+from agents.networks.layers import init_module
 
 
 class Models(nn.Module):
@@ -55,7 +56,8 @@ class ICM(Curiosity):
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of both models."""
         del board
-        return self._models.init(key, *(jnp.zeros((1, width)) for width in self._widths))
+        inputs = (jnp.zeros((1, width)) for width in self._widths)
+        return init_module(self._models, key, *inputs)
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The sum over units of the forward model's squared errors."""

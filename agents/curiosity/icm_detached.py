@@ -17,6 +17,7 @@ from agents.curiosity.base import Curiosity, Experience, Params
 from agents.curiosity.models import ForwardModel, InverseModel
 from agents.networks.actions import ActionDistribution
 from agents.networks.encoder import Encoder
+from agents.networks.layers import init_module
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
@@ -66,7 +67,7 @@ class DetachedICM(Curiosity):
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of the encoder and of both models."""
-        return self._models.init(key, board, board, jnp.zeros((1, 2), jnp.int32))
+        return init_module(self._models, key, board, board, jnp.zeros((1, 2), jnp.int32))
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features of its own encoder, f32[M, filters[1]]."""

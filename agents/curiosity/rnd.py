@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.networks.encoder import Encoder
-from agents.networks.layers import dense, output_dense
+from agents.networks.layers import dense, init_module, output_dense
 
 
 class Models(nn.Module):
@@ -46,7 +46,7 @@ class RND(Curiosity):
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of target and predictor; the target's get no gradient."""
-        return self._models.init(key, board)
+        return init_module(self._models, key, board)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """The difference of prediction and target, f32[M, filters[1]]."""

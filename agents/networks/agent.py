@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from agents.config import Config
 from agents.networks.core import Core, Heads, Outputs
 from agents.networks.encoder import Encoder
+from agents.networks.layers import draw
 from agents.networks.object_encoder import ObjectEncoder
 from trap_tube_jax.objects import BOARD_SIZE
 
@@ -47,15 +48,16 @@ class Agent:
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters."""
-        encoder_key, core_key, heads_key = jax.random.split(key, 3)
-        features, encoder = self.encoder.init_with_output(encoder_key, self._board)
+        unused_key = jax.random.key(0)
+        features, encoder = self.encoder.init_with_output(unused_key, self._board)
         state = jnp.zeros((1, self._hidden))
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
-        return {
+        deviations = {
             "encoder": encoder,
-            "core": self.core.init(core_key, state, features, action, reward),
-            "heads": self.heads.init(heads_key, state),
+            "core": self.core.init(unused_key, state, features, action, reward),
+            "heads": self.heads.init(unused_key, state),
         }
+        return draw(key, deviations)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features f32[M, F] of observations u8[M, 12, 12, N]; reads `params["encoder"]`."""
