@@ -1,13 +1,12 @@
 """An encoder that sees a board as a handful of objects, wherever they are and whatever colour.
 
-An object is all cells of one colour. Agent and food are known by their colours, which no
-transfer changes; of every other object the encoder is told where it is, on the board and as
-seen from the agent and from the food, and how large it is. Its colour is not told: where
-colours are drawn anew in every task they say nothing, and an agent that cannot see them
-cannot be misled by them.
+An object is all cells of one colour. Agent and food are recognised by their colours, which no
+transfer changes. Every other object is described by its place, on the board and as seen from the
+agent and from the food, and by its size. Its colour is left out: where every task has new colours,
+they say nothing about it.
 
-All of it is computed from the observation. An object costs a small network a hundred numbers,
-which is a fraction of what convolutions over 144 cells cost.
+The description is computed from the observation alone. A small network reads it at a fraction of
+the cost of convolutions over 144 cells.
 
 Source: own; objects share a network and are pooled after Zaheer et al. (2017).
 """

@@ -6,7 +6,7 @@ alone: it plays its episodes, and of every minibatch it differentiates its part.
 come two exchanges:
 
   1. once per iteration, the episodes without their features (two kilobytes each) are
-     gathered, and every device derives rewards, advantages and counts from all of them;
+     gathered, and every device derives rewards and advantages from all of them;
   2. once per gradient step, gradient and metrics are averaged in one reduction.
 
 `jax.shard_map` rather than the compiler's own partitioning, because observations are sorted
@@ -241,7 +241,7 @@ def _key_data(x: jax.Array) -> jax.Array:
 
 
 def _is_even(devices: int, processes: int, config: Config, seeds: int) -> bool:
-    """Whether devices can share the seeds and what is left of them every minibatch."""
+    """Whether devices can share the seeds, and those of one seed its minibatches."""
     per_process, rest = divmod(devices, processes)
     shards = devices // math.gcd(devices, seeds)
     enough = per_process <= jax.local_device_count()
