@@ -84,17 +84,7 @@ def rollout(
       choose: `sample_action` or `greedy_action`.
       chunk: distinct observations encoded at once.
     """
-    encode = functools.partial(encode_rows, agent.encoder)
-
-    def see(carry: _Carry, time: jax.Array | int) -> tuple[_Carry, Outputs]:
-        """The network's step: it encodes the observation and updates its memory."""
-        features, cache = carry.cache.encode(
-            encode, params["encoder"], carry.state, time, chunk=chunk
-        )
-        inputs = agent.core_inputs(params, features, carry.action_tm1, carry.reward_tm1)
-        embedding = agent.advance(params, carry.embedding, inputs)
-        carry = carry._replace(embedding=embedding, cache=cache)
-        return carry, agent.act(params, embedding)
+    see = functools.partial(_see, agent, params, chunk)
 
     def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[_Carry, dict]:
         time, step_key = inputs
@@ -128,6 +118,17 @@ def rollout(
         log_prob=record["log_prob"],
         value=jnp.concatenate([record["value"], outputs.value[None]]),
     )
+
+
+def _see(
+    agent: Agent, params: Params, chunk: int, carry: _Carry, time: jax.Array | int
+) -> tuple[_Carry, Outputs]:
+    """The network's step: encodes the observation, updates the GRU, asks the heads."""
+    encode = functools.partial(encode_rows, agent.encoder)
+    features, cache = carry.cache.encode(encode, params["encoder"], carry.state, time, chunk=chunk)
+    inputs = agent.core_inputs(params, features, carry.action_tm1, carry.reward_tm1)
+    embedding = agent.advance(params, carry.embedding, inputs)
+    return carry._replace(embedding=embedding, cache=cache), agent.act(params, embedding)
 
 
 def _first(agent: Agent, params: Params, env: Environment, initial: State) -> _Carry:
