@@ -5,12 +5,20 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
-from agents import evaluate as evaluation
 from agents import make_train
+from agents.acting import evaluation
+from agents.acting.evaluation import (
+    Evaluation,
+    Evaluator,
+    evaluation_keys,
+    evaluation_tasks,
+    fixed_tasks,
+    layout_numbers,
+)
+from agents.acting.scores import Layouts, Optimality, Score, wilson_interval
 from agents.config import Config
-from agents.evaluate import Evaluation, Evaluator, evaluation_keys, evaluation_tasks, fixed_tasks
 from agents.networks.agent import Agent
-from agents.runs.metrics import Optimality, Score, wilson_interval
+from agents.runs import report
 from trap_tube_jax.registry import PAPER_TASK_SETS
 
 TINY = {
@@ -81,12 +89,16 @@ def test_more_tasks_begin_with_the_same_ones():
     assert_equal(few, jax.tree.map(lambda x: x[:3], many))
 
 
-def test_keys_differ_within_and_between_sets():
-    keys = [jax.random.key_data(evaluation_keys(entry.id, 64)) for entry in PAPER_TASK_SETS]
-    assert len(np.unique(np.concatenate(keys), axis=0)) == 64 * len(PAPER_TASK_SETS)
+def test_keys_differ_within_and_between_sets_and_purposes():
+    keys = [
+        jax.random.key_data(evaluation_keys(entry.id, 64, purpose))
+        for entry in PAPER_TASK_SETS
+        for purpose in ("test", "validation")
+    ]
+    assert len(np.unique(np.concatenate(keys), axis=0)) == 64 * len(keys)
 
 
-def test_tasks_are_never_drawn_in_training():
+def test_keys_of_tasks_are_never_drawn_in_training():
     """Training with recorded keys: what a transfer gets is fixed by what `reset` gets."""
     seen = []
 
@@ -113,8 +125,9 @@ def test_tasks_are_never_drawn_in_training():
     seen.clear()
     for entry in PAPER_TASK_SETS:
         fixed_tasks(env, entry.id, 8)
+        fixed_tasks(env, entry.id, 8, "validation")
     jax.effects_barrier()
-    assert len(set(seen)) == 8 * len(PAPER_TASK_SETS)
+    assert len(set(seen)) == 2 * 8 * len(PAPER_TASK_SETS)
     assert not training & set(seen)
 
 
@@ -133,12 +146,12 @@ def test_outcomes_are_those_of_the_recorded_actions(grey_play):
 
 
 def test_own_tasks_are_evaluated(grey_play):
-    _, _, played = grey_play
+    evaluator, _, played = grey_play
     outcome = played["mine"]
     assert outcome.solved.any()
     assert 1 in outcome.length[outcome.solved]
     assert not played["base"].solved.any()  # needs 11 steps, has 6
-    by_set = {score.set: score for score in evaluation.scores(played, 6)}
+    by_set = {score.set: score for score in evaluation.scores(played, evaluator.tasks, 6)}
     assert by_set["mine"].percent == 25 * outcome.solved.sum()
     assert by_set["mine"].interval is not None
     assert by_set["base"].interval is None
@@ -155,7 +168,7 @@ def test_blocks_change_nothing(grey_play, monkeypatch):
 def test_solved_episode_becomes_a_gif(grey_play, tmp_path):
     evaluator, _, played = grey_play
     path = tmp_path / "solved.gif"
-    assert evaluation.save_solved_episode(path, evaluator, played, prefer="base") == "mine"
+    assert report.save_first_solved(path, evaluator, [played], prefer="base") == "mine"
     with Image.open(path) as picture:
         index = int(np.argmax(played["mine"].solved))
         assert getattr(picture, "n_frames", 1) == played["mine"].length[index] + 1
@@ -164,7 +177,7 @@ def test_solved_episode_becomes_a_gif(grey_play, tmp_path):
 def test_no_solved_episode_leaves_no_gif(grey_play, tmp_path):
     evaluator, _, played = grey_play
     unsolved = {"base": played["base"]}
-    assert evaluation.save_solved_episode(tmp_path / "x.gif", evaluator, unsolved, "base") is None
+    assert report.save_first_solved(tmp_path / "x.gif", evaluator, [unsolved], "base") is None
     assert not list(tmp_path.iterdir())
 
 
@@ -188,7 +201,7 @@ def test_optimality_compares_with_shortest_plans():
 
 def test_scores_use_the_paper_notation():
     outcome = Evaluation(*map(jnp.asarray, ([True, False], [11, 50], np.zeros((2, 50, 2), int))))
-    (score,) = evaluation.scores({"pst": outcome}, 50, {"pst": np.array([11, 12])})
+    (score,) = evaluation.scores({"pst": outcome}, {"pst": None}, 50, {"pst": np.array([11, 12])})
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
     assert score.mean_steps == 11
     assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)
@@ -209,9 +222,23 @@ def test_wilson_interval_refuses(successes, trials):
         wilson_interval(successes, trials)
 
 
-def test_a_single_possible_task_has_no_interval():
-    score = Score.of("base", "base", np.array([True]), np.array([11]), is_sample=False)
-    assert (score.percent, score.interval, score.mean_steps) == (100.0, None, 11.0)
+@pytest.mark.parametrize("name", SHORTS)
+def test_sets_with_few_layouts_are_named(name):
+    layout = layout_numbers(name, evaluation_tasks(name, 64))
+    if name in evaluation.NUM_LAYOUTS:
+        assert layout is not None
+        assert sorted(set(layout.tolist())) == list(range(evaluation.NUM_LAYOUTS[name]))
+    else:
+        assert layout is None
+
+
+def test_few_layouts_are_counted_and_have_no_interval():
+    solved = np.array([True, True, False, True, False])
+    layout = np.array([0, 0, 0, 1, 1])
+    score = Score.of("stsy", "{St, Sy}", solved, np.full(5, 9), layout=layout)
+    assert (score.percent, score.interval, score.layouts) == (60.0, None, Layouts(1, 2))
+    assert str(score.layouts) == "1 of 2"
+    assert Score.of("p", "{P}", solved, np.full(5, 9)).layouts is None
 
 
 def test_refusals():

@@ -1,6 +1,6 @@
 """The agent: policy network and curiosity together, as pure functions of parameters."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -14,22 +14,6 @@ from agents.networks.object_encoder import ObjectEncoder
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
-
-
-class Policy(NamedTuple):
-    """A trained network: what evaluation needs of a run, wherever it comes from.
-
-    Attributes:
-      name: what to call it in tables.
-      config: the settings that it was trained with.
-      params: its parameters.
-      iteration: iterations trained.
-    """
-
-    name: str
-    config: Config
-    params: Params
-    iteration: int
 
 
 class Agent:

@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from agents.acting.policy import Policy
 from agents.config import Config
-from agents.networks.agent import Agent, Policy
+from agents.networks.agent import Agent
 from agents.runs.checkpoint import Arrays, digest, from_arrays, to_arrays
 
 FORMAT = "trap-tube-jax parameters 1"

@@ -10,6 +10,8 @@ from agents.config import PRESETS, Config
 
 CONFIG_FILE = "config.json"
 MAX_SEED = 2**31 - 1
+# Settings that may change when a run is resumed: they decide only where it ends.
+EXTENDABLE = ("iterations", "stop_when_solved")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +53,29 @@ class Run:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
         return dataclasses.asdict(self)
+
+    def check_continues(self, before: "Run") -> None:
+        """Checks that this run, resumed, ends as if it had never been another one.
+
+        Args:
+          before: the stored run.
+
+        Raises:
+          ValueError: a setting differs that shapes what has been trained so far.
+        """
+        old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
+        for name, value in old.items():
+            if name not in (*EXTENDABLE, "config") and new[name] != value:
+                raise ValueError(
+                    f"the run has {name}={value}, not {new[name]}; only "
+                    f"{' and '.join(EXTENDABLE)} may change"
+                )
+        if before.config.cooldown > 0 and new["iterations"] != old["iterations"]:
+            raise ValueError(
+                f"the run has cooldown={before.config.cooldown} and iterations="
+                f"{old['iterations']}, not {new['iterations']}: the step size falls towards the "
+                "last iteration, so another number of them is another run; begin a new one"
+            )
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
@@ -95,6 +120,10 @@ class RunFolder:
     def best(self, seed: int) -> Path:
         """The parameters of a seed's best evaluation on several sets."""
         return self.path / f"best-seed{seed}.npz"
+
+    def tested(self, seed: int) -> Path:
+        """The steps that these parameters take in the tasks that are reported."""
+        return self.path / f"tested-seed{seed}.json"
 
     @property
     def checkpoints(self) -> Path:
@@ -165,10 +194,23 @@ class RunFolder:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Writes a JSON file whole or not at all."""
+    """Writes a JSON file whole or not at all; a list of plain values takes one line."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_text(json.dumps(values, indent=2) + "\n")
+    draft.write_text(_json(values) + "\n")
     draft.replace(path)
+
+
+def _json(value: Any, indent: str = "") -> str:
+    inner = indent + "  "
+    if isinstance(value, dict) and value:
+        lines = [f"{json.dumps(str(name))}: {_json(each, inner)}" for name, each in value.items()]
+        start, end = "{}"
+    elif isinstance(value, list | tuple) and any(isinstance(x, dict | list | tuple) for x in value):
+        lines = [_json(each, inner) for each in value]
+        start, end = "[]"
+    else:
+        return json.dumps(value, allow_nan=False)
+    return f"{start}\n{inner}" + f",\n{inner}".join(lines) + f"\n{indent}{end}"
 
 
 def read_json(path: Path) -> Any:
