@@ -110,8 +110,7 @@ def train(arguments: Sequence[str]) -> None:
     resume = how_to_resume(session.folder)
     stop = StopSignals(lambda: console.print("Finishing this iteration; again to abandon it."))
     try:
-        session.prepare_results()
-        session.train(stop)
+        session.train(stop, then_finish=True)
         session.finish()
     except (Stopped, KeyboardInterrupt) as stopped:
         console.print(f"Stopped at iteration {session.saved}. {resume}", soft_wrap=True)

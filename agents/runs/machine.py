@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
 # What decides results; records and texts may change between two of them.
 CODE = ("agents/*.py", "benchmarks/*.py", "trap_tube_jax/*.py", "pyproject.toml")
@@ -40,16 +41,15 @@ def _processor() -> str:
 
 def _commit() -> str | None:
     """The commit that the code is of, with "-dirty" where the code was changed since."""
-    root = pathlib.Path(__file__).parents[2]
     try:
-        commit = _git(root, "rev-parse", "--short=12", "HEAD")
-        changes = _git(root, "status", "--porcelain", "--", *CODE)
+        commit = _git("rev-parse", "--short=12", "HEAD")
+        changes = _git("status", "--porcelain", "--", *CODE)
     except (OSError, subprocess.CalledProcessError):
         return None
     return commit + (DIRTY if changes else "")
 
 
-def _git(root: pathlib.Path, *arguments: str) -> str:
+def _git(*arguments: str) -> str:
     command = ["git", *arguments]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     return done.stdout.strip()

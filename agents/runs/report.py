@@ -168,7 +168,7 @@ def evaluation_table(scores: Sequence[Score], title: str) -> Table:
     heads = ["tasks", "solved %", "95 % interval", "steps"]
     with_layouts = any(score.layouts is not None for score in scores)
     if with_layouts:
-        heads.insert(3, "layouts solved")
+        heads.insert(2, "layouts solved")
     with_optimality = any(score.optimality is not None for score in scores)
     if with_optimality:
         heads += ["of solvable", "optimal", "worst"]

@@ -194,8 +194,12 @@ class Session:
         if self._checkpoints is not None:
             self._checkpoints.close()
 
-    def train(self, stop: StopSignals) -> None:
+    def train(self, stop: StopSignals, *, then_finish: bool = False) -> None:
         """Trains until all seeds are solved or the iterations are over.
+
+        Args:
+          stop: tells when to stop early.
+          then_finish: `finish` will follow; what it needs compiles as training goes.
 
         Raises:
           Stopped: on request; everything is saved.
@@ -205,6 +209,8 @@ class Session:
         if not self._progress.active(config).any():
             return
         advance = self._compile()
+        if then_finish:
+            self._prepare_results()
         live = report.LiveReport(self.console, total, self.run.seeds)
         with stop, live:
             while self._progress.active(config).any():
@@ -217,20 +223,6 @@ class Session:
                     self._save()
                 if request:
                     raise Stopped(request)
-
-    def prepare_results(self) -> None:
-        """Compiles in the background what `finish` needs; nothing happens on several devices."""
-        if self._placement.mesh is None:
-            worker = futures.ThreadPoolExecutor(1)
-            self._results = worker.submit(self._make_evaluator)
-            worker.shutdown(wait=False)
-
-    def _make_evaluator(self) -> Evaluator:
-        config = self.run.config
-        evaluator = Evaluator.of_sets(config, ALL_SETS, config.eval_episodes, self._placement)
-        if self._placement.mesh is None:
-            evaluator.compile(jax.eval_shape(self._train.agent.init, jax.random.key(0)))
-        return evaluator
 
     def finish(self) -> None:
         """Evaluates on all task sets, writes the results and says what they show."""
@@ -303,6 +295,20 @@ class Session:
         )
         self.console.print(f"Compiled in {seconds:.1f} s.")
         return compiled
+
+    def _prepare_results(self) -> None:
+        """Compiles in the background what `finish` needs, unless there are several devices."""
+        if self._placement.mesh is None:
+            worker = futures.ThreadPoolExecutor(1)
+            self._results = worker.submit(self._make_evaluator)
+            worker.shutdown(wait=False)
+
+    def _make_evaluator(self) -> Evaluator:
+        config = self.run.config
+        evaluator = Evaluator.of_sets(config, ALL_SETS, config.eval_episodes, self._placement)
+        if self._placement.mesh is None:
+            evaluator.compile(jax.eval_shape(self._train.agent.init, jax.random.key(0)))
+        return evaluator
 
     def _iterate(self, advance: Advance) -> list[Row]:
         config, progress = self.run.config, self._progress

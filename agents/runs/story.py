@@ -47,7 +47,7 @@ class Story(NamedTuple):
         if not folder.animation.exists():
             watch = "No episode of the evaluation is solved, so there is none to watch."
         return cls(
-            before=["", learnt(own, percent, solved), watch, transfers(own, others)],
+            before=["", learnt(own, percent, solved), watch, transfers(own, percent, others)],
             after=["", f"Next: {next_command(folder, run, percent)}"],
         )
 
@@ -69,9 +69,17 @@ def learnt(own: tt.TaskSet, percent: float, solved: Sequence[FirstSolved | None]
     )
 
 
-def transfers(own: tt.TaskSet, percents: Sequence[float]) -> str:
-    """Whether what was learnt carries over to the other task sets, percents solved."""
-    mean = statistics.fmean(percents)
+def transfers(own: tt.TaskSet, percent: float, others: Sequence[float]) -> str:
+    """Whether what was learnt carries over to the other task sets.
+
+    Args:
+      own: the set that was trained on.
+      percent: of its tasks, percent solved.
+      others: percent solved of each other set.
+    """
+    if percent == 0:
+        return "Nothing is learnt yet that could carry over to the other task sets."
+    mean = statistics.fmean(others)
     verdict = "does not transfer" if mean < LITTLE else "transfers in part"
     if mean > MUCH:
         verdict = "transfers"
