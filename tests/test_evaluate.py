@@ -201,7 +201,8 @@ def test_optimality_compares_with_shortest_plans():
 
 def test_scores_use_the_paper_notation():
     outcome = Evaluation(*map(jnp.asarray, ([True, False], [11, 50], np.zeros((2, 50, 2), int))))
-    (score,) = evaluation.scores({"pst": outcome}, {"pst": None}, 50, {"pst": np.array([11, 12])})
+    tasks = evaluation_tasks("pst", 2)
+    (score,) = evaluation.scores({"pst": outcome}, {"pst": tasks}, 50, {"pst": np.array([11, 12])})
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
     assert score.mean_steps == 11
     assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)

@@ -5,7 +5,7 @@ import pytest
 
 import agents
 import trap_tube_jax as tt
-from agents import Config, Policy
+from agents import Config, Policy, pretrained
 from agents.acting.evaluation import Evaluator
 from agents.networks.agent import Agent
 from agents.runs.checkpoint import Checkpoints
@@ -81,7 +81,7 @@ def test_a_loaded_policy_reaches_the_evaluators_outcomes(run_path, seed):
 def test_runs_files_and_names_are_loaded(run_path, tmp_path):
     first = agents.load(str(run_path))
     assert (first.name, first.iteration, first.greedy) == ("seed 3", 6, True)
-    agents.pretrained.save(tmp_path / "x.npz", first)
+    pretrained.save(tmp_path / "x.npz", first)
     again = agents.load(tmp_path / "x.npz")
     jax.tree.map(np.testing.assert_array_equal, again.params, first.params)
     assert agents.load("base").config.env_id == "TrapTube-v0"

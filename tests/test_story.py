@@ -20,9 +20,14 @@ def scores(own, percent, others):
     return made
 
 
-def story(tmp_path, own, percent, others, first=FIRST, **settings):
+def story(tmp_path, own, percent, others, *, is_solved=True, **settings):
     run = Run(Config.preset("paper", env_id=own, iterations=7, **settings))
-    return Story.of(RunFolder(tmp_path / "x"), run, [scores(own, percent, others)], [first])
+    return Story.of(
+        RunFolder(tmp_path / "x"),
+        run,
+        [scores(own, percent, others)],
+        [FIRST if is_solved else None],
+    )
 
 
 def test_a_run_that_solves_base_says_so_and_points_onward(tmp_path):
@@ -48,11 +53,11 @@ def test_transfer_is_named_by_what_is_solved(tmp_path, others, verdict):
 
 
 def test_a_run_that_has_not_learnt_is_to_be_continued(tmp_path):
-    before, after = story(tmp_path, "base", 0, 0, first=None)
+    before, after = story(tmp_path, "base", 0, 0, is_solved=False)
     text = "\n".join(before)
     assert "Learnt so far: trained on the base task" in text
     assert "so there is none to watch" in text
     assert "transfer:" not in text
     assert f"--resume --name x --out {tmp_path} --iterations 14" in after[-1]
-    _, after = story(tmp_path, "base", 0, 0, first=None, cooldown=0.5)  # not to be extended
+    _, after = story(tmp_path, "base", 0, 0, is_solved=False, cooldown=0.5)  # not to be extended
     assert "--resume" not in after[-1]

@@ -22,6 +22,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from agents.experiments.training import AlgorithmRun
 from agents.runs.folder import read_json, write_json
 from agents.runs.machine import DIRTY, machine
@@ -33,7 +35,7 @@ MAX_POINTS = 200  # of a curve
 DIGITS = 4  # significant digits of a curve's values
 
 Record = Mapping[str, Any]
-Steps = Mapping[str, Sequence[int]]
+Steps = Mapping[str, Sequence[int] | np.ndarray]
 
 
 def seed_record(
@@ -153,7 +155,7 @@ def check_clean(record: Record, commit: str | None = None) -> None:
     commits = {entry["commit"] for entry in record["machines"]} | {machine()["commit"] or commit}
     if None in commits:
         raise ValueError("a record names its commit, which git does not tell; give --commit")
-    dirty = sorted(commit for commit in commits if str(commit).endswith(DIRTY))
+    dirty = sorted(str(commit) for commit in commits if str(commit).endswith(DIRTY))
     if dirty:
         raise ValueError(
             f"a record is of committed code, this one of {', '.join(dirty)}; commit the changes "

@@ -3,14 +3,16 @@
 Source: paper Tables 1 and 2.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from rich.table import Table as RichTable
 
+from agents.acting.scores import Layouts
 from agents.experiments import statistics
 from agents.experiments.protocol import EXPERIMENTS, PRESET
 from agents.experiments.records import Record
-from agents.experiments.statistics import SetSummary, Spread
+from agents.experiments.statistics import Spread
 from agents.runs.report import FEW_LAYOUTS, NOTHING, TABLE_STYLE, duration
 
 
@@ -152,7 +154,7 @@ def layouts_table(record: Record) -> Table:
         for summary in summaries.values():
             if summary.layouts is not None:
                 row = rows.setdefault(summary.label, [summary.label, *[NOTHING] * len(entries)])
-                row[1 + index] = _layouts(summary)
+                row[1 + index] = _solved_layouts(summary.layouts)
     heading = f"Layouts solved, mean over seeds. {FEW_LAYOUTS}"
     return Table(heading, ("set", *entries), tuple(map(tuple, rows.values())))
 
@@ -271,8 +273,7 @@ def _spread(spread: Spread | None, form: str, high: float | None = None) -> str:
     return text
 
 
-def _layouts(summary: SetSummary) -> str:
-    layouts = summary.layouts or ()
+def _solved_layouts(layouts: Sequence[Layouts]) -> str:
     mean = sum(each.solved for each in layouts) / len(layouts)
     form = ".0f" if len(layouts) == 1 else ".1f"
     return f"{mean:{form}} of {layouts[0].total}"
