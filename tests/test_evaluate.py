@@ -1,3 +1,8 @@
+import base64
+import io
+import json
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +23,7 @@ from agents.acting.evaluation import (
 from agents.acting.scores import Layouts, Optimality, Score, wilson_interval
 from agents.config import Config
 from agents.networks.agent import Agent
-from agents.runs import report
+from agents.runs import report, report_page
 from trap_tube_jax.registry import PAPER_TASK_SETS
 
 TINY = {
@@ -181,6 +186,44 @@ def test_no_solved_episode_leaves_no_gif(grey_play, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_page_shows_solved_and_unsolved_episodes(grey_play, tmp_path):
+    evaluator, _, played = grey_play
+    Image.new("RGB", (4, 4)).save(tmp_path / "curves.png")
+    path = tmp_path / "report.html"
+    report_page.save(
+        path,
+        title="<mine>",
+        sentences=["It does not transfer."],
+        settings={"hidden": 4},
+        scores={"seed 0": evaluation.scores(played, evaluator.tasks, 6)},
+        curves=tmp_path / "curves.png",
+        evaluator=evaluator,
+        played=played,
+    )
+    text = path.read_text()
+    assert "<h1>&lt;mine&gt;</h1>" in text
+    assert "<td>hidden</td><td>4</td>" in text
+    assert "<td>{P}</td><td>2</td>" in text
+    assert not re.search(r"https?:|(src|href)=\"(?!data:)", text)
+    start, end = '<script type="application/json" id="data">', "</script>"
+    data = json.loads(text.partition(start)[2].partition(end)[0])
+    outcome = played["mine"]
+    solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
+    mine = [each for each in data["episodes"] if each["title"].startswith("mine")]
+    assert [each["title"] for each in mine] == [
+        f"mine, task {solved}: solved",
+        f"mine, task {unsolved}: not solved",
+    ]
+    for index, each in zip((solved, unsolved), mine, strict=True):
+        length = outcome.length[index]
+        assert len(each["frames"]) == length + 1
+        assert len(each["actions"]) == length
+        np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
+        for number in each["frames"]:
+            with Image.open(io.BytesIO(base64.b64decode(data["pictures"][number]))) as picture:
+                assert picture.size == (192, 192)
+
+
 def test_shortest_lengths_of_the_base_task():
     assert evaluation.shortest_lengths(evaluation_tasks("base", 1)).tolist() == [11]
 
@@ -200,7 +243,7 @@ def test_optimality_compares_with_shortest_plans():
 
 
 def test_scores_use_the_paper_notation():
-    outcome = Evaluation(*map(jnp.asarray, ([True, False], [11, 50], np.zeros((2, 50, 2), int))))
+    outcome = Evaluation(jnp.array([True, False]), jnp.array([11, 50]), *[jnp.zeros((2, 50))] * 2)
     tasks = evaluation_tasks("pst", 2)
     (score,) = evaluation.scores({"pst": outcome}, {"pst": tasks}, 50, {"pst": np.array([11, 12])})
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)

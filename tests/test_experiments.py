@@ -88,14 +88,14 @@ class FakeEvaluator:
         steps = STEPS.get(divmod(number, 100), NOTHING_SOLVED)
         played = {name: jnp.array(steps[name]) for name in self.tasks}
         return {
-            name: evaluation.Evaluation(taken > 0, jnp.where(taken > 0, taken, 6), taken)
+            name: evaluation.Evaluation(taken > 0, jnp.where(taken > 0, taken, 6), taken, taken)
             for name, taken in played.items()
         }
 
 
 def fake_evaluate(agent, params, env, tasks, chunk, shards):
     nothing = jnp.zeros(len(tasks.time), jnp.int32)
-    return evaluation.Evaluation(nothing > 0, nothing, nothing)
+    return evaluation.Evaluation(nothing > 0, nothing, nothing, nothing)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -363,6 +363,15 @@ def test_protocols_are_the_papers():
         assert (protocol.selection, protocol.num_reported) == ("validation", 1000)
     fast = QUICK["exp1"].config(EXPERIMENTS["exp1"], "preset")
     assert (fast.curiosity, fast.imitation_coef, fast.eval_episodes) == ("counts", 1.0, 16)
+
+
+def test_stored_protocols_are_whole():
+    """An old one did not say on which tasks its evaluations were chosen."""
+    values = json.loads(json.dumps(dataclasses.asdict(PROTOCOLS["exp1"])))
+    assert Protocol.from_dict(values) == PROTOCOLS["exp1"]
+    del values["selection"]
+    with pytest.raises(ValueError, match="a protocol lacks selection"):
+        Protocol.from_dict(values)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -46,11 +46,13 @@ class Evaluation(NamedTuple):
       solved: bool[B].
       length: i32[B], steps taken.
       action: i32[B, T, 2], (grasp, move); without meaning from `length` on.
+      value: f32[B, T], the network's value of every state; likewise.
     """
 
     solved: jax.Array
     length: jax.Array
     action: jax.Array
+    value: jax.Array
 
 
 def evaluation_tasks(
@@ -147,7 +149,8 @@ def evaluate(
     chunk = min(chunk, tasks.time.shape[0])
     unused_key = jax.random.key(0)
     played = rollout(agent, params, env, tasks, unused_key, choose=greedy_action, chunk=chunk)
-    outcome = Evaluation(played.solved, played.length, played.action.swapaxes(0, 1))
+    by_episode = played.action.swapaxes(0, 1), played.value.swapaxes(0, 1)
+    outcome = Evaluation(played.solved, played.length, *by_episode)
     return outcome if shards.count == 1 else _rows(shards.whole(outcome), slice(num_tasks))
 
 

@@ -112,12 +112,15 @@ class Protocol:
         """The inverse of `dataclasses.asdict`, also from JSON.
 
         Raises:
-          ValueError: a value is unknown, or not allowed.
+          ValueError: a value is unknown, missing or not allowed.
         """
         known = [field.name for field in dataclasses.fields(cls)]
         for name in values:
             if name not in known:
                 raise ValueError(f"unknown {name!r} in a protocol; allowed: {', '.join(known)}")
+        missing = [name for name in known if name not in values]
+        if missing:
+            raise ValueError(f"a protocol lacks {', '.join(missing)}")
         return cls(**{**values, "algorithms": tuple(values["algorithms"])})
 
     @property

@@ -136,6 +136,11 @@ class RunFolder:
         return self.path / "curves.png"
 
     @property
+    def page(self) -> Path:
+        """All of it on one page, to open in a browser."""
+        return self.path / "report.html"
+
+    @property
     def evaluation(self) -> Path:
         """Greedy evaluation on all task sets."""
         return self.path / "evaluation.json"

@@ -14,14 +14,22 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import ALL_SETS, Evaluator, evaluate, evaluation_tasks, scores
+from agents.acting.evaluation import (
+    ALL_SETS,
+    Evaluation,
+    Evaluator,
+    evaluate,
+    evaluation_tasks,
+    scores,
+)
 from agents.acting.policy import Policy
+from agents.acting.scores import Score
 from agents.config import Config
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import DEFAULT_DEVICE, Placement
 from agents.ppo.method import Train
-from agents.runs import report
+from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.metrics import FirstSolved, MetricsLog, Row, read_metrics
@@ -244,12 +252,34 @@ class Session:
         report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
         solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
         story = Story.of(folder, run, results.values(), list(solved.values()))
+        self._save_page(story, evaluator, played, results)
         self._say(story.before)
         for name, result in results.items():
             self.console.print(report.evaluation_table(result, f"{folder.path.name}, {name}"))
         self.console.print(report.summary_table(solved, env.id))
         self._say_where()
         self._say(story.after)
+
+    def _save_page(
+        self,
+        story: Story,
+        evaluator: Evaluator,
+        played: Mapping[str, Mapping[str, Evaluation]],
+        results: Mapping[str, Sequence[Score]],
+    ) -> None:
+        """Writes the page, with episodes of the first seed."""
+        if not self.folder.curves.exists():
+            return
+        report_page.save(
+            self.folder.page,
+            title=self.folder.path.name,
+            sentences=[*story.before, *story.after],
+            settings={"preset": self.run.preset, **self.run.config.to_dict()},
+            scores=results,
+            curves=self.folder.curves,
+            evaluator=evaluator,
+            played=next(iter(played.values())),
+        )
 
     def summarize(self) -> None:
         """Writes the summary and the learning curves."""
@@ -411,6 +441,7 @@ class Session:
             "learning curves": folder.curves,
             "evaluation": folder.evaluation,
             "summary": folder.summary,
+            "report": folder.page,
         }
         self._say([f"{name:>15}: {path}" for name, path in files.items()])
 
