@@ -15,11 +15,11 @@ import numpy as np
 from agents.acting.evaluation import Evaluation, Evaluator, label
 from agents.acting.scores import Score
 from agents.runs.report import FEW_LAYOUTS, NOTHING
-from trap_tube_jax.objects import DIRECTION_NAMES
+from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
 from trap_tube_jax.rendering import episode_frames
 
 CELL_SIZE = 16  # pixels
-MAX_PICTURE_BYTES = 1_200_000  # of all episodes; a third more in the page
+MAX_PICTURES = 600  # of all episodes, of at most two kilobytes each
 
 PAGE = string.Template("""<!doctype html>
 <html lang="en">
@@ -170,20 +170,20 @@ def _episodes(
 ) -> tuple[list[Episode], list[str]]:
     """The first solved and the first unsolved episode of each set, and their pictures as PNG.
 
-    Sets are left out once the pictures take too many bytes.
+    Sets are left out once there are too many pictures.
     """
     episodes: list[Episode] = []
     pictures: dict[bytes, int] = {}
     for name, outcome in played.items():
         for solved in (True, False):
             found = np.flatnonzero(np.asarray(outcome.solved) == solved)
-            if not len(found) or sum(map(len, pictures)) > MAX_PICTURE_BYTES:
+            if not len(found) or len(pictures) > MAX_PICTURES:
                 continue
             index = int(found[0])
             how = "solved" if solved else "not solved"
             title = f"{label(name)}, task {index}: {how}"
             episodes.append(_episode(title, evaluator, name, outcome, index, pictures))
-    return episodes, [base64.b64encode(picture).decode() for picture in pictures]
+    return episodes, [base64.b64encode(_png(picture)).decode() for picture in pictures]
 
 
 def _episode(
@@ -200,11 +200,11 @@ def _episode(
     actions = np.array(outcome.action[index])
     # No direction, which changes nothing: all episodes are as long, and compile as one.
     actions[length:] = -1
-    frames = [_png(frame) for frame in episode_frames(state, actions, CELL_SIZE)[: length + 1]]
+    frames = episode_frames(state, actions, CELL_SIZE)[: length + 1]
     return Episode(
         title=title,
         solved=bool(outcome.solved[index]),
-        frames=[pictures.setdefault(frame, len(pictures)) for frame in frames],
+        frames=[pictures.setdefault(frame.tobytes(), len(pictures)) for frame in frames],
         actions=[
             f"grasp {DIRECTION_NAMES[grasp]}, move {DIRECTION_NAMES[move]}"
             for grasp, move in actions[:length].tolist()
@@ -213,9 +213,10 @@ def _episode(
     )
 
 
-def _png(frame: np.ndarray) -> bytes:
+def _png(pixels: bytes) -> bytes:
     from PIL import Image  # noqa: PLC0415  slow to import
 
+    side = BOARD_SIZE * CELL_SIZE
     file = io.BytesIO()
-    Image.fromarray(np.asarray(frame)).quantize(32).save(file, "png", optimize=True)
+    Image.frombytes("RGB", (side, side), pixels).quantize(32).save(file, "png")
     return file.getvalue()
