@@ -1,5 +1,6 @@
 import csv
 import dataclasses
+import io
 import json
 import os
 import re
@@ -12,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy import stats
 
 import trap_tube_jax as tt
 from agents import pretrained
 from agents.acting import evaluation
-from agents.config import PRESETS
+from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
 from agents.experiments import (
     figures,
@@ -143,7 +145,7 @@ def contents(folder):
     best = [pretrained.load(path) for path in sorted(folder.glob("best-*.npz"))]
     return {
         "metrics": untimed(run_folder.metrics),
-        "outcomes": untimed(run_folder.outcomes),
+        "outcomes": untimed(run_folder.outcomes) if run_folder.outcomes.exists() else None,
         "state": digest(arrays),
         "best": [(policy.iteration, digest(to_arrays(policy.params))) for policy in best],
     }
@@ -404,6 +406,39 @@ def test_runs_with_a_cooldown_are_not_extended(tmp_path):
     longer = dataclasses.replace(short, iterations=8)
     with pytest.raises(ValueError, match=r"ppo-seed0: the run has cooldown=0.5 and iterations=4"):
         training.plan(tmp_path, longer, experiment, side_by_side=False)
+
+
+def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
+    """Solved of four tasks are as many as there were iterations."""
+
+    def evaluate(agent, params, env, tasks, chunk, shards):
+        iteration = jax.tree.leaves(params)[0].reshape(-1)[0] % 100
+        nothing = jnp.zeros(4, jnp.int32)
+        return evaluation.Evaluation(jnp.arange(4) < iteration, nothing, nothing, nothing)
+
+    monkeypatch.setattr(session, "evaluate", evaluate)
+    sizes = {"max_steps": 6, "filters": (2, 2), "hidden": 4, "embedding": 2, "curiosity": "none"}
+
+    def train(name, share):
+        run = Run(Config(**sizes, iterations=9, stop_when_solved=share))
+        folder = RunFolder(tmp_path / name)
+        if not folder.path.exists():
+            RunFolder.create(folder.path, run)
+        console = Console(file=io.StringIO())
+        part = session.Session(folder, run, console, checkpoint_every=3, keep=1)
+        part.train(session.StopSignals(lambda: None))
+        part.summarize()
+        part.close()
+        return contents(folder.path)
+
+    assert len(train("mine", 0.5)["metrics"]) == 2
+    extended = train("mine", 1.0)
+    assert len(extended["metrics"]) == 4
+    assert extended == train("whole", 1.0)
+    first = json.loads((tmp_path / "mine" / "summary.json").read_text())["seeds"][0]
+    assert first["first_solved"]["iteration"] == 4
+    with pytest.raises(ValueError, match="would be after iteration 3, but it is after 4"):
+        train("mine", 0.75)
 
 
 def rows(seed, greedy, iterations=None):

@@ -31,7 +31,7 @@ class Run:
     seeds: int = 1
 
     def __post_init__(self) -> None:
-        """Refuses impossible seeds.
+        """Checks preset and seeds.
 
         Raises:
           ValueError: naming the value and what is allowed.
