@@ -29,7 +29,7 @@ from agents.experiments import (
     tables,
     training,
 )
-from agents.experiments.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
+from agents.experiments.protocol import EXPERIMENTS, PROTOCOLS, QUICK, Protocol, algorithms
 from agents.parallel.sharding import ALONE
 from agents.ppo.learner import make_train
 from agents.runs import machine, report, session, tracking
@@ -326,7 +326,7 @@ def refused(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--algorithms ppo icm", f"unknown algorithm 'icm'; allowed: {', '.join(ALGORITHMS)}"),
+        ("--algorithms ppo icm", f"unknown algorithm 'icm'; allowed: {', '.join(algorithms())}"),
         ("--preset slow", "unknown preset 'slow'; allowed: paper, fast"),
         ("--seeds 0", "seeds must be >= 1, got 0"),
         ("--reported 0", "reported must be >= 1, got 0"),

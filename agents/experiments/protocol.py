@@ -18,18 +18,17 @@ WITHOUT_IMITATION = {"imitation_coef": 0.0}
 WITHOUT_CURIOSITY = {"curiosity": "none", "episodic_novelty": False}
 
 
-def _algorithms() -> dict[str, dict[str, Any]]:
-    """What each algorithm changes in a preset, whichever that is."""
+def algorithms() -> dict[str, dict[str, Any]]:
+    """What each algorithm changes in a preset, whichever that is.
+
+    `ppo` is PPO alone. `+<curiosity>` adds that curiosity and `+imitation` imitation, both with
+    the preset's weights. `preset` is the preset as it is.
+    """
     named: dict[str, dict[str, Any]] = {"ppo": WITHOUT_CURIOSITY}
     named |= {f"ppo+{name}": {"curiosity": name} for name in get_args(Curiosity) if name != "none"}
     pure = {name: {**changes, **WITHOUT_IMITATION} for name, changes in named.items()}
     imitating = {name + IMITATION: changes for name, changes in named.items()}
     return {**pure, **imitating, PRESET: {}}
-
-
-# `ppo` is PPO alone. `+<curiosity>` adds that curiosity and `+imitation` imitation, both with
-# the preset's weights. `preset` is the preset as it is.
-ALGORITHMS = _algorithms()
 
 
 class Experiment(NamedTuple):
@@ -63,7 +62,7 @@ class Protocol:
 
     Attributes:
       preset: the named settings.
-      algorithms: which of `ALGORITHMS`.
+      algorithms: which of `algorithms()`.
       seeds: how many, from `seed` on.
       iterations: of training, at most.
       tasks: tasks per set by which the best evaluation is chosen; the base set has one.
@@ -94,18 +93,19 @@ class Protocol:
         Raises:
           ValueError: naming the value and what is allowed.
         """
+        allowed = ", ".join(algorithms())
         for name in self.algorithms:
-            if name not in ALGORITHMS:
-                allowed = ", ".join(ALGORITHMS)
+            if name not in algorithms():
                 raise ValueError(f"unknown algorithm {name!r}; allowed: {allowed}")
         for name in ("seeds", "tasks", "reported", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
         if not self.algorithms:
-            raise ValueError(f"name at least one algorithm; allowed: {', '.join(ALGORITHMS)}")
+            raise ValueError(f"name at least one algorithm; allowed: {allowed}")
         if self.selection not in SELECTIONS:
-            allowed = ", ".join(SELECTIONS)
-            raise ValueError(f"selection must be one of {allowed}, got {self.selection!r}")
+            raise ValueError(
+                f"selection must be one of {', '.join(SELECTIONS)}, got {self.selection!r}"
+            )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -146,7 +146,7 @@ class Protocol:
             "eval_episodes": self.tasks,
             "stop_when_solved": self.stop_when_solved,
         }
-        changes = ALGORITHMS[algorithm]
+        changes = algorithms()[algorithm]
         config = Config.preset(self.preset, **{**self.settings, **fixed, **changes})
         if algorithm.endswith(IMITATION) and not config.imitation_coef:
             raise ValueError(

@@ -15,7 +15,7 @@ import trap_tube_jax as tt
 from agents import pretrained
 from agents.acting.evaluation import Evaluator, layout_numbers, shortest_lengths
 from agents.experiments import figures, records, tables
-from agents.experiments.protocol import ALGORITHMS, EXPERIMENTS, Protocol
+from agents.experiments.protocol import EXPERIMENTS, Protocol, algorithms
 from agents.experiments.records import Record, Steps
 from agents.experiments.training import AlgorithmRun, draw_tasks, find_runs
 from agents.networks.agent import Params
@@ -51,13 +51,13 @@ def make_record(
         raise ValueError(f"{root} holds no run with a first iteration yet")
     tasks = draw_tasks(runs[0].run.config, protocol.num_reported, "test")
     shortest = find_shortest(root / SHORTEST_FILE, tasks, console) if optimality else {}
-    names = [name for name in ALGORITHMS if any(entry.algorithm == name for entry in runs)]
+    names = [name for name in algorithms() if any(entry.algorithm == name for entry in runs)]
     machines: list[Any] = []
-    algorithms = []
+    reached = []
     with console.status("Playing the reported tasks ..."):
         for name in names:
             entries = [entry for entry in runs if entry.algorithm == name]
-            algorithms.append(_algorithm(name, entries, protocol, tasks, machines))
+            reached.append(_algorithm(name, entries, protocol, tasks, machines))
     whole = _whole_protocol(protocol, runs)
     return {
         "schema": records.SCHEMA,
@@ -67,7 +67,7 @@ def make_record(
         "ranked": list(EXPERIMENTS[experiment].ranked),
         "machines": machines,
         "sets": {name: _about(name, states, shortest) for name, states in tasks.items()},
-        "algorithms": algorithms,
+        "algorithms": reached,
     }
 
 

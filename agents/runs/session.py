@@ -328,17 +328,24 @@ class Session:
 
     def _prepare_results(self) -> None:
         """Compiles in the background what `finish` needs, unless there are several devices."""
-        if self._placement.mesh is None:
-            worker = futures.ThreadPoolExecutor(1)
-            self._results = worker.submit(self._make_evaluator)
-            worker.shutdown(wait=False)
+        if self._placement.mesh is not None:
+            return
+        params = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._state.params
+        )
+
+        def compiled() -> Evaluator:
+            evaluator = self._make_evaluator()
+            evaluator.compile(params)
+            return evaluator
+
+        worker = futures.ThreadPoolExecutor(1)
+        self._results = worker.submit(compiled)
+        worker.shutdown(wait=False)
 
     def _make_evaluator(self) -> Evaluator:
         config = self.run.config
-        evaluator = Evaluator.of_sets(config, ALL_SETS, config.eval_episodes, self._placement)
-        if self._placement.mesh is None:
-            evaluator.compile(jax.eval_shape(self._train.agent.init, jax.random.key(0)))
-        return evaluator
+        return Evaluator.of_sets(config, ALL_SETS, config.eval_episodes, self._placement)
 
     def _iterate(self, advance: Advance) -> list[Row]:
         config, progress = self.run.config, self._progress
