@@ -1,6 +1,32 @@
 """Agents that learn the trap-tube task: PPO with curiosity, end-to-end jitted."""
 
+from pathlib import Path
+
+from agents.acting.policy import Policy
 from agents.config import Config
 from agents.ppo.learner import Train, TrainState, make_train
 
-__all__ = ["Config", "Train", "TrainState", "make_train"]
+__all__ = ["Config", "Policy", "Train", "TrainState", "load", "make_train"]
+
+
+def load(
+    source: str | Path,
+    *,
+    seed: int | None = None,
+    iteration: int | None = None,
+    greedy: bool = True,
+) -> Policy:
+    """A trained policy, which acts from observations alone; see `agents.runs.loading.load`.
+
+    Args:
+      source: a run's folder, a file of parameters, or the name of shipped parameters.
+      seed: which seed of a run; its first if absent.
+      iteration: the checkpoint of a run to take; the newest if absent.
+      greedy: take the most probable actions; false draws them.
+
+    Raises:
+      ValueError: there is no such policy, or it cannot be read.
+    """
+    from agents.runs import loading  # noqa: PLC0415  training needs nothing of files
+
+    return loading.load(source, seed=seed, iteration=iteration, greedy=greedy)

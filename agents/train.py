@@ -21,13 +21,11 @@ from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.session import Session, Stopped, StopSignals
 
 PROGRAM = "python -m agents.train"
-# Settings that do not shape what has been trained so far.
-EXTENDABLE = ("iterations", "stop_when_solved")
 
 
 @dataclasses.dataclass(frozen=True)
-class Selection:
-    """What names a run, and so decides the defaults of all other settings.
+class Selection(processes.Job):
+    """What is read first: how processes meet, and which run decides all other defaults.
 
     Attributes:
       preset: the named settings to start from.
@@ -50,7 +48,7 @@ class Selection:
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(processes.Job, Selection):
+class Options(Selection):
     """Trains an agent, evaluates it on all task sets and leaves everything in a folder.
 
     Ctrl-C stops after the current iteration and saves; a second one stops at once.
@@ -73,7 +71,7 @@ class Options(processes.Job, Selection):
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
     def __post_init__(self) -> None:
-        """Refuses impossible numbers."""
+        """Checks the numbers."""
         super().__post_init__()
         for name in ("checkpoint_every", "keep"):
             if getattr(self, name) < 1:
@@ -96,24 +94,10 @@ def train(arguments: Sequence[str]) -> None:
     """Trains as a command line says.
 
     Raises:
-      SystemExit: it is refused, or training was stopped.
+      SystemExit: the command line is invalid, or training was stopped.
     """
     try:
-        find_job(arguments).join()
-        console = Console(quiet=not processes.is_first())
-        options, folder, run = processes.from_first(lambda: set_up(arguments))
-        if not options.no_cache:
-            compilation_cache.enable()
-        session = Session(
-            folder,
-            run,
-            console,
-            checkpoint_every=options.checkpoint_every,
-            keep=options.keep,
-            placement=Placement.of(options.devices, run.config, run.seeds),
-        )
-        # More iterations, once the run has been taken up.
-        processes.from_first(lambda: write_json(folder.config, run.to_dict()))
+        session = start(arguments)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
@@ -122,78 +106,89 @@ def train(arguments: Sequence[str]) -> None:
     except jax.errors.JaxRuntimeError as error:
         end_without_peers(error, "Begin again with the same command.")
 
-    def tell() -> None:
-        where = f"Stopped at iteration {session.saved}. {how_to_resume(folder)}"
-        console.print(where, soft_wrap=True)
-
+    console = session.console
+    resume = how_to_resume(session.folder)
     stop = StopSignals(lambda: console.print("Finishing this iteration; again to abandon it."))
     try:
-        session.train(stop)
+        session.train(stop, then_finish=True)
         session.finish()
-    except Stopped as stopped:
-        tell()
-        raise SystemExit(128 + stopped.signal) from None
-    except KeyboardInterrupt:
-        tell()
+    except (Stopped, KeyboardInterrupt) as stopped:
+        console.print(f"Stopped at iteration {session.saved}. {resume}", soft_wrap=True)
+        if isinstance(stopped, Stopped):
+            raise SystemExit(128 + stopped.signal) from None
         processes.leave(128 + (stop.received or signal.SIGINT))
     except (jax.errors.JaxRuntimeError, ValueError) as error:
-        end_without_peers(error, f"Iteration {session.saved} is saved. {how_to_resume(folder)}")
+        end_without_peers(error, f"Iteration {session.saved} is saved. {resume}")
     finally:
         session.close()
 
 
-def find_job(arguments: Sequence[str]) -> processes.Job:
-    """How the command line finds other processes.
-
-    Raises:
-      ValueError: the description is incomplete or contradicts itself.
-    """
-    job, _ = tyro.cli(
-        processes.Job, args=arguments, prog=PROGRAM, add_help=False, return_unknown_args=True
-    )
-    return job
-
-
-def set_up(arguments: Sequence[str]) -> tuple[Options, RunFolder, Run]:
-    """Checks a command line as a whole, then makes or opens its run.
+def start(arguments: Sequence[str]) -> Session:
+    """The session of a command line, once all processes have met.
 
     Raises:
       ValueError: something is not allowed.
-      OSError: the folder cannot be made.
+      OSError: the run's folder cannot be made.
     """
-    options, stored = parse(arguments)
-    Placement.of(options.devices, options.config, options.seeds)
-    return options, *open_run(options, stored)
-
-
-def end_without_peers(error: Exception, advice: str) -> NoReturn:
-    """Ends one of several processes after an error; one alone raises the error.
-
-    The computations of a process end with one of JAX's errors where another process is gone.
-    """
-    if processes.count() == 1:
-        raise error
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
-    print(
-        f"error: training has ended here, likely because another process did ({reason}). {advice}",
-        file=sys.stderr,
+    selection = select(arguments)
+    selection.join()
+    console = Console(quiet=not processes.is_first())
+    options, folder, run = processes.from_first(lambda: open_run(selection, arguments))
+    if not options.no_cache:
+        compilation_cache.enable()
+    session = Session(
+        folder,
+        run,
+        console,
+        checkpoint_every=options.checkpoint_every,
+        keep=options.keep,
+        placement=Placement.of(options.devices, run.config, run.seeds),
     )
-    processes.leave(1)
+    # More iterations, once the run has been taken up.
+    processes.from_first(lambda: write_json(folder.config, run.to_dict()))
+    return session
 
 
-def parse(arguments: Sequence[str]) -> tuple[Options, Run | None]:
-    """The options of a command line, and the stored run that --resume names.
+def select(arguments: Sequence[str]) -> Selection:
+    """The part of a command line that decides the defaults of the rest.
 
     Raises:
-      ValueError: a value is not allowed, or contradicts the stored run.
+      ValueError: it is incomplete or contradicts itself.
     """
     selection, _ = tyro.cli(
         Selection, args=arguments, prog=PROGRAM, add_help=False, return_unknown_args=True
     )
-    overrides = {} if selection.env is None else {"env_id": selection.env}
-    config = Config.preset(selection.preset, **overrides)
-    stored = None
-    defaults = Options(preset=selection.preset, config=config)
+    return selection
+
+
+def open_run(selection: Selection, arguments: Sequence[str]) -> tuple[Options, RunFolder, Run]:
+    """Checks a command line as a whole, then makes or opens its run.
+
+    Raises:
+      ValueError: a value is not allowed, contradicts the stored run, or there is a run
+        already that is not to be resumed.
+      OSError: the folder cannot be made.
+    """
+    stored, options = parse(selection, arguments)
+    config = options.config
+    run = Run(config, options.preset, options.seed, options.seeds)
+    Placement.of(options.devices, config, options.seeds)
+    path = run_path(options, config.env_id)
+    if stored is None:
+        return options, RunFolder.create(path, run), run
+    run.check_continues(stored)
+    return options, RunFolder(path), run
+
+
+def parse(selection: Selection, arguments: Sequence[str]) -> tuple[Run | None, Options]:
+    """The stored run that --resume names, and all options.
+
+    Raises:
+      ValueError: a value is not allowed.
+    """
+    given = {} if selection.env is None else {"env_id": selection.env}
+    config = Config.preset(selection.preset, **given)
+    stored, defaults = None, Options(preset=selection.preset, config=config)
     path = run_path(selection, config.env_id)
     if selection.resume:
         _, stored = RunFolder.open(path)
@@ -203,16 +198,14 @@ def parse(arguments: Sequence[str]) -> tuple[Options, Run | None]:
     options = tyro.cli(
         Options, args=arguments, prog=PROGRAM, default=defaults, config=(tyro.conf.OmitArgPrefixes,)
     )
-    _check_env(options, given=selection.env)
     env_id = tt.task_set(options.config.env_id).id
-    options = dataclasses.replace(
-        options, config=dataclasses.replace(options.config, env_id=env_id)
-    )
-    if stored is not None:
-        _check_same(options, stored)
-    else:
-        path = run_path(options, options.config.env_id)
-    return dataclasses.replace(options, name=path.name), stored
+    if selection.env is not None and tt.task_set(selection.env).id != env_id:
+        raise ValueError(
+            f"--env {selection.env} contradicts --env-id {options.config.env_id}; give one"
+        )
+    config = dataclasses.replace(options.config, env_id=env_id)
+    name = path.name if stored else run_path(options, env_id).name
+    return stored, dataclasses.replace(options, config=config, name=name)
 
 
 def run_path(selection: Selection, env_id: str) -> Path:
@@ -229,51 +222,25 @@ def run_path(selection: Selection, env_id: str) -> Path:
     return selection.out / name
 
 
-def open_run(options: Options, stored: Run | None) -> tuple[RunFolder, Run]:
-    """The folder of the run, made or resumed.
-
-    Raises:
-      ValueError: there is a run already, and it is not to be resumed.
-    """
-    run = Run(options.config, options.preset, options.seed, options.seeds)
-    path = run_path(options, options.config.env_id)
-    if stored is None:
-        return RunFolder.create(path, run), run
-    return RunFolder(path), run
-
-
 def how_to_resume(folder: RunFolder) -> str:
     """What to type to continue."""
     out = "" if folder.path.parent == Path("runs") else f" --out {folder.path.parent}"
     return f"Continue with: {PROGRAM} --resume --name {folder.path.name}{out}"
 
 
-def _check_env(options: Options, given: str | None) -> None:
-    wanted = tt.task_set(options.config.env_id).id
-    if given is not None and tt.task_set(given).id != wanted:
-        raise ValueError(f"--env {given} contradicts --env-id {options.config.env_id}; give one")
+def end_without_peers(error: Exception, advice: str) -> NoReturn:
+    """Ends one of several processes after an error; one alone raises the error.
 
-
-def _check_same(options: Options, stored: Run) -> None:
-    """Refuses to continue a run with other settings than it has."""
-    now = {
-        "preset": options.preset,
-        "seed": options.seed,
-        "seeds": options.seeds,
-        **options.config.to_dict(),
-    }
-    before = {
-        "preset": stored.preset,
-        "seed": stored.seed,
-        "seeds": stored.seeds,
-        **stored.config.to_dict(),
-    }
-    for name, value in before.items():
-        if name not in EXTENDABLE and now[name] != value:
-            raise ValueError(
-                f"the run has {name}={value}, not {now[name]}; --resume may change "
-                f"{' and '.join(EXTENDABLE)} only"
-            )
+    The computations of a process end with one of JAX's errors where another process is gone.
+    """
+    if processes.count() == 1:
+        raise error
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    print(
+        f"error: training has ended here, likely because another process did ({reason}). {advice}",
+        file=sys.stderr,
+    )
+    processes.leave(1)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from agents.acting.evaluation import Evaluator, evaluation_tasks
 from agents.config import Config
-from agents.evaluate import Evaluator, evaluation_tasks
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays

@@ -1,3 +1,8 @@
+import base64
+import io
+import json
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,12 +10,20 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
-from agents import evaluate as evaluation
 from agents import make_train
+from agents.acting import evaluation
+from agents.acting.evaluation import (
+    Evaluation,
+    Evaluator,
+    evaluation_keys,
+    evaluation_tasks,
+    fixed_tasks,
+    layout_numbers,
+)
+from agents.acting.scores import Layouts, Optimality, Score, wilson_interval
 from agents.config import Config
-from agents.evaluate import Evaluation, Evaluator, evaluation_keys, evaluation_tasks, fixed_tasks
 from agents.networks.agent import Agent
-from agents.runs.metrics import Optimality, Score, wilson_interval
+from agents.runs import report, report_page
 from trap_tube_jax.registry import PAPER_TASK_SETS
 
 TINY = {
@@ -81,12 +94,16 @@ def test_more_tasks_begin_with_the_same_ones():
     assert_equal(few, jax.tree.map(lambda x: x[:3], many))
 
 
-def test_keys_differ_within_and_between_sets():
-    keys = [jax.random.key_data(evaluation_keys(entry.id, 64)) for entry in PAPER_TASK_SETS]
-    assert len(np.unique(np.concatenate(keys), axis=0)) == 64 * len(PAPER_TASK_SETS)
+def test_keys_differ_within_and_between_sets_and_purposes():
+    keys = [
+        jax.random.key_data(evaluation_keys(entry.id, 64, purpose))
+        for entry in PAPER_TASK_SETS
+        for purpose in ("test", "validation")
+    ]
+    assert len(np.unique(np.concatenate(keys), axis=0)) == 64 * len(keys)
 
 
-def test_tasks_are_never_drawn_in_training():
+def test_keys_of_tasks_are_never_drawn_in_training():
     """Training with recorded keys: what a transfer gets is fixed by what `reset` gets."""
     seen = []
 
@@ -113,8 +130,9 @@ def test_tasks_are_never_drawn_in_training():
     seen.clear()
     for entry in PAPER_TASK_SETS:
         fixed_tasks(env, entry.id, 8)
+        fixed_tasks(env, entry.id, 8, "validation")
     jax.effects_barrier()
-    assert len(set(seen)) == 8 * len(PAPER_TASK_SETS)
+    assert len(set(seen)) == 2 * 8 * len(PAPER_TASK_SETS)
     assert not training & set(seen)
 
 
@@ -133,12 +151,12 @@ def test_outcomes_are_those_of_the_recorded_actions(grey_play):
 
 
 def test_own_tasks_are_evaluated(grey_play):
-    _, _, played = grey_play
+    evaluator, _, played = grey_play
     outcome = played["mine"]
     assert outcome.solved.any()
     assert 1 in outcome.length[outcome.solved]
     assert not played["base"].solved.any()  # needs 11 steps, has 6
-    by_set = {score.set: score for score in evaluation.scores(played, 6)}
+    by_set = {score.set: score for score in evaluation.scores(played, evaluator.tasks, 6)}
     assert by_set["mine"].percent == 25 * outcome.solved.sum()
     assert by_set["mine"].interval is not None
     assert by_set["base"].interval is None
@@ -155,7 +173,7 @@ def test_blocks_change_nothing(grey_play, monkeypatch):
 def test_solved_episode_becomes_a_gif(grey_play, tmp_path):
     evaluator, _, played = grey_play
     path = tmp_path / "solved.gif"
-    assert evaluation.save_solved_episode(path, evaluator, played, prefer="base") == "mine"
+    assert report.save_first_solved(path, evaluator, [played], prefer="base") == "mine"
     with Image.open(path) as picture:
         index = int(np.argmax(played["mine"].solved))
         assert getattr(picture, "n_frames", 1) == played["mine"].length[index] + 1
@@ -164,8 +182,46 @@ def test_solved_episode_becomes_a_gif(grey_play, tmp_path):
 def test_no_solved_episode_leaves_no_gif(grey_play, tmp_path):
     evaluator, _, played = grey_play
     unsolved = {"base": played["base"]}
-    assert evaluation.save_solved_episode(tmp_path / "x.gif", evaluator, unsolved, "base") is None
+    assert report.save_first_solved(tmp_path / "x.gif", evaluator, [unsolved], "base") is None
     assert not list(tmp_path.iterdir())
+
+
+def test_a_page_shows_solved_and_unsolved_episodes(grey_play, tmp_path):
+    evaluator, _, played = grey_play
+    Image.new("RGB", (4, 4)).save(tmp_path / "curves.png")
+    path = tmp_path / "report.html"
+    report_page.save(
+        path,
+        title="<mine>",
+        sentences=["It does not transfer."],
+        settings={"hidden": 4},
+        scores={"seed 0": evaluation.scores(played, evaluator.tasks, 6)},
+        curves=tmp_path / "curves.png",
+        evaluator=evaluator,
+        played=played,
+    )
+    text = path.read_text()
+    assert "<h1>&lt;mine&gt;</h1>" in text
+    assert "<td>hidden</td><td>4</td>" in text
+    assert "<td>{P}</td><td>2</td>" in text
+    assert not re.search(r"https?:|(src|href)=\"(?!data:)", text)
+    start, end = '<script type="application/json" id="data">', "</script>"
+    data = json.loads(text.partition(start)[2].partition(end)[0])
+    outcome = played["mine"]
+    solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
+    mine = [each for each in data["episodes"] if each["title"].startswith("mine")]
+    assert [each["title"] for each in mine] == [
+        f"mine, task {solved}: solved",
+        f"mine, task {unsolved}: not solved",
+    ]
+    for index, each in zip((solved, unsolved), mine, strict=True):
+        length = outcome.length[index]
+        assert len(each["frames"]) == length + 1
+        assert len(each["actions"]) == length
+        np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
+        for number in each["frames"]:
+            with Image.open(io.BytesIO(base64.b64decode(data["pictures"][number]))) as picture:
+                assert picture.size == (192, 192)
 
 
 def test_shortest_lengths_of_the_base_task():
@@ -187,8 +243,9 @@ def test_optimality_compares_with_shortest_plans():
 
 
 def test_scores_use_the_paper_notation():
-    outcome = Evaluation(*map(jnp.asarray, ([True, False], [11, 50], np.zeros((2, 50, 2), int))))
-    (score,) = evaluation.scores({"pst": outcome}, 50, {"pst": np.array([11, 12])})
+    outcome = Evaluation(jnp.array([True, False]), jnp.array([11, 50]), *[jnp.zeros((2, 50))] * 2)
+    tasks = evaluation_tasks("pst", 2)
+    (score,) = evaluation.scores({"pst": outcome}, {"pst": tasks}, 50, {"pst": np.array([11, 12])})
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
     assert score.mean_steps == 11
     assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)
@@ -209,9 +266,23 @@ def test_wilson_interval_refuses(successes, trials):
         wilson_interval(successes, trials)
 
 
-def test_a_single_possible_task_has_no_interval():
-    score = Score.of("base", "base", np.array([True]), np.array([11]), is_sample=False)
-    assert (score.percent, score.interval, score.mean_steps) == (100.0, None, 11.0)
+@pytest.mark.parametrize("name", SHORTS)
+def test_sets_with_few_layouts_are_named(name):
+    layout = layout_numbers(name, evaluation_tasks(name, 64))
+    if name in evaluation.NUM_LAYOUTS:
+        assert layout is not None
+        assert sorted(set(layout.tolist())) == list(range(evaluation.NUM_LAYOUTS[name]))
+    else:
+        assert layout is None
+
+
+def test_few_layouts_are_counted_and_have_no_interval():
+    solved = np.array([True, True, False, True, False])
+    layout = np.array([0, 0, 0, 1, 1])
+    score = Score.of("stsy", "{St, Sy}", solved, np.full(5, 9), layout=layout)
+    assert (score.percent, score.interval, score.layouts) == (60.0, None, Layouts(1, 2))
+    assert str(score.layouts) == "1 of 2"
+    assert Score.of("p", "{P}", solved, np.full(5, 9)).layouts is None
 
 
 def test_refusals():

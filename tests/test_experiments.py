@@ -1,4 +1,6 @@
 import csv
+import dataclasses
+import io
 import json
 import os
 import re
@@ -11,15 +13,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
+from scipy import stats
 
 import trap_tube_jax as tt
-from agents import evaluate, pretrained
+from agents import pretrained
+from agents.acting import evaluation
+from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
-from agents.experiments import figures, results, tables
-from agents.experiments.protocol import ALGORITHMS, EXPERIMENTS, PROTOCOLS, QUICK, Protocol
+from agents.experiments import (
+    figures,
+    records,
+    reporting,
+    statistics,
+    tables,
+    training,
+)
+from agents.experiments.protocol import EXPERIMENTS, PROTOCOLS, QUICK, Protocol, algorithms
 from agents.parallel.sharding import ALONE
 from agents.ppo.learner import make_train
-from agents.runs import report, session, tracking
+from agents.runs import machine, report, session, tracking
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
@@ -77,14 +90,14 @@ class FakeEvaluator:
         steps = STEPS.get(divmod(number, 100), NOTHING_SOLVED)
         played = {name: jnp.array(steps[name]) for name in self.tasks}
         return {
-            name: evaluate.Evaluation(taken > 0, jnp.where(taken > 0, taken, 6), taken)
+            name: evaluation.Evaluation(taken > 0, jnp.where(taken > 0, taken, 6), taken, taken)
             for name, taken in played.items()
         }
 
 
 def fake_evaluate(agent, params, env, tasks, chunk, shards):
     nothing = jnp.zeros(len(tasks.time), jnp.int32)
-    return evaluate.Evaluation(nothing > 0, nothing, nothing)
+    return evaluation.Evaluation(nothing > 0, nothing, nothing, nothing)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -101,10 +114,12 @@ def lab():
         patch.setattr(session, "make_train", fake_train)
         patch.setattr(session, "evaluate", fake_evaluate)
         patch.setattr(report, "save_curves", lambda *args: None)
-        patch.setattr(tracking, "Evaluator", FakeEvaluator)
-        patch.setattr(experiments, "draw_tasks", lambda config: tasks)
+        for module in (tracking, reporting):
+            patch.setattr(module, "Evaluator", FakeEvaluator)
+        for module in (training, reporting):
+            patch.setattr(module, "draw_tasks", lambda *args: tasks)
         one_step = lambda states: np.ones(len(states.time), np.int32)  # noqa: E731
-        patch.setattr(experiments, "shortest_lengths", one_step)
+        patch.setattr(reporting, "shortest_lengths", one_step)
         yield
 
 
@@ -130,7 +145,7 @@ def contents(folder):
     best = [pretrained.load(path) for path in sorted(folder.glob("best-*.npz"))]
     return {
         "metrics": untimed(run_folder.metrics),
-        "outcomes": untimed(run_folder.outcomes),
+        "outcomes": untimed(run_folder.outcomes) if run_folder.outcomes.exists() else None,
         "state": digest(arrays),
         "best": [(policy.iteration, digest(to_arrays(policy.params))) for policy in best],
     }
@@ -181,41 +196,55 @@ def test_the_best_parameters_are_kept(whole):
 def test_the_record_says_how_good_the_best_evaluation_is(whole, record):
     (entry,) = record["algorithms"]
     trial, _ = entry["runs"]
+    assert record["schema"] == records.SCHEMA
     assert (trial["iterations"], trial["of"], trial["finished"]) == (6, 6, True)
     assert (trial["episodes"], trial["transitions"]) == (48, 288)
     assert trial["first_solved"] is None
-    assert trial["machines"][0]["jax"] == jax.__version__
-    assert (trial["best"]["iteration"], trial["best"]["overall"]) == (4, 75)
-    base, p = trial["best"]["sets"]
-    assert (base["set"], base["percent"], base["interval"]) == ("base", 100, None)
-    assert (p["set"], p["percent"], p["mean_steps"]) == ("p", 50, 2.5)
-    assert (p["optimality"]["mean"], p["optimality"]["worst"]) == ((1 + 1 / 4) / 2, 1 / 4)
-    assert json.loads((whole / "shortest.json").read_text()) == {"base": [1], "p": [1, 1, 1, 1]}
-    assert record["equal_to_base"] == {"base": 100, "p": 25}
+    assert record["machines"][trial["machines"][0]]["jax"] == jax.__version__
+    assert (trial["best"]["iteration"], trial["best"]["selected_percent"]) == (4, 75)
+    assert trial["best"]["steps"] == STEPS[0, 4]
+    scores = statistics.seed_scores(record, entry, trial)
+    base, p = scores["base"], scores["p"]
+    assert (base.percent, base.interval, str(base.layouts)) == (100, None, "1 of 1")
+    assert (p.percent, p.mean_steps, p.layouts) == (50, 2.5, None)
+    assert p.optimality is not None
+    assert (p.optimality.mean, p.optimality.worst) == ((1 + 1 / 4) / 2, 1 / 4)
+    assert {name: about["shortest"] for name, about in record["sets"].items()} == {
+        "base": [1],
+        "p": [1, 1, 1, 1],
+    }
+    assert [about["equal_to_base"] for about in record["sets"].values()] == [100, 25]
+
+
+@pytest.mark.slow
+def test_the_papers_selection_reports_what_it_chose_by(whole, record, tmp_path):
+    root = run(tmp_path, "--selection", "paper")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reporting, "Evaluator", lambda config, tasks: None)  # nothing is played
+        again = run(tmp_path, "--selection", "paper")
+    found = records.read_record(again / "summary.json")
+    runs = [entry["runs"] for entry in (record["algorithms"][0], found["algorithms"][0])]
+    assert [trial["best"]["steps"] for trial in runs[1]] == [
+        trial["best"]["steps"] for trial in runs[0]
+    ]
+    assert "--selection paper" in found["command"]
+    assert "chosen and reported on the same 4 tasks" in (root / "tables.md").read_text()
+    assert "on 4 validation tasks a set; reported are 1,000 other tasks" in (
+        (whole / "tables.md").read_text()
+    )
+    assert not list(root.glob("*/tested-*"))
 
 
 @pytest.mark.slow
 def test_an_experiment_leaves_tables_and_figures(whole, record, capsys):
-    assert (whole / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert figures.drawn_from(whole / "curves.png") == figures.digest(record)
     text = (whole / "tables.md").read_text()
     assert "| PPO + ICM, paper | 5 / 5 | 102,000 ± 60,000 |" in text
     assert tables.markdown(record) in text
     before = (whole / "summary.json").read_bytes()
-    saved = whole / "record.json"
-    experiments.main(
-        [
-            "exp1",
-            "--out",
-            str(whole.parent),
-            "--name",
-            "x",
-            "--report-only",
-            "--no-cache",
-            "--record",
-            str(saved),
-        ]
-    )
-    assert saved.read_bytes() == before
+    where = ["--out", str(whole.parent), "--name", "x"]
+    experiments.main(["exp1", *where, "--report-only", "--no-cache"])
+    assert (whole / "summary.json").read_bytes() == before
     shown = capsys.readouterr().out
     assert str(whole / "curves.png") in shown
     assert "left at most" not in shown
@@ -297,9 +326,11 @@ def refused(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--algorithms ppo icm", f"unknown algorithm 'icm'; allowed: {', '.join(ALGORITHMS)}"),
+        ("--algorithms ppo icm", f"unknown algorithm 'icm'; allowed: {', '.join(algorithms())}"),
         ("--preset slow", "unknown preset 'slow'; allowed: paper, fast"),
         ("--seeds 0", "seeds must be >= 1, got 0"),
+        ("--reported 0", "reported must be >= 1, got 0"),
+        ("--algorithms ppo+imitation", "imitates, but imitation_coef is 0 in preset 'paper'"),
         ("--evaluate-every 0", "evaluate_every must be >= 1, got 0"),
         ("--checkpoint-every 0", "checkpoint_every must be >= 1, got 0"),
         ("--iterations 0", "iterations must lie in [1, inf], got 0"),
@@ -331,8 +362,83 @@ def test_protocols_are_the_papers():
         config = protocol.config(EXPERIMENTS[name], "ppo+icm")
         assert (config.curiosity, config.episodes, config.stop_when_solved) == ("icm", 1024, 0)
         assert protocol.config(EXPERIMENTS[name], "ppo").curiosity == "none"
+        assert (protocol.selection, protocol.num_reported) == ("validation", 1000)
     fast = QUICK["exp1"].config(EXPERIMENTS["exp1"], "preset")
     assert (fast.curiosity, fast.imitation_coef, fast.eval_episodes) == ("counts", 1.0, 16)
+
+
+def test_stored_protocols_are_whole():
+    """An old one did not say on which tasks its evaluations were chosen."""
+    values = json.loads(json.dumps(dataclasses.asdict(PROTOCOLS["exp1"])))
+    assert Protocol.from_dict(values) == PROTOCOLS["exp1"]
+    del values["selection"]
+    with pytest.raises(ValueError, match="a protocol lacks selection"):
+        Protocol.from_dict(values)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_ppo_is_ppo_alone_in_every_preset(preset):
+    learner = {"method": "ppo"} if "method" in PRESETS[preset] else {}
+    protocol = Protocol(preset=preset, settings=learner)
+    whole = protocol.config(EXPERIMENTS["exp1"], "preset")
+    for name in ("ppo", "ppo+icm", "ppo+counts"):
+        config = protocol.config(EXPERIMENTS["exp1"], name)
+        assert config.imitation_coef == 0
+        assert config.curiosity == (name.partition("+")[2] or "none")
+        assert config.learning_rate == whole.learning_rate
+    assert not protocol.config(EXPERIMENTS["exp1"], "ppo").episodic_novelty
+
+
+def test_a_name_may_say_that_the_agent_imitates():
+    fast = Protocol(preset="fast")
+    whole = fast.config(EXPERIMENTS["exp1"], "preset")
+    assert whole.imitation_coef > 0
+    named = fast.config(EXPERIMENTS["exp1"], f"ppo+{whole.curiosity}+imitation")
+    assert named == whole
+    plain = fast.config(EXPERIMENTS["exp1"], "ppo+imitation")
+    assert (plain.curiosity, plain.imitation_coef) == ("none", whole.imitation_coef)
+
+
+def test_runs_with_a_cooldown_are_not_extended(tmp_path):
+    experiment = EXPERIMENTS["exp1"]
+    short = Protocol(algorithms=("ppo",), seeds=1, settings={"cooldown": 0.5}, iterations=4)
+    training.plan(tmp_path, short, experiment, side_by_side=False)
+    longer = dataclasses.replace(short, iterations=8)
+    with pytest.raises(ValueError, match=r"ppo-seed0: the run has cooldown=0.5 and iterations=4"):
+        training.plan(tmp_path, longer, experiment, side_by_side=False)
+
+
+def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
+    """Solved of four tasks are as many as there were iterations."""
+
+    def evaluate(agent, params, env, tasks, chunk, shards):
+        iteration = jax.tree.leaves(params)[0].reshape(-1)[0] % 100
+        nothing = jnp.zeros(4, jnp.int32)
+        return evaluation.Evaluation(jnp.arange(4) < iteration, nothing, nothing, nothing)
+
+    monkeypatch.setattr(session, "evaluate", evaluate)
+    sizes = {"max_steps": 6, "filters": (2, 2), "hidden": 4, "embedding": 2, "curiosity": "none"}
+
+    def train(name, share):
+        run = Run(Config(**sizes, iterations=9, stop_when_solved=share))
+        folder = RunFolder(tmp_path / name)
+        if not folder.path.exists():
+            RunFolder.create(folder.path, run)
+        console = Console(file=io.StringIO())
+        part = session.Session(folder, run, console, checkpoint_every=3, keep=1)
+        part.train(session.StopSignals(lambda: None))
+        part.summarize()
+        part.close()
+        return contents(folder.path)
+
+    assert len(train("mine", 0.5)["metrics"]) == 2
+    extended = train("mine", 1.0)
+    assert len(extended["metrics"]) == 4
+    assert extended == train("whole", 1.0)
+    first = json.loads((tmp_path / "mine" / "summary.json").read_text())["seeds"][0]
+    assert first["first_solved"]["iteration"] == 4
+    with pytest.raises(ValueError, match="would be after iteration 3, but it is after 4"):
+        train("mine", 0.75)
 
 
 def rows(seed, greedy, iterations=None):
@@ -352,82 +458,200 @@ def rows(seed, greedy, iterations=None):
     ]
 
 
-def trials(tmp_path, greedy, iterations):
-    """Runs of experiment 1 with these evaluations; the first iteration is the best of all."""
-    made = []
+MACHINE = {
+    "processor": "any",
+    "cores": 2,
+    "device": "cpu",
+    "devices": 1,
+    "jax": "0",
+    "commit": "abc",
+}
+
+
+def example_record(tmp_path, greedy, iterations):
+    """Runs with these evaluations; in test tasks they take 10 * seed, 20 and 0 steps."""
+    entries = []
     for seed, values in enumerate(greedy):
-        run = Run(Protocol(iterations=iterations).config(EXPERIMENTS["exp1"], "ppo+icm"), seed=seed)
-        folder = RunFolder.create(tmp_path / f"ppo+icm-seed{seed}", run)
-        steps = {"seed": seed, "iteration": 1, "p/00000": 10 * seed, "p/00001": 20, "p/00002": 0}
-        MetricsLog(folder.outcomes).append([steps])
-        made.append(results.AlgorithmRun("ppo+icm", folder, run, rows(seed, values)))
-    return made
-
-
-def test_tables_hold_means_and_deviations(tmp_path):
-    runs = trials(tmp_path, [[0, 0, 0], [0, 1, 0], [0, 0, 0, 1]], iterations=4)
-    shortest = {"p": [5, 10, -1]}
-    entry = results.algorithm_record("ppo+icm", runs, shortest)
-    record = {
+        config = Protocol(iterations=iterations).config(EXPERIMENTS["exp1"], "ppo+icm")
+        made = Run(config, seed=seed)
+        folder = RunFolder.create(tmp_path / f"ppo+icm-seed{seed}", made)
+        entries.append(training.AlgorithmRun("ppo+icm", folder, made, rows(seed, values)))
+    machines = [MACHINE]
+    runs = [
+        records.seed_record(
+            entry,
+            entry.run.seed,
+            machines=machines,
+            evaluate_every=1,
+            steps={"base": [11], "p": [10 * entry.run.seed, 20, 0]},
+        )
+        for entry in entries
+    ]
+    config = entries[0].run.config.to_dict()
+    about = {"equal_to_base": 25.0, "layout": None, "shortest": [5, 10, -1]}
+    return {
+        "schema": records.SCHEMA,
         "experiment": "exp2",
-        "equal_to_base": {"p": 25},
-        "preset": "paper",
-        "ranked": ["p"],
         "command": "x",
-        "algorithms": [entry],
+        "protocol": dataclasses.asdict(Protocol(iterations=iterations)),
+        "ranked": ["p"],
+        "machines": machines,
+        "sets": {"base": {**about, "layout": [0], "shortest": [11]}, "p": about},
+        "algorithms": [{"name": "ppo+icm", "config": config, "runs": runs}],
     }
-    found = entry["aggregate"]
-    assert (found["trials"], found["solved"]) == (3, 2)
+
+
+@pytest.fixture
+def example(tmp_path):
+    return example_record(tmp_path, [[0, 0, 0], [0, 1, 0], [0, 0, 0, 1]], iterations=4)
+
+
+def test_tables_hold_means_deviations_and_intervals(example):
+    (entry,) = example["algorithms"]
     # 2,048 and 4,096 episodes; solved 1, 2 and 2 of 3 tasks, of which one is unsolvable.
-    assert found["episodes_to_solve"] == {"mean": 3072, "sd": pytest.approx(1448.15, abs=0.01)}
-    (score,) = found["sets"]
-    assert score["percent"] == pytest.approx({"mean": 500 / 9, "sd": 19.245}, abs=1e-3)
-    assert score["percent_of_solvable"] == pytest.approx({"mean": 250 / 3, "sd": 28.868}, abs=1e-3)
-    assert score["optimality"]["mean"] == pytest.approx((0.5 + 0.5 + 0.375) / 3)
-    assert score["worst"] == 0.25
-    text = tables.markdown(record)
-    assert "| {P} | 55.6 ± 19.2 | 0.0 | 2.0 ± 3.0 |" in text
-    assert "| {P} | 3 | 55.6 ± 19.2 | 83.3 ± 28.9 | 0.458 ± 0.072 | 0.250 |" in text
+    episodes = statistics.Spread.of(statistics.episodes_to_solve(entry))
+    assert episodes == pytest.approx((3072, 1448.15, 12.7062 * 1024), abs=0.1)
+    p = statistics.by_set(example, entry)["p"]
+    half_width = 4.3027 * 19.245 / 3**0.5
+    assert p.percent == pytest.approx((500 / 9, 19.245, half_width), abs=1e-3)
+    assert p.percent_of_solvable == pytest.approx((250 / 3, 28.868, 71.712), abs=1e-3)
+    assert p.optimality is not None
+    assert p.optimality.mean == pytest.approx((0.5 + 0.5 + 0.375) / 3)
+    assert p.worst == 0.25
+    text = tables.markdown(example)
+    assert "| {P} | 55.6 ± 19.2 [7.7, 100.0] | 0.0 | 2.0 ± 3.0 |" in text
+    assert "| mean of the sets apart from base | 55.6 ± 19.2 [7.7, 100.0] | – | – |" in text
+    assert "| base | 1.0 of 1 |" in text
+    assert "| {P} | 3 | 83.3 ± 28.9 [11.6, 100.0] | 0.458 ± 0.072 [0.279, 0.638] | 0.250 |" in text
     assert "Unfinished: ppo+icm, seed 0, 3 of 4 iterations." in text
     assert "Unfinished: ppo+icm, seed 1, 3 of 4 iterations." in text
     assert "seed 2" not in text
-    record["experiment"] = "exp1"
-    assert tables.solved_table(record).rows[0] == ("PPO + ICM", "2 / 3", "3,072 ± 1,448")
-    assert tables.percent_table(record).rows[0] == ("{P}", "55.6 ± 19.2", "25.0")
-    cost = ("PPO + ICM", "3", "3–4", "3,333", "0:07")
-    assert tables.cost_table(record).rows == (cost,)
+    example["experiment"] = "exp1"
+    row = ("PPO + ICM", "2 / 3", "3,072 ± 1,448 [0, 16,083]")
+    assert tables.solved_table(example).rows[0] == row
+    assert tables.percent_table(example).rows[1] == ("{P}", "55.6 ± 19.2 [7.7, 100.0]", "25.0")
+    assert tables.cost_table(example).rows == (("PPO + ICM", "3", "3–4", "3,333", "0:07"),)
 
 
-def test_curves_are_drawn_of_seeds_of_any_length(tmp_path):
+@pytest.mark.parametrize("degrees", [1, 2, 9, 30, 31, 100])
+def test_student_t(degrees):
+    assert statistics.student_t(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), abs=6e-5)
+
+
+def test_one_seed_has_neither_deviation_nor_interval():
+    assert statistics.Spread.of([3.0, None]) == (3.0, None, None)
+    assert statistics.Spread.of([None]) is None
+    with pytest.raises(ValueError, match="degrees must be >= 1, got 0"):
+        statistics.student_t(0)
+
+
+def test_records_come_back_as_they_were_written(example, tmp_path):
+    path = tmp_path / "new" / "x.json"
+    records.write_record(path, example)
+    assert tables.markdown(records.read_record(path)) == tables.markdown(example)
+    assert figures.digest(records.read_record(path)) == figures.digest(example)
+    assert '"shortest": [5, 10, -1]' in path.read_text()
+    records.write_record(path, {**example, "schema": "trap-tube-jax experiment 0"})
+    with pytest.raises(ValueError, match="schema 'trap-tube-jax experiment 0'; allowed: 'trap-"):
+        records.read_record(path)
+    path.write_text("[]")
+    with pytest.raises(ValueError, match="is no record of an experiment"):
+        records.read_record(path)
+
+
+def test_records_are_of_committed_code(example, monkeypatch):
+    def check(commit, own, given=None):
+        monkeypatch.setattr(records, "machine", lambda: {"commit": own})
+        records.check_clean({**example, "machines": [{**MACHINE, "commit": commit}]}, given)
+
+    check("abc", "def")
+    check("abc", None, given="def")
+    for commit, own in (("abc-dirty", "def"), ("abc", "def-dirty")):
+        with pytest.raises(ValueError, match=r"committed code, this one of .*-dirty; commit the"):
+            check(commit, own)
+    for commit, own in ((None, "def"), ("abc", None)):
+        with pytest.raises(ValueError, match="which git does not tell; give --commit"):
+            check(commit, own)
+
+
+def test_curves_are_thinned_at_the_same_points_for_all_seeds():
+    long, short = (rows(0, [0.5] * n) for n in (1000, 333))
+    for row in (*long, *short):
+        row["greedy_p"] = row["greedy_overall"] = 0.123456 if row["iteration"] % 3 == 0 else np.nan
+    found = [records.curves(each, 1000, 3) for each in (long, short)]
+    assert found[0]["training"]["iteration"] == list(range(5, 1001, 5))
+    assert found[1]["training"]["iteration"] == [*range(5, 333, 5), 333]
+    assert found[0]["greedy"]["iteration"] == [*range(6, 1000, 6), 999]
+    assert found[0]["greedy"]["greedy_p"][0] == 0.1235
+    back = records.rows_of({"seed": 7, "curves": found[0]})
+    assert len(back) == len(found[0]["training"]["iteration"]) + len(
+        found[0]["greedy"]["iteration"]
+    )
+    assert {row["seed"] for row in back} == {7}
+
+
+def test_a_commit_is_dirty_where_code_changed(tmp_path, monkeypatch):
+    def git(*arguments):
+        given = ["git", "-c", "user.name=x", "-c", "user.email=x@x", *arguments]
+        subprocess.run(given, cwd=tmp_path, check=True, capture_output=True)
+
+    (tmp_path / "agents").mkdir()
+    (tmp_path / "agents" / "a.py").write_text("1\n")
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "x")
+    monkeypatch.setattr(machine, "ROOT", tmp_path)
+    clean = machine.machine()["commit"]
+    assert re.fullmatch(r"[0-9a-f]{12}", clean)
+    (tmp_path / "record.json").write_text("{}")
+    assert machine.machine()["commit"] == clean
+    (tmp_path / "agents" / "a.py").write_text("2\n")
+    assert machine.machine()["commit"] == f"{clean}-dirty"
+
+
+def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
     some = [*rows(0, [0.0, 0.5, 1.0]), *rows(1, [0.25])]
     episodes, values = figures.by_iteration(some, "greedy_p")
     assert episodes.tolist() == [1024, 3072]
     np.testing.assert_array_equal(values, [[0, 1], [0.25, np.nan]])
-    for draw in (figures.save_rewards, figures.save_success):
-        draw({"ppo": some, "ppo+icm": rows(0, [0.5])}, tmp_path / "x.png", "title")
-        assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+    for experiment in EXPERIMENTS:
+        example["experiment"] = experiment
+        figures.save(example, tmp_path / "x.png")
+        assert figures.drawn_from(tmp_path / "x.png") == figures.digest(example)
+    assert figures.drawn_from(tmp_path / "none.png") is None
 
 
-def test_readme_tables_are_those_of_the_recorded_results():
-    text = readme_tables.ROOT.joinpath("README.md").read_text()
-    assert readme_tables.BLOCK.search(text)
-    assert readme_tables.generate(text, readme_tables.Arguments().results) == text
+def test_pages_and_figures_are_those_of_the_records():
+    found = readme_tables.read_records(readme_tables.Arguments().results)
+    assert not readme_tables.stale(readme_tables.ROOT, found)
+    assert readme_tables.BLOCK.search((readme_tables.ROOT / "README.md").read_text())
 
 
-@pytest.mark.slow
-def test_readme_tables_are_written_on_demand(tmp_path, whole):
-    readme = tmp_path / "README.md"
-    shutil.copy(whole / "summary.json", tmp_path / "mine.json")
-    readme.write_text("a\n<!-- table: mine -->\nold\n<!-- end -->\nb\n")
-    arguments = readme_tables.Arguments(readme=readme, results=tmp_path)
+def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
+    folder = tmp_path / "benchmarks" / "results"
+    records.write_record(folder / "mine.json", example)
+    (folder / "other.json").write_text("{}")
+    block = "a\n<!-- table: {} -->\nold\n<!-- end -->\nb\n"
+    (tmp_path / "README.md").write_text(block.format("mine"))
+    (folder / "page.md").write_text(block.format("mine"))
+    (folder / "absent.md").write_text(block.format("absent"))
+    check, write = (readme_tables.Arguments(root=tmp_path, write=write) for write in (False, True))
     with pytest.raises(SystemExit):
-        readme_tables.main(arguments)
-    readme_tables.main(readme_tables.Arguments(write=True, readme=readme, results=tmp_path))
-    assert "PPO + ICM, paper" in readme.read_text()
-    assert "old" not in readme.read_text()
-    readme_tables.main(arguments)
-    with pytest.raises(ValueError, match="no recorded results 'none'; allowed: mine"):
-        readme_tables.generate("<!-- table: none -->\n<!-- end -->", tmp_path)
+        readme_tables.main(check)
+    readme_tables.main(write)
+    for page in (tmp_path / "README.md", folder / "page.md"):
+        assert "PPO + ICM, paper" in page.read_text()
+        assert "old" not in page.read_text()
+    assert (folder / "absent.md").read_text() == block.format("absent")
+    readme_tables.main(check)
+    example["algorithms"][0]["runs"][0]["curves"]["training"]["success"][0] = 0.5
+    records.write_record(folder / "mine.json", example)
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        readme_tables.main(check)
+    assert "out of date: " + str(folder / "figures" / "mine.png") in capsys.readouterr().out
+    with pytest.raises(ValueError, match="--write and --check exclude each other"):
+        readme_tables.Arguments(write=True, check=True)
 
 
 @pytest.mark.slow
@@ -440,8 +664,9 @@ def test_the_quick_protocol_runs(tmp_path):
         [
             *command,
             *counts,
+            "--reported",
+            "2",
             "--settings",
-            "imitation_coef=0",
             *settings,
             "--no-optimality",
             "--no-cache",
@@ -462,4 +687,4 @@ def test_the_quick_protocol_runs(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     (entry,) = json.loads((tmp_path / "exp1-fast-quick/summary.json").read_text())["algorithms"]
     (trial,) = entry["runs"]
-    assert [score["set"] for score in trial["best"]["sets"]] == list(evaluate.ALL_SETS)
+    assert list(trial["best"]["steps"]) == list(evaluation.ALL_SETS)

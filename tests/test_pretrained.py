@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from agents import evaluate, pretrained
+from agents.acting.policy import Policy
 from agents.config import Config
-from agents.networks.agent import Agent, Policy
+from agents.networks.agent import Agent
 from agents.pretrained.__main__ import main
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.folder import Run, RunFolder

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from agents import evaluate
+from agents.acting.evaluation import ALL_SETS
 from agents.config import PRESETS, Config
 from agents.ppo.learner import make_train
 from agents.runs import compilation_cache
@@ -22,7 +23,7 @@ from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
 from agents.runs.session import Progress, make_advance
-from agents.train import main, parse
+from agents.train import main, parse, select
 
 ROOT = Path(__file__).parent.parent
 TINY = [
@@ -103,7 +104,7 @@ def test_a_run_leaves_its_results_and_says_where(whole):
     assert [row["iteration"] for row in rows] == [str(i + 1) for i in range(ITERATIONS)]
     assert [row["episodes"] for row in rows] == [str(8 * i + 8) for i in range(ITERATIONS)]
     (policy,) = json.loads((folder / "evaluation.json").read_text())
-    assert [score["set"] for score in policy["sets"]] == list(evaluate.ALL_SETS)
+    assert [score["set"] for score in policy["sets"]] == list(ALL_SETS)
     assert [score["tasks"] for score in policy["sets"]] == [1] + 7 * [2]
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["env_id"] == "TrapTube-v0"
@@ -200,7 +201,7 @@ def test_a_run_is_not_overwritten(capsys, whole):
     out = ["--no-cache", "--out", folder.parent, "--name", "whole"]
     assert "give --resume to continue the run in it, or another --name" in refused(capsys, *out)
     message = refused(capsys, *out, "--resume", "--hidden", 8)
-    assert "the run has hidden=4, not 8; --resume may change iterations and" in message
+    assert "the run has hidden=4, not 8; only iterations and stop_when_solved" in message
     assert "the run has seed=0, not 1" in refused(capsys, *out, "--resume", "--seed", 1)
 
 
@@ -216,12 +217,16 @@ def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
     assert "holds no run" in refused(capsys, tmp_path / "none", command=evaluate.main)
 
 
+def parsed(*arguments):
+    return parse(select([*arguments]), [*arguments])
+
+
 def test_defaults_and_overrides(tmp_path):
-    options, stored = parse(["--out", str(tmp_path)])
+    stored, options = parsed("--out", str(tmp_path))
     assert (options.name, options.seed, options.seeds, stored) == ("fast-base-0", 0, 1, None)
     assert options.config == Config.preset("fast")
     arguments = "--preset paper --env psy --seed 3 --seeds 2 --hidden 32 --curiosity none"
-    options, _ = parse([*arguments.split(), "--out", str(tmp_path)])
+    _, options = parsed(*arguments.split(), "--out", str(tmp_path))
     expected = Config.preset(
         "paper", env_id="PerceptualSymbolicTrapTube-v0", hidden=32, curiosity="none"
     )
@@ -233,11 +238,63 @@ def test_resumed_runs_keep_their_settings(tmp_path):
     stored = Run(Config.preset("paper", hidden=32), preset="paper", seed=5, seeds=2)
     RunFolder.create(tmp_path / "x", stored)
     arguments = ["--resume", "--name", "x", "--out", str(tmp_path)]
-    options, found = parse(arguments)
+    found, options = parsed(*arguments)
     assert found == stored
     assert (options.config, options.seed, options.seeds) == (stored.config, 5, 2)
-    options, _ = parse([*arguments, "--iterations", "999"])
+    _, options = parsed(*arguments, "--iterations", "999")
     assert options.config == dataclasses.replace(stored.config, iterations=999)
+
+
+def test_a_run_with_a_cooldown_is_not_extended(capsys, tmp_path):
+    """Its step size has been falling towards the last iteration that was known then."""
+    RunFolder.create(tmp_path / "x", Run(Config(iterations=20, cooldown=0.5)))
+    arguments = ["--resume", "--no-cache", "--name", "x", "--out", tmp_path]
+    message = refused(capsys, *arguments, "--iterations", 30)
+    assert "the run has cooldown=0.5 and iterations=20, not 30" in message
+    assert json.loads((tmp_path / "x/config.json").read_text())["config"]["iterations"] == 20
+    Run(Config(iterations=30)).check_continues(Run(Config(iterations=20)))
+
+
+def row_of(seed, iteration, evaluation):
+    counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 1.0 * iteration}
+    return {"seed": seed, "iteration": iteration, "evaluation": evaluation, **counts}
+
+
+def test_another_threshold_is_applied_to_what_was_evaluated():
+    """Stored under 0.5, which iteration 2 reached; only iteration 4 reaches 0.9."""
+    values = Progress(3, 1.0, 2.0, (None,)).to_dict()
+    assert "solved" not in values
+    rows = [row_of(0, n, share) for n, share in ((1, 0.0), (2, 0.5), (3, 0.6), (4, 0.9))]
+
+    def resumed(share, done=3):
+        run = Run(Config(iterations=10, stop_when_solved=share))
+        return Progress.resumed({**values, "iteration": done}, run, rows), run
+
+    progress, run = resumed(0.9)
+    assert progress.solved == (None,)
+    assert progress.active(run.config).all()
+    progress.check(run, np.array([3]))
+    progress, run = resumed(0.9, done=4)
+    assert progress.solved[0] is not None
+    assert progress.solved[0].iteration == 4
+    progress.check(run, np.array([4]))
+    assert not progress.active(run.config).any()
+
+
+def test_runs_that_went_past_another_threshold_are_refused():
+    rows = [row_of(0, n, share) for n, share in ((1, 0.0), (2, 0.5), (3, 0.6))]
+    values = Progress(3, 1.0, 2.0, (None,)).to_dict()
+    lower = Run(Config(iterations=10, stop_when_solved=0.5))
+    with pytest.raises(ValueError, match=r"seed 0 would be after iteration 2, but it is after 3"):
+        Progress.resumed(values, lower, rows).check(lower, np.array([3]))
+    # The second seed stopped at 0.5, and training went on without it.
+    rows += [row_of(1, n, share) for n, share in ((1, 0.0), (2, 0.5))]
+    higher = Run(Config(iterations=10, stop_when_solved=0.9), seeds=2)
+    with pytest.raises(ValueError, match=r"seed 1 would be after iteration 3, but it is after 2"):
+        Progress.resumed(values, higher, rows).check(higher, np.array([3, 2]))
+    fewer = Run(Config(iterations=2))
+    with pytest.raises(ValueError, match="iterations must be at least 3, which are done, got 2"):
+        Progress.resumed(values, fewer, rows).check(fewer, np.array([3]))
 
 
 def test_help_documents_every_setting(capsys):
@@ -313,7 +370,6 @@ def test_training_goes_on_until_every_seed_is_solved():
     assert not progress._replace(iteration=10).active(config).any()
     never = dataclasses.replace(config, stop_when_solved=0.0)
     assert progress.active(never).all()
-    assert Progress.from_dict(json.loads(json.dumps(progress.to_dict()))) == progress
 
 
 def test_cache_follows_the_environment(monkeypatch, tmp_path):

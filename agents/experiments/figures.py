@@ -1,8 +1,10 @@
-"""The figures of the experiments.
+"""The figures of the experiments, from their records.
 
 Source: the paper's figures of experiments 1 and 2.
 """
 
+import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,36 +12,60 @@ from typing import Any
 import numpy as np
 
 import trap_tube_jax as tt
+from agents.experiments import tables
+from agents.experiments.records import Record, rows_of
 from agents.runs.metrics import Row
 from agents.runs.tracking import OVERALL, PREFIX
 
-Curves = Mapping[str, Sequence[Row]]
+Curves = Mapping[str, Sequence[Row]]  # by algorithm, the rows of all its seeds
 
 WIDTH = 3.2  # inches of a panel
 HEIGHT = 2.5
 DPI = 110
+DIGEST = "Record"  # the key of a figure's metadata
 
 
-def save_rewards(curves: Curves, path: Path, title: str) -> None:
-    """Experiment 1: training and evaluation reward over episodes, a thin line per seed.
+def save(record: Record, path: Path) -> None:
+    """Draws the learning curves of a record as PNG, which carries the digest of its data."""
+    entries = record["algorithms"]
+    curves = {
+        entry["name"]: [row for run in entry["runs"] for row in rows_of(run)] for entry in entries
+    }
+    draw = _save_rewards if record["experiment"] == "exp1" else _save_success
+    draw(curves, path, tables.title(record), {DIGEST: digest(record)})
 
-    Args:
-      curves: the rows of metrics of every algorithm, all seeds together.
-      path: the PNG to write.
-      title: over the panels.
-    """
+
+def digest(record: Record) -> str:
+    """A SHA-256 of all that a figure shows."""
+    shown = [
+        record["experiment"],
+        tables.title(record),
+        [
+            [entry["name"], [run["curves"] for run in entry["runs"]]]
+            for entry in record["algorithms"]
+        ],
+    ]
+    return hashlib.sha256(json.dumps(shown, sort_keys=True).encode()).hexdigest()
+
+
+def drawn_from(path: Path) -> str | None:
+    """The digest of the data that a figure was drawn from; None if it names none."""
+    from PIL import Image  # noqa: PLC0415  slow to import
+
+    if not path.is_file():
+        return None
+    with Image.open(path) as picture:
+        return picture.info.get(DIGEST)
+
+
+def _save_rewards(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:
+    """Experiment 1: training and evaluation reward over episodes, a thin line per seed."""
     panels = {"training reward": "success", "greedy evaluation reward": "evaluation"}
-    _save(curves, panels, path, title, columns=2, draw=_draw_seeds)
+    _save(curves, panels, path, title, metadata, columns=2, draw=_draw_seeds)
 
 
-def save_success(curves: Curves, path: Path, title: str) -> None:
-    """Experiment 2: mean ± sd and maximum over seeds, of training and of every set.
-
-    Args:
-      curves: the rows of metrics of every algorithm, all seeds together.
-      path: the PNG to write.
-      title: over the panels.
-    """
+def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:
+    """Experiment 2: mean ± sd and maximum over seeds, of training and of every set."""
     known = {PREFIX + entry.short: entry.label for entry in tt.PAPER_TASK_SETS}
     columns = {name for rows in curves.values() for row in rows for name in row}
     panels = {"training": "success"}
@@ -47,7 +73,7 @@ def save_success(curves: Curves, path: Path, title: str) -> None:
     if OVERALL in columns:
         panels["overall"] = OVERALL
     title = f"{title}: mean, ± sd, maximum (dotted)"
-    _save(curves, panels, path, title, columns=5, draw=_draw_spread)
+    _save(curves, panels, path, title, metadata, columns=5, draw=_draw_spread)
 
 
 def by_iteration(rows: Sequence[Row], metric: str) -> tuple[np.ndarray, np.ndarray]:
@@ -69,6 +95,7 @@ def _save(
     panels: Mapping[str, str],
     path: Path,
     title: str,
+    metadata: Mapping[str, str],
     *,
     columns: int,
     draw: Callable[..., None],
@@ -95,7 +122,7 @@ def _save(
         axis.xaxis.set_major_locator(MaxNLocator(5))
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes[0, 0].legend(fontsize="small")
-    figure.savefig(path, format="png", dpi=DPI)
+    figure.savefig(path, format="png", dpi=DPI, metadata=dict(metadata))
 
 
 def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:

@@ -1,24 +1,35 @@
 """What the experiments train, on what, for how long: one table each.
 
-Source: agent specification "Experiments"; paper section "Results".
+Source: paper section "Results"; its Tables 1 and 2.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
+from agents.acting.evaluation import ALL_SETS, Purpose
 from agents.config import Config
-from agents.evaluate import ALL_SETS
+from agents.registry import curiosities
 
-# What an algorithm changes in a preset.
-ALGORITHMS: dict[str, dict[str, Any]] = {
-    "ppo": {"curiosity": "none"},
-    "ppo+icm": {"curiosity": "icm"},
-    "ppo+icm-detached": {"curiosity": "icm-detached"},
-    "ppo+rnd": {"curiosity": "rnd"},
-    "ppo+counts": {"curiosity": "counts"},
-    "preset": {},
-}
+PROGRAM = "python -m agents.experiments"
+PRESET = "preset"
+IMITATION = "+imitation"
+WITHOUT_IMITATION = {"imitation_coef": 0.0}
+WITHOUT_CURIOSITY = {"curiosity": "none", "episodic_novelty": False}
+
+
+def algorithms() -> dict[str, dict[str, Any]]:
+    """What each algorithm changes in a preset, whichever that is.
+
+    `ppo` is PPO alone. `+<curiosity>` adds that curiosity and `+imitation` imitation, both with
+    the preset's weights. `preset` is the preset as it is.
+    """
+    named: dict[str, dict[str, Any]] = {"ppo": WITHOUT_CURIOSITY}
+    named |= {f"ppo+{name}": {"curiosity": name} for name in curiosities() if name != "none"}
+    pure = {name: {**changes, **WITHOUT_IMITATION} for name, changes in named.items()}
+    imitating = {name + IMITATION: changes for name, changes in named.items()}
+    return {**pure, **imitating, PRESET: {}}
 
 
 class Experiment(NamedTuple):
@@ -43,6 +54,7 @@ EXPERIMENTS = {
         ALL_SETS[1:],
     ),
 }
+SELECTIONS = ("validation", "paper")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +63,13 @@ class Protocol:
 
     Attributes:
       preset: the named settings.
-      algorithms: which of `ALGORITHMS`.
+      algorithms: which of `algorithms()`.
       seeds: how many, from `seed` on.
       iterations: of training, at most.
-      tasks: evaluation tasks per set; the base set has one.
+      tasks: tasks per set by which the best evaluation is chosen; the base set has one.
+      reported: tasks per set that the tables report.
+      selection: `validation`: the best evaluation is chosen on validation tasks, and other
+        tasks are reported. `paper`: it is chosen and reported on the same tasks.
       evaluate_every: iterations from one evaluation on all sets to the next.
       stop_when_solved: as in the config.
       settings: settings of the config that differ from the preset's.
@@ -66,45 +81,65 @@ class Protocol:
     seeds: int = 5
     iterations: int = 250
     tasks: int = 128
+    reported: int = 1000
+    selection: str = "validation"
     evaluate_every: int = 1
     stop_when_solved: float = 0.0
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuses what cannot be run.
+        """Checks the values.
 
         Raises:
           ValueError: naming the value and what is allowed.
         """
+        allowed = ", ".join(algorithms())
         for name in self.algorithms:
-            if name not in ALGORITHMS:
-                allowed = ", ".join(ALGORITHMS)
+            if name not in algorithms():
                 raise ValueError(f"unknown algorithm {name!r}; allowed: {allowed}")
-        for name in ("seeds", "tasks", "evaluate_every"):
+        for name in ("seeds", "tasks", "reported", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
         if not self.algorithms:
-            raise ValueError(f"name at least one algorithm; allowed: {', '.join(ALGORITHMS)}")
+            raise ValueError(f"name at least one algorithm; allowed: {allowed}")
+        if self.selection not in SELECTIONS:
+            raise ValueError(
+                f"selection must be one of {', '.join(SELECTIONS)}, got {self.selection!r}"
+            )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The inverse of `dataclasses.asdict`, also from JSON.
 
         Raises:
-          ValueError: a value is unknown, or not allowed.
+          ValueError: a value is unknown, missing or not allowed.
         """
         known = [field.name for field in dataclasses.fields(cls)]
         for name in values:
             if name not in known:
                 raise ValueError(f"unknown {name!r} in a protocol; allowed: {', '.join(known)}")
+        missing = [name for name in known if name not in values]
+        if missing:
+            raise ValueError(f"a protocol lacks {', '.join(missing)}")
         return cls(**{**values, "algorithms": tuple(values["algorithms"])})
+
+    @property
+    def selects_on(self) -> Purpose:
+        """Which tasks choose the best evaluation."""
+        return "validation" if self.selection == "validation" else "test"
+
+    @property
+    def num_reported(self) -> int:
+        """Tasks per set that the tables report."""
+        return self.reported if self.selection == "validation" else self.tasks
 
     def config(self, experiment: Experiment, algorithm: str) -> Config:
         """The settings of an algorithm's runs.
 
         Raises:
-          ValueError: unknown preset or setting, or a setting's value is not allowed.
+          ValueError: unknown preset or setting, a setting's value is not allowed, or the
+            preset has no imitation where the algorithm's name says so.
         """
         fixed = {
             "env_id": experiment.env_id,
@@ -112,34 +147,56 @@ class Protocol:
             "eval_episodes": self.tasks,
             "stop_when_solved": self.stop_when_solved,
         }
-        return Config.preset(self.preset, **{**self.settings, **fixed, **ALGORITHMS[algorithm]})
+        changes = algorithms()[algorithm]
+        config = Config.preset(self.preset, **{**self.settings, **fixed, **changes})
+        if algorithm.endswith(IMITATION) and not config.imitation_coef:
+            raise ValueError(
+                f"algorithm {algorithm!r} imitates, but imitation_coef is 0 in preset "
+                f"{self.preset!r}; give --settings imitation_coef=..., or leave out {IMITATION!r}"
+            )
+        return config
+
+    def command(self, experiment: str, algorithms: Sequence[str]) -> str:
+        """What to type for the same runs in a new folder."""
+        parts = [PROGRAM, experiment, "--preset", self.preset, "--algorithms", *algorithms]
+        names = ("seeds", "iterations", "tasks", "reported", "selection", "evaluate_every")
+        for name in (*names, "stop_when_solved", "seed"):
+            value = getattr(self, name)
+            if value != getattr(PROTOCOLS[experiment], name):
+                parts += [f"--{name.replace('_', '-')}", str(value)]
+        if self.settings:
+            pairs = [f"{name}={json.dumps(value)}" for name, value in self.settings.items()]
+            parts += ["--settings", *(pair.replace(" ", "") for pair in pairs)]
+        return " ".join(parts)
 
 
 # Nothing of these may differ between the runs of one folder.
-FIXED = ("preset", "tasks", "evaluate_every", "stop_when_solved", "settings")
+FIXED = ("preset", "tasks", "selection", "evaluate_every", "stop_when_solved", "settings")
 
 PROTOCOLS = {
     "exp1": Protocol(iterations=250),
     "exp2": Protocol(iterations=500),
 }
 # Some minutes on two cores: too short for the paper's numbers, long enough to see that the
-# `fast` preset's curiosity and imitation find the food where plain PPO does not.
+# `fast` preset's curiosity and imitation find the food where PPO alone does not.
 QUICK = {
     "exp1": Protocol(
         preset="fast",
-        algorithms=("ppo", "preset"),
+        algorithms=("ppo", PRESET),
         seeds=1,
         iterations=20,
         tasks=16,
+        reported=128,
         evaluate_every=5,
         stop_when_solved=1.0,
     ),
     "exp2": Protocol(
         preset="fast",
-        algorithms=("ppo", "preset"),
+        algorithms=("ppo", PRESET),
         seeds=1,
         iterations=15,
         tasks=16,
+        reported=128,
         evaluate_every=5,
     ),
 }

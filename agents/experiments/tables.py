@@ -1,23 +1,19 @@
 """The tables of the experiments, our numbers beside the paper's, as text for any place.
 
-Source: paper Tables 1 and 2; agent specification "Experiments".
+Source: paper Tables 1 and 2.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from rich.table import Table as RichTable
 
-from agents.runs.report import TABLE_STYLE, duration
-
-Record = Mapping[str, Any]
-
-
-class Spread(NamedTuple):
-    """A mean and a standard deviation, None where the paper gives none."""
-
-    mean: float
-    sd: float | None = None
+from agents.acting.scores import Layouts
+from agents.experiments import statistics
+from agents.experiments.protocol import EXPERIMENTS, PRESET
+from agents.experiments.records import Record
+from agents.experiments.statistics import Spread
+from agents.runs.report import FEW_LAYOUTS, NOTHING, TABLE_STYLE, duration
 
 
 class PaperSolved(NamedTuple):
@@ -56,7 +52,8 @@ PAPER_PERCENT: dict[str, dict[str, Spread]] = {
 }
 
 LABELS = {"ppo": "PPO", "ppo+icm": "PPO + ICM"}
-NOTHING = "–"
+SPREAD = "mean ± sd [95 % confidence interval of the mean, Student t over seeds]"
+MEAN_OF_SETS = "mean of the sets apart from base"
 
 
 class Table(NamedTuple):
@@ -91,31 +88,33 @@ class Table(NamedTuple):
 def tables(record: Record) -> list[Table]:
     """All tables of an experiment's record."""
     made = [solved_table(record)] if record["experiment"] == "exp1" else []
-    evaluated = [entry for entry in record["algorithms"] if entry["aggregate"]["sets"]]
+    evaluated = [entry for entry in record["algorithms"] if statistics.tested(entry)]
     if evaluated:
         made.append(percent_table(record))
-    made += [
-        quality_table(record, entry)
-        for entry in evaluated
-        if any(score["percent_of_solvable"] for score in entry["aggregate"]["sets"])
-    ]
+    if any(about["layout"] for about in record["sets"].values()) and evaluated:
+        made.append(layouts_table(record))
+    if any(about["shortest"] for about in record["sets"].values()):
+        made += [quality_table(record, entry) for entry in evaluated]
     return [*made, cost_table(record)]
+
+
+def title(record: Record) -> str:
+    """What a record is of, for the head of a page or figure."""
+    return f"{EXPERIMENTS[record['experiment']].title}, preset {record['protocol']['preset']}"
 
 
 def solved_table(record: Record) -> Table:
     """Our rows above those of the paper's Table 1."""
     rows = []
     for entry in record["algorithms"]:
-        found = entry["aggregate"]
-        trials = f"{found['solved']} / {found['trials']}"
-        rows.append((_label(record, entry), trials, _thousands(found["episodes_to_solve"])))
+        episodes = statistics.episodes_to_solve(entry)
+        trials = f"{len(episodes)} / {len(entry['runs'])}"
+        rows.append((_label(record, entry), trials, _spread(Spread.of(episodes), ",.0f")))
     for name, paper in PAPER_SOLVED.items():
-        episodes = paper.episodes._asdict() if paper.episodes else None
         trials = f"{paper.solved} / {paper.trials}"
-        rows.append((f"{LABELS[name]}, paper", trials, _thousands(episodes)))
+        rows.append((f"{LABELS[name]}, paper", trials, _spread(paper.episodes, ",.0f")))
     heads = ("algorithm", "trials solved", "episodes to solve")
-    title = "Base task solved; episodes to solve it, mean ± sd over the trials that did"
-    return Table(title, heads, tuple(rows))
+    return Table(f"Base task solved; episodes to solve it, {SPREAD}", heads, tuple(rows))
 
 
 def percent_table(record: Record) -> Table:
@@ -124,68 +123,80 @@ def percent_table(record: Record) -> Table:
     Of experiment 1 the paper says that agents solve what happens to equal the base task: the
     share of such tasks stands beside theirs.
     """
-    ranked = f"mean of {len(record['ranked'])}"
     columns: dict[str, dict[str, str]] = {}
     labels: dict[str, str] = {}
-    for entry in record["algorithms"]:
-        scores = {score["set"]: score for score in entry["aggregate"]["sets"]}
-        labels |= {name: score["label"] for name, score in scores.items()}
-        cells = {name: _spread(score["percent"]) for name, score in scores.items()}
-        columns[_label(record, entry)] = {**cells, ranked: _spread(entry["aggregate"]["overall"])}
+    for entry in _tested(record):
+        summaries = statistics.by_set(record, entry)
+        labels |= {name: summary.label for name, summary in summaries.items()}
+        cells = {name: _percent(summary.percent) for name, summary in summaries.items()}
+        mean = _percent(statistics.mean_of_sets(record, entry))
+        columns[_label(record, entry)] = {**cells, MEAN_OF_SETS: mean}
     for name, paper in PAPER_PERCENT.items() if record["experiment"] == "exp2" else ():
         columns[f"{LABELS[name]}, paper"] = {
-            name: _spread(spread._asdict()) for name, spread in paper.items()
+            name: _percent(spread) for name, spread in paper.items()
         }
     if record["experiment"] == "exp1":
-        equal = record["equal_to_base"].items()
-        columns["equal to base"] = {name: f"{percent:.1f}" for name, percent in equal}
+        about = record["sets"].items()
+        columns["equal to base"] = {name: f"{each['equal_to_base']:.1f}" for name, each in about}
     rows = [
         (label, *(cells.get(name, NOTHING) for cells in columns.values()))
-        for name, label in {**labels, ranked: ranked}.items()
+        for name, label in {**labels, MEAN_OF_SETS: MEAN_OF_SETS}.items()
     ]
-    title = "Tasks solved at the best overall evaluation, %, mean ± sd over trials"
-    return Table(title, ("set", *columns), tuple(rows))
+    heading = f"Tasks solved, %, {SPREAD}. {_selection(record)}"
+    return Table(heading, ("set", *columns), tuple(rows))
+
+
+def layouts_table(record: Record) -> Table:
+    """The layouts solved of the sets that have few of them."""
+    entries = {_label(record, entry): statistics.by_set(record, entry) for entry in _tested(record)}
+    rows: dict[str, list[str]] = {}
+    for index, summaries in enumerate(entries.values()):
+        for summary in summaries.values():
+            if summary.layouts is not None:
+                row = rows.setdefault(summary.label, [summary.label, *[NOTHING] * len(entries)])
+                row[1 + index] = _solved_layouts(summary.layouts)
+    heading = f"Layouts solved, mean over seeds. {FEW_LAYOUTS}"
+    return Table(heading, ("set", *entries), tuple(map(tuple, rows.values())))
 
 
 def quality_table(record: Record, entry: Record) -> Table:
     """How good an algorithm's play is: solvable tasks solved, shortest plan / steps taken."""
     rows = [
         (
-            score["label"],
-            str(score["tasks"]),
-            _spread(score["percent"]),
-            _spread(score["percent_of_solvable"]),
-            _spread(score["optimality"], ".3f"),
-            _number(score["worst"], ".3f"),
+            summary.label,
+            str(len(record["sets"][summary.name]["shortest"] or ())),
+            _percent(summary.percent_of_solvable),
+            _spread(summary.optimality, ".3f"),
+            _number(summary.worst, ".3f"),
         )
-        for score in entry["aggregate"]["sets"]
+        for summary in statistics.by_set(record, entry).values()
     ]
-    heads = ("set", "tasks", "solved %", "of solvable %", "optimality", "worst")
-    title = f"{_label(record, entry)}: optimality is shortest plan / steps taken, where solved"
-    return Table(title, heads, tuple(rows))
+    heads = ("set", "tasks", "of solvable %", "optimality", "worst")
+    heading = (
+        f"{_label(record, entry)}: optimality is shortest plan / steps taken, where solved; over "
+        "the first tasks of each set"
+    )
+    return Table(heading, heads, tuple(rows))
 
 
 def cost_table(record: Record) -> Table:
     """How long the training was."""
-    everything = [entry["aggregate"] for entry in record["algorithms"]]
-    whole = any(found.get("process_seconds") for found in everything)
     rows = []
-    for entry, found in zip(record["algorithms"], everything, strict=True):
+    for entry in record["algorithms"]:
         iterations = sorted({run["iterations"] for run in entry["runs"]})
-        cells = [
-            _label(record, entry),
-            str(found["trials"]),
-            "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
-            f"{found['transitions']['mean']:,.0f}",
-        ]
-        cells.append(duration(found["training_seconds"]["mean"]))
-        if whole:
-            process = found.get("process_seconds")
-            cells.append(duration(process["mean"]) if process else NOTHING)
-        rows.append(tuple(cells))
-    heads = ["algorithm", "trials", "iterations", "transitions"]
-    heads += ["training time"] + ["with start-up"] * whole
-    return Table("What a trial took, on average", tuple(heads), tuple(rows))
+        transitions = Spread.of([run["transitions"] for run in entry["runs"]])
+        seconds = Spread.of([run["training_seconds"] for run in entry["runs"]])
+        rows.append(
+            (
+                _label(record, entry),
+                str(len(entry["runs"])),
+                "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
+                NOTHING if transitions is None else f"{transitions.mean:,.0f}",
+                NOTHING if seconds is None else duration(seconds.mean),
+            )
+        )
+    heads = ("algorithm", "trials", "iterations", "transitions", "training time")
+    return Table("What a trial took, on average", heads, tuple(rows))
 
 
 def notes(record: Record) -> list[str]:
@@ -201,12 +212,7 @@ def notes(record: Record) -> list[str]:
 
 def provenance(record: Record) -> list[str]:
     """Each machine, with versions and commit, that runs of the record ran on."""
-    machines: dict[str, None] = {}
-    for entry in record["algorithms"]:
-        for run in entry["runs"]:
-            for machine in run["machines"]:
-                machines[_machine(machine)] = None
-    return list(machines)
+    return list(dict.fromkeys(map(_machine, record["machines"])))
 
 
 def markdown(record: Record) -> str:
@@ -215,7 +221,26 @@ def markdown(record: Record) -> str:
     return "\n\n".join([*parts, *notes(record)])
 
 
-def _machine(machine: Mapping[str, Any]) -> str:
+def _tested(record: Record) -> list[Record]:
+    return [entry for entry in record["algorithms"] if statistics.tested(entry)]
+
+
+def _selection(record: Record) -> str:
+    """How the evaluation was chosen that the tables report."""
+    protocol = record["protocol"]
+    ranked = ", ".join(record["ranked"])
+    if protocol["selection"] == "paper":
+        return (
+            f"Of each trial, the evaluation with the best mean over {ranked}, chosen and reported "
+            f"on the same {protocol['tasks']} tasks a set, as in the paper"
+        )
+    return (
+        f"Of each trial, the evaluation with the best mean over {ranked} on {protocol['tasks']} "
+        f"validation tasks a set; reported are {protocol['reported']:,} other tasks a set"
+    )
+
+
+def _machine(machine: Record) -> str:
     where = f"{machine['cores']} cores of {machine['processor']}"
     if machine["device"].lower() != "cpu":
         where = f"{machine['devices']} {machine['device']}, {where}"
@@ -224,21 +249,34 @@ def _machine(machine: Mapping[str, Any]) -> str:
 
 
 def _label(record: Record, entry: Record) -> str:
-    if entry["name"] == "preset":
-        return str(record["preset"])
+    if entry["name"] == PRESET:
+        return str(record["protocol"]["preset"])
     name = str(entry["name"])
     return LABELS.get(name, name)
 
 
-def _spread(spread: Mapping[str, float | None] | None, form: str = ".1f") -> str:
+def _percent(spread: Spread | None) -> str:
+    return _spread(spread, ".1f", high=100.0)
+
+
+def _spread(spread: Spread | None, form: str, high: float | None = None) -> str:
+    """Mean, deviation and interval, the last cut off at 0 and `high`, beyond which no mean lies."""
     if spread is None:
         return NOTHING
-    sd = "" if spread["sd"] is None else f" ± {spread['sd']:{form}}"
-    return f"{spread['mean']:{form}}{sd}"
+    text = format(spread.mean, form)
+    if spread.sd is not None:
+        text += f" ± {spread.sd:{form}}"
+    if spread.margin is not None:
+        ends = max(0.0, spread.mean - spread.margin), spread.mean + spread.margin
+        ends = ends[0], ends[1] if high is None else min(high, ends[1])
+        text += f" [{ends[0]:{form}}, {ends[1]:{form}}]"
+    return text
 
 
-def _thousands(spread: Mapping[str, float | None] | None) -> str:
-    return _spread(spread, ",.0f")
+def _solved_layouts(layouts: Sequence[Layouts]) -> str:
+    mean = sum(each.solved for each in layouts) / len(layouts)
+    form = ".0f" if len(layouts) == 1 else ".1f"
+    return f"{mean:{form}} of {layouts[0].total}"
 
 
 def _number(value: float | None, form: str) -> str:

@@ -1,6 +1,6 @@
 """The policy network as pure functions of its parameters: encoder, recurrent core, heads."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -15,22 +15,6 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
 ENCODERS = {"paper": Encoder, "objects": ObjectEncoder}
-
-
-class Policy(NamedTuple):
-    """A trained network: what evaluation needs of a run, wherever it comes from.
-
-    Attributes:
-      name: what to call it in tables.
-      config: the settings that it was trained with.
-      params: its parameters.
-      iteration: iterations trained.
-    """
-
-    name: str
-    config: Config
-    params: Params
-    iteration: int
 
 
 class Agent:

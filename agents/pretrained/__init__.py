@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from agents.acting.policy import Policy
 from agents.config import Config
-from agents.networks.agent import Policy
 from agents.ppo.learner import make_train
 from agents.runs.checkpoint import Arrays, digest, from_arrays, to_arrays
 

@@ -9,9 +9,9 @@ from typing import Annotated
 import tyro
 
 from agents import pretrained
-from agents.evaluate import load_run
-from agents.networks.agent import Policy
+from agents.acting.policy import Policy
 from agents.runs.folder import RunFolder
+from agents.runs.loading import load
 
 PROGRAM = "python -m agents.pretrained"
 
@@ -95,7 +95,7 @@ def find_policy(options: Export) -> Policy:
         allowed = ", ".join(map(str, run.seed_range))
         raise ValueError(f"{options.run} has no seed {seed}; allowed: {allowed}")
     if not options.best:
-        return load_run(options.run, options.iteration)[run.seed_range.index(seed)]
+        return load(options.run, seed=seed, iteration=options.iteration)
     if options.iteration is not None:
         raise ValueError("--best and --iteration name different parameters; give one")
     if not folder.best(seed).exists():

@@ -10,6 +10,8 @@ from agents.config import PRESETS, Config
 
 CONFIG_FILE = "config.json"
 MAX_SEED = 2**31 - 1
+# Settings that may change when a run is resumed: they decide only where it ends.
+EXTENDABLE = ("iterations", "stop_when_solved")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Run:
     seeds: int = 1
 
     def __post_init__(self) -> None:
-        """Refuses impossible seeds.
+        """Checks preset and seeds.
 
         Raises:
           ValueError: naming the value and what is allowed.
@@ -51,6 +53,29 @@ class Run:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
         return dataclasses.asdict(self)
+
+    def check_continues(self, before: "Run") -> None:
+        """Checks that this run, resumed, ends as if it had never been another one.
+
+        Args:
+          before: the stored run.
+
+        Raises:
+          ValueError: a setting differs that shapes what has been trained so far.
+        """
+        old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
+        for name, value in old.items():
+            if name not in (*EXTENDABLE, "config") and new[name] != value:
+                raise ValueError(
+                    f"the run has {name}={value}, not {new[name]}; only "
+                    f"{' and '.join(EXTENDABLE)} may change"
+                )
+        if before.config.cooldown > 0 and new["iterations"] != old["iterations"]:
+            raise ValueError(
+                f"the run has cooldown={before.config.cooldown} and iterations="
+                f"{old['iterations']}, not {new['iterations']}: the step size falls towards the "
+                "last iteration, so another number of them is another run; begin a new one"
+            )
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
@@ -96,6 +121,10 @@ class RunFolder:
         """The parameters of a seed's best evaluation on several sets."""
         return self.path / f"best-seed{seed}.npz"
 
+    def tested(self, seed: int) -> Path:
+        """The steps that these parameters take in the tasks that are reported."""
+        return self.path / f"tested-seed{seed}.json"
+
     @property
     def checkpoints(self) -> Path:
         """One folder per checkpoint, named after its iteration."""
@@ -105,6 +134,11 @@ class RunFolder:
     def curves(self) -> Path:
         """The learning curves."""
         return self.path / "curves.png"
+
+    @property
+    def page(self) -> Path:
+        """All of it on one page, to open in a browser."""
+        return self.path / "report.html"
 
     @property
     def evaluation(self) -> Path:
@@ -165,10 +199,23 @@ class RunFolder:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Writes a JSON file whole or not at all."""
+    """Writes a JSON file whole or not at all; a list of plain values takes one line."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_text(json.dumps(values, indent=2) + "\n")
+    draft.write_text(_json(values) + "\n")
     draft.replace(path)
+
+
+def _json(value: Any, indent: str = "") -> str:
+    inner = indent + "  "
+    if isinstance(value, dict) and value:
+        lines = [f"{json.dumps(str(name))}: {_json(each, inner)}" for name, each in value.items()]
+        start, end = "{}"
+    elif isinstance(value, list | tuple) and any(isinstance(x, dict | list | tuple) for x in value):
+        lines = [_json(each, inner) for each in value]
+        start, end = "[]"
+    else:
+        return json.dumps(value, allow_nan=False)
+    return f"{start}\n{inner}" + f",\n{inner}".join(lines) + f"\n{indent}{end}"
 
 
 def read_json(path: Path) -> Any:

@@ -9,7 +9,11 @@ from typing import Any
 
 import jax
 
+ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
+# What decides results; records and texts may change between two of them.
+CODE = ("agents/*.py", "benchmarks/*.py", "trap_tube_jax/*.py", "pyproject.toml")
+DIRTY = "-dirty"
 
 
 def machine() -> dict[str, Any]:
@@ -36,14 +40,16 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
+    """The commit that the code is of, with "-dirty" where the code was changed since."""
     try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-            cwd=pathlib.Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        commit = _git("rev-parse", "--short=12", "HEAD")
+        changes = _git("status", "--porcelain", "--", *CODE)
     except (OSError, subprocess.CalledProcessError):
         return None
-    return described.stdout.strip()
+    return commit + (DIRTY if changes else "")
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip()

@@ -1,4 +1,4 @@
-"""Numbers of a run on the host: the CSV file, scores of task sets, when it was solved."""
+"""The metrics of a run on the host: the CSV file, and when a seed first solved its tasks."""
 
 import csv
 import dataclasses
@@ -14,7 +14,6 @@ Row = Mapping[str, float | int]
 
 LEADING_COLUMNS = ("seed", "iteration", "episodes", "transitions")
 TIMING_COLUMNS = ("seconds", "transitions_per_second")
-NORMAL_QUANTILE_95 = 1.959963984540054
 
 
 class MetricsLog:
@@ -87,106 +86,6 @@ class FirstSolved:
             transitions=int(row["transitions"]),
             seconds=round(float(row["seconds"]), 3),
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class Optimality:
-    """How the solved episodes compare with shortest plans.
-
-    Attributes:
-      solvable: tasks that any sequence of actions within the step limit solves.
-      percent_of_solvable: of those, percent solved; None if there are none.
-      mean: mean of shortest length / steps taken over solved tasks; None if there are none.
-      worst: the smallest of them.
-    """
-
-    solvable: int
-    percent_of_solvable: float | None
-    mean: float | None
-    worst: float | None
-
-    @classmethod
-    def of(
-        cls, solved: np.ndarray, length: np.ndarray, shortest: np.ndarray, max_steps: int
-    ) -> "Optimality":
-        """Compares bool[B] and i32[B] with shortest lengths i32[B], -1 where unsolvable."""
-        solvable = (shortest >= 0) & (shortest <= max_steps)
-        ratio = shortest[solved] / np.maximum(length[solved], 1)
-        return cls(
-            solvable=int(solvable.sum()),
-            percent_of_solvable=100 * float(solved[solvable].mean()) if solvable.any() else None,
-            mean=float(ratio.mean()) if len(ratio) else None,
-            worst=float(ratio.min()) if len(ratio) else None,
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class Score:
-    """Greedy play on the fixed tasks of one set.
-
-    Attributes:
-      set: the set's short name.
-      label: its name in the paper's notation.
-      tasks: how many tasks were tried.
-      solved: how many were solved.
-      percent: 100 solved / tasks.
-      interval: 95 % Wilson interval of the percentage over the set's tasks; None where
-        the one task tried is all there is, so that nothing is estimated.
-      mean_steps: mean steps of the solved episodes; None without any.
-      optimality: the comparison with shortest plans, if one was made.
-    """
-
-    set: str
-    label: str
-    tasks: int
-    solved: int
-    percent: float
-    interval: tuple[float, float] | None
-    mean_steps: float | None
-    optimality: Optimality | None = None
-
-    @classmethod
-    def of(
-        cls,
-        name: str,
-        label: str,
-        solved: np.ndarray,
-        length: np.ndarray,
-        *,
-        is_sample: bool,
-        optimality: Optimality | None = None,
-    ) -> "Score":
-        """The score of outcomes bool[B] and lengths i32[B]; `is_sample`: there are more tasks."""
-        count, tasks = int(np.sum(solved)), len(solved)
-        low, high = wilson_interval(count, tasks)
-        return cls(
-            set=name,
-            label=label,
-            tasks=tasks,
-            solved=count,
-            percent=100 * count / tasks,
-            interval=(100 * low, 100 * high) if is_sample else None,
-            mean_steps=float(np.mean(length[solved])) if count else None,
-            optimality=optimality,
-        )
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """The 95 % score interval of a probability (Wilson, 1927).
-
-      (p + z^2 / 2n ± z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n),  p = successes / n.
-
-    Raises:
-      ValueError: there is no trial, or not 0 <= successes <= trials.
-    """
-    if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"need 0 <= successes <= trials >= 1, got {successes} and {trials}")
-    z2 = NORMAL_QUANTILE_95**2
-    share = successes / trials
-    center = share + z2 / (2 * trials)
-    margin = math.sqrt(z2 * (share * (1 - share) / trials + z2 / (4 * trials**2)))
-    scale = 1 + z2 / trials
-    return max(0.0, (center - margin) / scale), min(1.0, (center + margin) / scale)
 
 
 def _columns(row: Row) -> list[str]:

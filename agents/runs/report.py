@@ -1,11 +1,13 @@
 """How a run is shown: the live table, tables of results, learning curves, a GIF."""
 
+import dataclasses
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+import jax
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
@@ -13,7 +15,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from agents.runs.metrics import FirstSolved, Row, Score, column
+from agents.acting.evaluation import Evaluation, Evaluator
+from agents.acting.policy import Policy
+from agents.acting.scores import Score
+from agents.runs.metrics import FirstSolved, Row, column
 from trap_tube_jax.gallery import episode_frames
 from trap_tube_jax.rendering import save_gif
 from trap_tube_jax.state import State
@@ -22,6 +27,11 @@ TABLE_STYLE: dict[str, Any] = {"box": SIMPLE_HEAD, "padding": (0, 0, 0, 1), "pad
 LIVE_ROWS = 10
 LIVE_WIDTH = 10  # characters of a column; a narrow terminal shows the first columns only
 CELL_SIZE = 24  # pixels
+NOTHING = "–"
+FEW_LAYOUTS = (
+    "Sets without {P} have one or five layouts, in one or any colours: for these the table "
+    "counts the layouts solved in more than half of their draws, and gives no interval."
+)
 
 
 class LiveColumn(NamedTuple):
@@ -156,6 +166,9 @@ def evaluation_table(scores: Sequence[Score], title: str) -> Table:
     table = Table(title=f"Greedy evaluation: {title}", title_justify="left", **TABLE_STYLE)
     table.add_column("set", no_wrap=True)
     heads = ["tasks", "solved %", "95 % interval", "steps"]
+    with_layouts = any(score.layouts is not None for score in scores)
+    if with_layouts:
+        heads.insert(2, "layouts solved")
     with_optimality = any(score.optimality is not None for score in scores)
     if with_optimality:
         heads += ["of solvable", "optimal", "worst"]
@@ -163,22 +176,23 @@ def evaluation_table(scores: Sequence[Score], title: str) -> Table:
         # Heads break between words; nothing in a narrow terminal breaks within one.
         table.add_column(head, justify="right", min_width=max(map(len, head.split())))
     for score in scores:
-        table.add_row(*_score_cells(score, with_optimality))
-    if any(score.interval is None for score in scores):
-        table.caption = "A set without transfers has a single task: there is no interval."
+        table.add_row(*_score_cells(score, with_layouts, with_optimality))
+    if with_layouts:
+        table.caption = FEW_LAYOUTS
         table.caption_justify = "left"
     return table
 
 
-def _score_cells(score: Score, with_optimality: bool) -> list[str]:
-    interval = "–" if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval)
+def _score_cells(score: Score, with_layouts: bool, with_optimality: bool) -> list[str]:
+    interval = NOTHING if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval)
     cells = [
         f"{score.label} ({score.set})" if score.label != score.set else score.label,
         str(score.tasks),
         f"{score.percent:.1f}",
-        interval,
-        _optional(score.mean_steps, ".1f"),
     ]
+    if with_layouts:
+        cells.append(NOTHING if score.layouts is None else str(score.layouts))
+    cells += [interval, _optional(score.mean_steps, ".1f")]
     if with_optimality and score.optimality is not None:
         found = score.optimality
         cells.append(_optional(found.percent_of_solvable, ".1f"))
@@ -187,7 +201,7 @@ def _score_cells(score: Score, with_optimality: bool) -> list[str]:
 
 
 def _optional(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)
+    return NOTHING if value is None else format(value, form)
 
 
 def summary_table(solved: Mapping[int, FirstSolved | None], env: str) -> Table:
@@ -272,6 +286,49 @@ def _draw_panel(axis: Any, rows: Sequence[Row], metrics: Sequence[str]) -> None:
         axis.legend(fontsize="small")
 
 
+def save_first_solved(
+    path: Path,
+    evaluator: Evaluator,
+    played: Iterable[Mapping[str, Evaluation]],
+    prefer: str,
+) -> str | None:
+    """Writes a GIF of the first solved episode of the first policy that solves one.
+
+    Args:
+      path: the file to write.
+      evaluator: what played.
+      played: what it returned, of one policy after the other.
+      prefer: the set to take the episode from if one of its is solved.
+
+    Returns:
+      The name of its set, or None if no episode is solved: then nothing is written.
+    """
+    for outcomes in played:
+        for name in sorted(outcomes, key=lambda name: name != prefer):
+            outcome = outcomes[name]
+            if np.any(outcome.solved):
+                index = int(np.argmax(outcome.solved))
+                actions = np.asarray(outcome.action[index, : outcome.length[index]])
+                state = jax.tree.map(lambda x, i=index: x[i], evaluator.tasks[name])
+                save_episode(state, actions, path)
+                return name
+    return None
+
+
 def save_episode(state: State, actions: np.ndarray, path: Path) -> None:
     """Writes a GIF of an episode: `actions` i32[T, 2] from one `state` at time 0."""
     save_gif(episode_frames(state, actions, CELL_SIZE), path, fps=4)
+
+
+def results_json(
+    policies: Sequence[Policy], results: Mapping[str, Sequence[Score]]
+) -> list[dict[str, Any]]:
+    """The scores of every policy as plain values."""
+    return [
+        {
+            "policy": policy.name,
+            "iteration": policy.iteration,
+            "sets": [dataclasses.asdict(score) for score in results[policy.name]],
+        }
+        for policy in policies
+    ]

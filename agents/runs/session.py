@@ -4,7 +4,8 @@ import dataclasses
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent import futures
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -13,24 +14,26 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.config import Config
-from agents.evaluate import (
+from agents.acting.evaluation import (
     ALL_SETS,
+    Evaluation,
     Evaluator,
     evaluate,
     evaluation_tasks,
-    results_json,
-    save_solved_episode,
     scores,
 )
-from agents.networks.agent import Policy, num_parameters
+from agents.acting.policy import Policy
+from agents.acting.scores import Score
+from agents.config import Config
+from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import DEFAULT_DEVICE, Placement
 from agents.ppo.learner import Train, TrainState, make_train
-from agents.runs import report
+from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
-from agents.runs.metrics import FirstSolved, MetricsLog, Row
+from agents.runs.metrics import FirstSolved, MetricsLog, Row, read_metrics
+from agents.runs.story import Story
 from agents.runs.tracking import Tracker
 
 POLL_SECONDS = 0.005
@@ -54,16 +57,49 @@ class Progress(NamedTuple):
     solved: tuple[FirstSolved | None, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        solved = [first and dataclasses.asdict(first) for first in self.solved]
-        return {**self._asdict(), "solved": solved}
+        """Plain values, for JSON, without `solved`, which follows from the metrics."""
+        values = self._asdict()
+        del values["solved"]
+        return values
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Self:
-        """The inverse of `to_dict`; further values are ignored."""
-        solved = tuple(first and FirstSolved(**first) for first in values["solved"])
+    def resumed(cls, values: Mapping[str, Any], run: Run, rows: Sequence[Row]) -> Self:
+        """The progress that was stored; further values are ignored.
+
+        Args:
+          values: what `to_dict` gave.
+          run: what is trained, which may have another threshold than when it was stored.
+          rows: the metrics, of which those after the stored iteration do not count.
+        """
         counts = (values["iteration"], values["seconds"], values["compile_seconds"])
-        return cls(*counts, solved)
+        before = [row for row in rows if row["iteration"] <= values["iteration"]]
+        return cls(*counts, _first_solved(run, (None,) * run.seeds, before))
+
+    def check(self, run: Run, iterations: np.ndarray) -> None:
+        """Checks that an uninterrupted run would have come to the same states.
+
+        Args:
+          run: what is trained.
+          iterations: i32[S], the iterations that the state of each seed is after.
+
+        Raises:
+          ValueError: a seed has been trained for too long, or has stopped too early.
+        """
+        config = run.config
+        if self.iteration > config.iterations:
+            raise ValueError(
+                f"iterations must be at least {self.iteration}, which are done, got "
+                f"{config.iterations}"
+            )
+        for seed, first, done in zip(run.seed_range, self.solved, iterations, strict=True):
+            stops = first is not None and config.stop_when_solved > 0
+            wanted = first.iteration if first is not None and stops else self.iteration
+            if done != wanted:
+                raise ValueError(
+                    f"with stop_when_solved={config.stop_when_solved}, seed {seed} would be after "
+                    f"iteration {wanted}, but it is after {done}: this run cannot be continued "
+                    "with that threshold; give the former one, or begin a new run"
+                )
 
     def active(self, config: Config) -> np.ndarray:
         """bool[S]: the seeds that have more to learn."""
@@ -141,8 +177,10 @@ class Session:
         Raises:
           ValueError: the settings cannot be trained with, or the checkpoint is unusable.
         """
-        self.folder, self.run, self._console = folder, run, console
+        self.folder, self.run, self.console = folder, run, console
         self._every, self._tracker, self._placement = checkpoint_every, tracker, placement
+        self._results: futures.Future[Evaluator] | None = None
+        self._introduce()
         self._train = make_train(run.config, shards=placement.episodes)
         # Files are the first process's alone.
         is_first = processes.is_first()
@@ -163,8 +201,12 @@ class Session:
         if self._checkpoints is not None:
             self._checkpoints.close()
 
-    def train(self, stop: StopSignals) -> None:
+    def train(self, stop: StopSignals, *, then_finish: bool = False) -> None:
         """Trains until all seeds are solved or the iterations are over.
+
+        Args:
+          stop: tells when to stop early.
+          then_finish: `finish` will follow; what it needs compiles as training goes.
 
         Raises:
           Stopped: on request; everything is saved.
@@ -173,9 +215,10 @@ class Session:
         config, total = self.run.config, self.run.config.iterations
         if not self._progress.active(config).any():
             return
-        self._introduce()
         advance = self._compile()
-        live = report.LiveReport(self._console, total, self.run.seeds)
+        if then_finish:
+            self._prepare_results()
+        live = report.LiveReport(self.console, total, self.run.seeds)
         with stop, live:
             while self._progress.active(config).any():
                 rows = self._iterate(advance)
@@ -189,28 +232,53 @@ class Session:
                     raise Stopped(request)
 
     def finish(self) -> None:
-        """Evaluates on all task sets, writes the results and says where they are."""
+        """Evaluates on all task sets, writes the results and says what they show."""
         run, folder = self.run, self.folder
-        evaluator = Evaluator.of_sets(
-            run.config, ALL_SETS, run.config.eval_episodes, self._placement
-        )
+        self.console.print("Evaluating on all task sets ...")
+        evaluator = self._make_evaluator() if self._results is None else self._results.result()
         policies = self._policies()
         played = {policy.name: evaluator(policy.params) for policy in policies}
         self.summarize()
         if self._log is None:
             return
-        results = {name: scores(outcome, run.config.max_steps) for name, outcome in played.items()}
-        write_json(folder.evaluation, results_json(policies, results))
+        results = {
+            name: scores(outcome, evaluator.tasks, run.config.max_steps)
+            for name, outcome in played.items()
+        }
+        write_json(folder.evaluation, report.results_json(policies, results))
         env = tt.task_set(run.config.env_id)
         folder.animation.unlink(missing_ok=True)
-        for outcome in played.values():
-            if save_solved_episode(folder.animation, evaluator, outcome, env.short):
-                break
-        for name, result in results.items():
-            self._console.print(report.evaluation_table(result, f"{folder.path.name}, {name}"))
+        report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
         solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
-        self._console.print(report.summary_table(solved, env.id))
+        story = Story.of(folder, run, results.values(), list(solved.values()))
+        self._save_page(story, evaluator, played, results)
+        self._say(story.before)
+        for name, result in results.items():
+            self.console.print(report.evaluation_table(result, f"{folder.path.name}, {name}"))
+        self.console.print(report.summary_table(solved, env.id))
         self._say_where()
+        self._say(story.after)
+
+    def _save_page(
+        self,
+        story: Story,
+        evaluator: Evaluator,
+        played: Mapping[str, Mapping[str, Evaluation]],
+        results: Mapping[str, Sequence[Score]],
+    ) -> None:
+        """Writes the page, with episodes of the first seed."""
+        if not self.folder.curves.exists():
+            return
+        report_page.save(
+            self.folder.page,
+            title=self.folder.path.name,
+            sentences=[*story.before, *story.after],
+            settings={"preset": self.run.preset, **self.run.config.to_dict()},
+            scores=results,
+            curves=self.folder.curves,
+            evaluator=evaluator,
+            played=next(iter(played.values())),
+        )
 
     def summarize(self) -> None:
         """Writes the summary and the learning curves."""
@@ -230,26 +298,53 @@ class Session:
             if self._checkpoints is None or not self._checkpoints.iterations:
                 return None
             state, record = self._checkpoints.restore(template)
-            return to_arrays(state), record
+            rows = read_metrics(self.folder.metrics)
+            progress = Progress.resumed(record, self.run, rows)
+            progress.check(self.run, np.asarray(state.iteration))
+            return to_arrays(state), progress
 
         found = processes.from_first(stored)
         if found is not None:
-            return from_arrays(found[0], template), Progress.from_dict(found[1])
+            return from_arrays(found[0], template), found[1]
         return init(keys), Progress(0, 0.0, 0.0, (None,) * self.run.seeds)
 
     def _compile(self) -> Any:
         started = time.perf_counter()
+        count = num_parameters(self._state.params) // self.run.seeds
+        iteration = self._progress.iteration
+        begin = f"from iteration {iteration}" if iteration else "from the start"
+        self._say([f"{count:,} parameters, {begin}. Compiling one iteration of training ..."])
         active = np.ones(self.run.seeds, bool)
         per_device = make_advance(self._train, self._placement.local_seeds(self.run.seeds))
         advance = jax.jit(self._placement.shard(per_device), donate_argnums=0)
-        with self._console.status("Compiling ..."):
-            compiled = advance.lower(self._state, active).compile()
+        compiled = advance.lower(self._state, active).compile()
         seconds = time.perf_counter() - started
         self._progress = self._progress._replace(
             compile_seconds=self._progress.compile_seconds + seconds
         )
-        self._console.print(f"Compiled in {seconds:.1f} s.")
+        self.console.print(f"Compiled in {seconds:.1f} s.")
         return compiled
+
+    def _prepare_results(self) -> None:
+        """Compiles in the background what `finish` needs, unless there are several devices."""
+        if self._placement.mesh is not None:
+            return
+        params = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._state.params
+        )
+
+        def compiled() -> Evaluator:
+            evaluator = self._make_evaluator()
+            evaluator.compile(params)
+            return evaluator
+
+        worker = futures.ThreadPoolExecutor(1)
+        self._results = worker.submit(compiled)
+        worker.shutdown(wait=False)
+
+    def _make_evaluator(self) -> Evaluator:
+        config = self.run.config
+        return Evaluator.of_sets(config, ALL_SETS, config.eval_episodes, self._placement)
 
     def _iterate(self, advance: Advance) -> list[Row]:
         config, progress = self.run.config, self._progress
@@ -329,17 +424,19 @@ class Session:
         }
 
     def _introduce(self) -> None:
-        run, iteration = self.run, self._progress.iteration
-        count = num_parameters(self._state.params) // run.seeds
+        run = self.run
         seeds = ", ".join(map(str, run.seed_range))
-        begin = f"from iteration {iteration}" if iteration else "from the start"
-        self._console.print(
-            f"{self.folder.path}: preset {run.preset}, {tt.task_set(run.config.env_id).id}, "
-            f"curiosity {run.config.curiosity}, seed {seeds}, {count:,} parameters, {begin}, "
-            f"on {self._placement}",
-            soft_wrap=True,
-            highlight=False,
+        self._say(
+            [
+                f"{self.folder.path}: preset {run.preset}, {tt.task_set(run.config.env_id).id}, "
+                f"curiosity {run.config.curiosity}, seed {seeds}, on {self._placement}",
+                "Setting up the network ...",
+            ]
         )
+
+    def _say(self, lines: Sequence[str]) -> None:
+        for line in lines:
+            self.console.print(line, soft_wrap=True, highlight=False)
 
     def _say_where(self) -> None:
         folder = self.folder
@@ -350,11 +447,9 @@ class Session:
             "learning curves": folder.curves,
             "evaluation": folder.evaluation,
             "summary": folder.summary,
-            "solved episode": folder.animation,
+            "report": folder.page,
         }
-        for name, path in files.items():
-            where = str(path) if path.exists() else "none: no episode is solved"
-            self._console.print(f"{name:>15}: {where}", soft_wrap=True, highlight=False)
+        self._say([f"{name:>15}: {path}" for name, path in files.items()])
 
 
 def make_advance(train: Train, num_seeds: int) -> Advance:
@@ -365,7 +460,7 @@ def make_advance(train: Train, num_seeds: int) -> Advance:
     """
     config = train.config
     tasks = evaluation_tasks(
-        config.env_id, config.eval_episodes, config.num_features, config.max_steps
+        config.env_id, config.eval_episodes, config.num_features, config.max_steps, "validation"
     )
 
     def advance(state: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -394,9 +489,12 @@ def make_advance(train: Train, num_seeds: int) -> Advance:
 def _first_solved(
     run: Run, solved: Sequence[FirstSolved | None], rows: Sequence[Row]
 ) -> tuple[FirstSolved | None, ...]:
-    """Adds the seeds that these rows show to be solved for the first time."""
+    """Adds the seeds that these rows, in order of time, show to be solved for the first time."""
     share = run.config.stop_when_solved or 1.0
-    found = {row["seed"]: row for row in rows if row["evaluation"] >= share}
+    found: dict[int, Row] = {}
+    for row in rows:
+        if row["evaluation"] >= share:
+            found.setdefault(int(row["seed"]), row)
     return tuple(
         FirstSolved.of(found[seed]) if first is None and seed in found else first
         for seed, first in zip(run.seed_range, solved, strict=True)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from agents import pretrained
-from agents.evaluate import Evaluation, Evaluator
-from agents.networks.agent import Policy
+from agents.acting.evaluation import Evaluation, Evaluator
+from agents.acting.policy import Policy
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import MetricsLog, Row
 from trap_tube_jax.state import State
@@ -72,7 +72,7 @@ class Tracker:
         if self._log is None:
             raise ValueError("call resume before evaluate")
         played = self._evaluator(policy.params)
-        self._log.append([{"seed": seed, "iteration": policy.iteration, **_steps(played)}])
+        self._log.append([{"seed": seed, "iteration": policy.iteration, **_columns(played)}])
         shares = {name: float(np.mean(outcome.solved)) for name, outcome in played.items()}
         overall = float(np.mean([shares[name] for name in self._ranked]))
         if overall > self._best[seed]:
@@ -90,10 +90,18 @@ def outcome(row: Row) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return {name: (values > 0, values) for name, values in counts.items()}
 
 
-def _steps(played: Mapping[str, Evaluation]) -> dict[str, int]:
+def steps_taken(played: Mapping[str, Evaluation]) -> dict[str, np.ndarray]:
+    """By set, the steps i32[B] taken in every task, 0 where it is not solved."""
+    return {
+        name: np.where(outcome.solved, outcome.length, 0).astype(np.int32)
+        for name, outcome in played.items()
+    }
+
+
+def _columns(played: Mapping[str, Evaluation]) -> dict[str, int]:
     """A column for each task, in the order of their names."""
     return {
-        f"{name}{SEPARATOR}{index:05d}": int(steps)
-        for name, outcome in played.items()
-        for index, steps in enumerate(np.where(outcome.solved, outcome.length, 0))
+        f"{name}{SEPARATOR}{index:05d}": int(count)
+        for name, steps in steps_taken(played).items()
+        for index, count in enumerate(steps)
     }

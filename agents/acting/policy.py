@@ -1,0 +1,87 @@
+"""A trained policy: pure functions from observations to actions."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from agents.config import Config
+from agents.networks.agent import Agent, Params
+from trap_tube_jax.objects import BOARD_SIZE
+
+
+class Carry(NamedTuple):
+    """What a policy remembers from one step of B episodes to the next.
+
+    Attributes:
+      embedding: f32[B, hidden], the state of the GRU.
+      action_tm1: i32[B, 2], the previous (grasp, move); zeros before the first step.
+    """
+
+    embedding: jax.Array
+    action_tm1: jax.Array
+
+
+class Policy(NamedTuple):
+    """A trained network that acts from observations alone.
+
+    Start every episode with `initial`. The previous reward, which the network also takes, is
+    0 until an episode ends, so nothing but observations is needed.
+
+    Attributes:
+      name: what to call it in tables.
+      config: the settings that it was trained with.
+      params: its parameters.
+      iteration: iterations trained.
+      greedy: take the most probable actions; false draws them.
+    """
+
+    name: str
+    config: Config
+    params: Params
+    iteration: int
+    greedy: bool = True
+
+    def initial(self, batch: int) -> Carry:
+        """The carry before the first step of `batch` episodes."""
+        embedding = _agent(self.config).initial_state(self.params, batch)
+        return Carry(embedding, jnp.zeros((batch, 2), jnp.int32))
+
+    def act(
+        self, observation: jax.Array, carry: Carry, key: jax.Array | None = None
+    ) -> tuple[jax.Array, Carry]:
+        """One action of each of B episodes. Pure; jit it.
+
+        Args:
+          observation: u8[B, 12, 12, N], batched because the encoder is.
+          carry: `initial(B)` at an episode's first step, then what the last call returned.
+          key: PRNG key of the draws; not used, and may be absent, where `greedy`.
+
+        Returns:
+          The actions i32[B, 2], (grasp, move) each, and the next carry.
+
+        Raises:
+          ValueError: the shape of `observation` is wrong, or a key is missing.
+        """
+        wanted = (len(carry.action_tm1), BOARD_SIZE, BOARD_SIZE, self.config.num_features)
+        if observation.shape != wanted:
+            raise ValueError(f"observation must be of shape {wanted}, got {observation.shape}")
+        if key is None and not self.greedy:
+            raise ValueError("a policy that draws its actions needs a key; greedy ones do not")
+        agent = _agent(self.config)
+        features = agent.encode(self.params, observation)
+        reward_tm1 = jnp.zeros(len(observation))
+        inputs = agent.core_inputs(self.params, features, carry.action_tm1, reward_tm1)
+        embedding = agent.advance(self.params, carry.embedding, inputs)
+        outputs = agent.act(self.params, embedding)
+        if key is None or self.greedy:
+            action = outputs.actions.mode()
+        else:
+            action = outputs.actions.sample(key)
+        return action, Carry(embedding, action)
+
+
+@functools.cache
+def _agent(config: Config) -> Agent:
+    return Agent(config)

@@ -1,0 +1,220 @@
+"""What the runs of an experiment came to: the record, and its tables and figures."""
+
+import dataclasses
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress as Bar
+
+import trap_tube_jax as tt
+from agents import pretrained
+from agents.acting.evaluation import Evaluator, layout_numbers, shortest_lengths
+from agents.experiments import figures, records, tables
+from agents.experiments.protocol import EXPERIMENTS, Protocol, algorithms
+from agents.experiments.records import Record, Steps
+from agents.experiments.training import AlgorithmRun, draw_tasks, find_runs
+from agents.networks.agent import Params
+from agents.runs.folder import read_json, write_json
+from agents.runs.metrics import read_metrics
+from agents.runs.tracking import outcome, steps_taken
+from trap_tube_jax.state import State
+
+SHORTEST_FILE = "shortest.json"
+NUM_COMPARED = 128  # tasks per set whose shortest plans are searched for
+SOLVED_AT_ONCE = 8  # tasks whose shortest plans are found between two saves
+
+Play = Callable[[Params], Steps]
+
+
+def make_record(
+    root: Path, experiment: str, protocol: Protocol, console: Console, *, optimality: bool
+) -> Record:
+    """The record of all runs in an experiment's folder.
+
+    Args:
+      root: the folder.
+      experiment: which of `EXPERIMENTS`.
+      protocol: how it is run.
+      console: where to show what is being done.
+      optimality: search for shortest plans, to compare solved episodes with.
+
+    Raises:
+      ValueError: there is no run yet, or one cannot be read.
+    """
+    runs = [entry for entry in find_runs(root) if entry.rows]
+    if not runs:
+        raise ValueError(f"{root} holds no run with a first iteration yet")
+    tasks = draw_tasks(runs[0].run.config, protocol.num_reported, "test")
+    shortest = find_shortest(root / SHORTEST_FILE, tasks, console) if optimality else {}
+    names = [name for name in algorithms() if any(entry.algorithm == name for entry in runs)]
+    machines: list[Any] = []
+    reached = []
+    with console.status("Playing the reported tasks ..."):
+        for name in names:
+            entries = [entry for entry in runs if entry.algorithm == name]
+            reached.append(_algorithm(name, entries, protocol, tasks, machines))
+    whole = _whole_protocol(protocol, runs)
+    return {
+        "schema": records.SCHEMA,
+        "experiment": experiment,
+        "command": whole.command(experiment, names),
+        "protocol": dataclasses.asdict(whole),
+        "ranked": list(EXPERIMENTS[experiment].ranked),
+        "machines": machines,
+        "sets": {name: _about(name, states, shortest) for name, states in tasks.items()},
+        "algorithms": reached,
+    }
+
+
+def report(root: Path, record: Record, console: Console) -> None:
+    """Writes the record, its tables and its figure into the folder, and shows the tables."""
+    files = {
+        "summary": root / "summary.json",
+        "tables": root / "tables.md",
+        "figure": root / "curves.png",
+    }
+    records.write_record(files["summary"], record)
+    files["tables"].write_text(f"# {tables.title(record)}\n\n{tables.markdown(record)}\n")
+    figures.save(record, files["figure"])
+    for table in tables.tables(record):
+        console.print(table.to_rich())
+    for line in tables.notes(record):
+        console.print(line, soft_wrap=True, highlight=False)
+    for name, path in files.items():
+        console.print(f"{name:>10}: {path}", soft_wrap=True, highlight=False)
+
+
+def find_shortest(path: Path, tasks: Mapping[str, State], console: Console) -> dict[str, list[int]]:
+    """The lengths of the shortest plans of every set's first tasks, kept in a file as found.
+
+    Raises:
+      ValueError: the file cannot be read.
+    """
+    found: dict[str, list[int]] = read_json(path) or {}
+    wanted = {name: min(len(states.time), NUM_COMPARED) for name, states in tasks.items()}
+    missing = sum(count - len(found.get(name, ())) for name, count in wanted.items())
+    if missing <= 0:
+        return found
+    with Bar(console=console, transient=True) as bar:
+        task = bar.add_task("Shortest plans", total=missing)
+        for name, states in tasks.items():
+            lengths = found.setdefault(name, [])
+            while len(lengths) < wanted[name]:
+                part = slice(len(lengths), min(len(lengths) + SOLVED_AT_ONCE, wanted[name]))
+                block = shortest_lengths(jax.tree.map(operator.itemgetter(part), states)).tolist()
+                lengths += block
+                write_json(path, found)
+                bar.advance(task, len(block))
+    return found
+
+
+def equal_to_base(tasks: State) -> float:
+    """The percentage of tasks that equal the base task."""
+    base = tt.base_state(tasks.palette.shape[-1])
+    same = jax.tree.map(
+        lambda x, y: np.all(np.asarray(x) == np.asarray(y), axis=tuple(range(1, x.ndim))),
+        tasks,
+        base,
+    )
+    return 100 * float(np.mean(np.all(jax.tree.leaves(same), axis=0)))
+
+
+def best_steps(entry: AlgorithmRun, seed: int, protocol: Protocol, play: Play) -> Steps | None:
+    """The steps that a seed's best policy takes in the reported tasks, 0 where unsolved.
+
+    What was played is kept in the run's folder.
+
+    Args:
+      entry: the seed's run.
+      seed: which one.
+      protocol: how the experiment is run.
+      play: from parameters to steps, by set.
+
+    Returns:
+      By set i32[B]; None if the seed has not been evaluated yet.
+
+    Raises:
+      ValueError: what the run wrote does not fit together.
+    """
+    best = records.best_row(records.of_seed(entry.rows, seed))
+    if best is None:
+        return None
+    iteration = int(best["iteration"])
+    if protocol.selection == "paper":
+        return _selected_steps(entry, seed, iteration)
+    path, key = entry.folder.tested(seed), [iteration, protocol.reported]
+    known = read_json(path)
+    if known is None or known["iteration_and_tasks"] != key:
+        policy = pretrained.load(entry.folder.best(seed))
+        if policy.iteration != iteration:
+            where = entry.folder.best(seed)
+            raise ValueError(f"{where} is of iteration {policy.iteration}, not of {iteration}")
+        steps = {name: list(map(int, taken)) for name, taken in play(policy.params).items()}
+        known = {"iteration_and_tasks": key, "steps": steps}
+        write_json(path, known)
+    return known["steps"]
+
+
+def _selected_steps(entry: AlgorithmRun, seed: int, iteration: int) -> Steps:
+    """The steps in the tasks by which the evaluation of an iteration was chosen."""
+    rows = records.of_seed(read_metrics(entry.folder.outcomes), seed)
+    played = [row for row in rows if row["iteration"] == iteration]
+    if not played:
+        where = entry.folder.outcomes
+        raise ValueError(f"{where} lacks seed {seed}, iteration {iteration}, which metrics have")
+    return {name: steps.tolist() for name, (_, steps) in outcome(played[0]).items()}
+
+
+def _algorithm(
+    name: str,
+    entries: Sequence[AlgorithmRun],
+    protocol: Protocol,
+    tasks: Mapping[str, State],
+    machines: list[Any],
+) -> dict[str, Any]:
+    config = entries[0].run.config
+    evaluator = Evaluator(config, tasks)
+
+    def play(params: Params) -> Steps:
+        return steps_taken(evaluator(params))
+
+    seeds = [
+        records.seed_record(
+            entry,
+            seed,
+            machines=machines,
+            evaluate_every=protocol.evaluate_every,
+            steps=best_steps(entry, seed, protocol, play),
+        )
+        for entry in entries
+        for seed in entry.run.seed_range
+        if records.of_seed(entry.rows, seed)
+    ]
+    return {"name": name, "config": config.to_dict(), "runs": seeds}
+
+
+def _about(name: str, tasks: State, shortest: Mapping[str, Sequence[int]]) -> dict[str, Any]:
+    layout = layout_numbers(name, tasks)
+    lengths = shortest.get(name)
+    return {
+        "equal_to_base": equal_to_base(tasks),
+        "layout": None if layout is None else layout.tolist(),
+        "shortest": None if lengths is None else list(lengths[: len(tasks.time)]),
+    }
+
+
+def _whole_protocol(protocol: Protocol, runs: Sequence[AlgorithmRun]) -> Protocol:
+    """The protocol that comes to all these runs at once."""
+    seeds = [seed for entry in runs for seed in entry.run.seed_range]
+    return dataclasses.replace(
+        protocol,
+        algorithms=tuple(dict.fromkeys(entry.algorithm for entry in runs)),
+        iterations=max(entry.run.config.iterations for entry in runs),
+        seed=min(seeds),
+        seeds=max(seeds) - min(seeds) + 1,
+    )

@@ -1,0 +1,232 @@
+"""Training of an experiment: its folder, the runs in it, and what is still missing."""
+
+import dataclasses
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+from agents.acting.evaluation import ALL_SETS, Purpose, evaluation_tasks
+from agents.config import Config
+from agents.experiments.protocol import EXPERIMENTS, FIXED, Experiment, Protocol
+from agents.parallel.sharding import Placement
+from agents.runs.folder import CONFIG_FILE, Run, RunFolder, read_json, write_json
+from agents.runs.machine import machine
+from agents.runs.metrics import Row, read_metrics
+from agents.runs.session import Session, StopSignals
+from agents.runs.tracking import Tracker
+from trap_tube_jax.state import State
+
+PROTOCOL_FILE = "experiment.json"
+FOLDER_NAME = re.compile(r"(?P<algorithm>.+)-seed\d+(to\d+)?")
+
+
+class AlgorithmRun(NamedTuple):
+    """A run of an experiment, as far as it got.
+
+    Attributes:
+      algorithm: its name.
+      folder: its files.
+      run: what it trains.
+      rows: its rows of metrics.
+    """
+
+    algorithm: str
+    folder: RunFolder
+    run: Run
+    rows: Sequence[Row]
+
+
+class Resources(NamedTuple):
+    """How runs are trained, which changes nothing of what they come to.
+
+    Attributes:
+      side_by_side: train all missing seeds of an algorithm at once.
+      devices: how many share a run's episodes and seeds, or `all`; one if absent.
+      checkpoint_every: iterations from one checkpoint to the next.
+      commit: the commit to note where git does not tell it.
+    """
+
+    side_by_side: bool = False
+    devices: int | str | None = None
+    checkpoint_every: int = 10
+    commit: str | None = None
+
+
+def open_experiment(
+    root: Path, experiment: str, defaults: Protocol, given: Mapping[str, Any], *, create: bool
+) -> Protocol:
+    """The protocol of the experiment in a folder.
+
+    Args:
+      root: the folder.
+      experiment: which of `EXPERIMENTS`.
+      defaults: what holds where the folder holds no experiment yet.
+      given: values that go before the defaults and before what the folder says.
+      create: make or update the folder; otherwise it must hold an experiment.
+
+    Raises:
+      ValueError: a value is not allowed, or contradicts what is in the folder.
+    """
+    stored = read_json(root / PROTOCOL_FILE)
+    if stored is None and not create:
+        raise ValueError(f"{root} holds no experiment")
+    if stored is not None:
+        if stored.pop("experiment", None) != experiment:
+            raise ValueError(f"{root} holds another experiment than {experiment}")
+        defaults = Protocol.from_dict({**stored, "seed": defaults.seed})
+    protocol = dataclasses.replace(defaults, **given)
+    for field in FIXED if stored is not None else ():
+        before, now = getattr(defaults, field), getattr(protocol, field)
+        if before != now:
+            raise ValueError(f"{root} has {field}={before}, not {now}; use another --name")
+    for algorithm in protocol.algorithms:
+        Run(protocol.config(EXPERIMENTS[experiment], algorithm), protocol.preset)
+    if create:
+        root.mkdir(parents=True, exist_ok=True)
+        values = {"experiment": experiment, **dataclasses.asdict(protocol)}
+        write_json(root / PROTOCOL_FILE, values)
+    return protocol
+
+
+def train_all(
+    root: Path,
+    experiment: Experiment,
+    protocol: Protocol,
+    resources: Resources,
+    console: Console,
+    stop: StopSignals,
+) -> None:
+    """Trains what is missing, seed after seed, the algorithms in turn.
+
+    Raises:
+      ValueError: a run in the folder has other settings.
+      Stopped: on request; everything is saved.
+    """
+    planned = plan(root, protocol, experiment, resources.side_by_side)
+    todo = [(folder, run) for folder, run in planned if not is_done(folder, run)]
+    if not todo:
+        return
+    tasks = draw_tasks(todo[0][1].config, protocol.tasks, protocol.selects_on)
+    for number, (folder, run) in enumerate(todo, 1):
+        console.rule(f"run {number} of {len(todo)}: {folder.path.name}")
+        note_machine(folder, resources.commit)
+        tracker = Tracker(
+            folder, run, tasks, ranked=experiment.ranked, every=protocol.evaluate_every
+        )
+        session = Session(
+            folder,
+            run,
+            console,
+            checkpoint_every=resources.checkpoint_every,
+            keep=2,
+            tracker=tracker,
+            placement=Placement.of(resources.devices, run.config, run.seeds),
+        )
+        write_json(folder.config, run.to_dict())  # more iterations, once it has been taken up
+        try:
+            session.train(stop)
+            session.summarize()
+        finally:
+            session.close()
+
+
+def plan(
+    root: Path, protocol: Protocol, experiment: Experiment, side_by_side: bool
+) -> Iterable[tuple[RunFolder, Run]]:
+    """The runs that hold the protocol's seeds, made where they are missing, by seed.
+
+    Raises:
+      ValueError: a run has other settings than the protocol.
+    """
+    wanted = range(protocol.seed, protocol.seed + protocol.seeds)
+    planned: list[tuple[RunFolder, Run]] = []
+    there = find_runs(root)
+    for algorithm in protocol.algorithms:
+        config = protocol.config(experiment, algorithm)
+        seen: set[int] = set()
+        for entry in there:
+            if entry.algorithm == algorithm and set(entry.run.seed_range) & set(wanted):
+                seen |= set(entry.run.seed_range)
+                planned.append((entry.folder, _continued(entry, config)))
+        missing = [range(seed, seed + 1) for seed in wanted if seed not in seen]
+        for seeds in _joined(missing) if side_by_side else missing:
+            run = Run(config, protocol.preset, seeds[0], len(seeds))
+            planned.append((RunFolder(root / folder_name(algorithm, seeds)), run))
+    planned.sort(key=lambda entry: entry[1].seed)  # stable: algorithms in turn
+    for folder, run in planned:
+        if not folder.config.is_file():
+            RunFolder.create(folder.path, run)
+    return planned
+
+
+def is_done(folder: RunFolder, run: Run) -> bool:
+    """Whether a run has been trained and summarised in full."""
+    summary = read_json(folder.summary)
+    if summary is None:
+        return False
+    solved = all(seed["first_solved"] for seed in summary["seeds"])
+    return summary["iterations"] >= run.config.iterations or (
+        run.config.stop_when_solved > 0 and solved
+    )
+
+
+def draw_tasks(config: Config, num_tasks: int, purpose: Purpose) -> dict[str, State]:
+    """The fixed evaluation tasks of all sets."""
+    return {
+        name: evaluation_tasks(name, num_tasks, config.num_features, config.max_steps, purpose)
+        for name in ALL_SETS
+    }
+
+
+def note_machine(folder: RunFolder, commit: str | None) -> None:
+    """Adds this machine to those that a run ran on."""
+    known = read_json(folder.machines) or []
+    here = machine()
+    here["commit"] = here["commit"] or commit
+    if here not in known:
+        write_json(folder.machines, [*known, here])
+
+
+def folder_name(algorithm: str, seeds: range) -> str:
+    """The name of the folder of a run within that of its experiment."""
+    last = f"to{seeds[-1]}" if len(seeds) > 1 else ""
+    return f"{algorithm}-seed{seeds[0]}{last}"
+
+
+def find_runs(root: Path) -> list[AlgorithmRun]:
+    """All runs in the folder of an experiment, by algorithm and seed.
+
+    Raises:
+      ValueError: the settings of a run cannot be read.
+    """
+    found = []
+    for path in root.glob(f"*/{CONFIG_FILE}"):
+        match = FOLDER_NAME.fullmatch(path.parent.name)
+        if match:
+            folder, run = RunFolder.open(path.parent)
+            rows = read_metrics(folder.metrics)
+            found.append(AlgorithmRun(match["algorithm"], folder, run, rows))
+    return sorted(found, key=lambda entry: (entry.algorithm, entry.run.seed))
+
+
+def _continued(entry: AlgorithmRun, config: Config) -> Run:
+    run = dataclasses.replace(entry.run, config=config)
+    try:
+        run.check_continues(entry.run)
+    except ValueError as error:
+        raise ValueError(f"{entry.folder.path}: {error}; use another --name") from error
+    return run
+
+
+def _joined(ranges: Sequence[range]) -> list[range]:
+    """The ranges with adjacent ones put together."""
+    joined: list[range] = []
+    for seeds in ranges:
+        if joined and joined[-1].stop == seeds.start:
+            joined[-1] = range(joined[-1].start, seeds.stop)
+        else:
+            joined.append(seeds)
+    return joined

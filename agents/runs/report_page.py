@@ -1,0 +1,222 @@
+"""A run on one page of HTML that needs no network: settings, curves, scores, episodes to step."""
+
+import base64
+import html
+import io
+import json
+import string
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from agents.acting.evaluation import Evaluation, Evaluator, label
+from agents.acting.scores import Score
+from agents.runs.report import FEW_LAYOUTS, NOTHING
+from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
+from trap_tube_jax.rendering import episode_frames
+
+CELL_SIZE = 16  # pixels
+MAX_PICTURES = 600  # of all episodes, of at most two kilobytes each
+
+PAGE = string.Template("""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>$title</title>
+<style>
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem }
+table { border-collapse: collapse; margin: 1rem 0 }
+th, td { padding: .2rem .7rem; text-align: right; border-bottom: 1px solid #ddd }
+th:first-child, td:first-child { text-align: left }
+img { max-width: 100% }
+#board { image-rendering: pixelated; width: 24rem }
+</style>
+</head>
+<body>
+<h1>$title</h1>
+$sentences
+<h2>Greedy evaluation</h2>
+$scores
+<p>$few_layouts</p>
+<h2>Episodes</h2>
+<p><select id="episode" aria-label="episode"></select>
+<button id="back">Back</button> <button id="on">On</button>
+<input id="step" type="range" min="0" value="0" aria-label="step"></p>
+<p id="caption"></p>
+<img id="board" alt="the board">
+<h2>Learning curves</h2>
+<p><img src="data:image/png;base64,$curves" alt="learning curves"></p>
+<h2>Settings</h2>
+$settings
+<script type="application/json" id="data">$data</script>
+<script>
+const data = JSON.parse(document.getElementById("data").textContent);
+const [chosen, step, board, caption] =
+  ["episode", "step", "board", "caption"].map(id => document.getElementById(id));
+data.episodes.forEach((each, index) => chosen.add(new Option(each.title, index)));
+function show() {
+  const each = data.episodes[chosen.value];
+  if (!each) { caption.textContent = "There are none."; return; }
+  const now = Number(step.value), last = each.frames.length - 1;
+  board.src = "data:image/png;base64," + data.pictures[each.frames[now]];
+  const next = now < last
+    ? "; next: " + each.actions[now] + "; value " + each.values[now].toFixed(3)
+    : each.solved ? "; solved" : "; not solved";
+  caption.textContent = "step " + now + " of " + last + next;
+}
+function choose() {
+  const each = data.episodes[chosen.value];
+  step.max = each ? each.frames.length - 1 : 0;
+  step.value = 0;
+  show();
+}
+function move(by) { step.value = Number(step.value) + by; show(); }
+chosen.onchange = choose;
+step.oninput = show;
+document.getElementById("back").onclick = () => move(-1);
+document.getElementById("on").onclick = () => move(1);
+choose();
+</script>
+</body>
+</html>
+""")
+
+
+class Episode(NamedTuple):
+    """An episode of greedy play.
+
+    Attributes:
+      title: what to call it.
+      solved: whether it was.
+      frames: before each step and after the last, the number of a picture.
+      actions: of each step, in words.
+      values: f32 of each step, what the network expects.
+    """
+
+    title: str
+    solved: bool
+    frames: list[int]
+    actions: list[str]
+    values: list[float]
+
+
+def save(
+    path: Path,
+    *,
+    title: str,
+    sentences: Sequence[str],
+    settings: Mapping[str, Any],
+    scores: Mapping[str, Sequence[Score]],
+    curves: Path,
+    evaluator: Evaluator,
+    played: Mapping[str, Evaluation],
+) -> None:
+    """Writes the page.
+
+    Args:
+      path: the file to write.
+      title: the head of the page.
+      sentences: what the run shows.
+      settings: by name.
+      scores: the scores of every policy, by its name.
+      curves: the PNG of the learning curves.
+      evaluator: what played.
+      played: what it returned of one policy, whose episodes are shown.
+    """
+    episodes, pictures = _episodes(evaluator, played)
+    data = json.dumps({"episodes": [each._asdict() for each in episodes], "pictures": pictures})
+    page = PAGE.substitute(
+        title=html.escape(title),
+        sentences="\n".join(f"<p>{html.escape(line)}</p>" for line in sentences if line),
+        scores="\n".join(_score_table(name, each) for name, each in scores.items()),
+        few_layouts=html.escape(FEW_LAYOUTS),
+        curves=base64.b64encode(curves.read_bytes()).decode(),
+        settings=_table(("setting", "value"), settings.items()),
+        data=data.replace("</", "<\\/"),
+    )
+    path.write_text(page)
+
+
+def _score_table(name: str, scores: Sequence[Score]) -> str:
+    heads = (name, "tasks", "solved %", "layouts solved", "95 % interval", "steps")
+    rows = [
+        (
+            score.label,
+            score.tasks,
+            f"{score.percent:.1f}",
+            score.layouts or NOTHING,
+            NOTHING if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval),
+            NOTHING if score.mean_steps is None else f"{score.mean_steps:.1f}",
+        )
+        for score in scores
+    ]
+    return _table(heads, rows)
+
+
+def _table(heads: Sequence[Any], rows: Iterable[Sequence[Any]]) -> str:
+    def line(cells: Sequence[Any], tag: str) -> str:
+        inner = "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for cell in cells)
+        return f"<tr>{inner}</tr>"
+
+    return "\n".join(["<table>", line(heads, "th"), *(line(row, "td") for row in rows), "</table>"])
+
+
+def _episodes(
+    evaluator: Evaluator, played: Mapping[str, Evaluation]
+) -> tuple[list[Episode], list[str]]:
+    """The first solved and the first unsolved episode of each set, and their pictures as PNG.
+
+    Sets are left out once there are too many pictures.
+    """
+    episodes: list[Episode] = []
+    pictures: dict[bytes, int] = {}
+    for name, outcome in played.items():
+        for solved in (True, False):
+            found = np.flatnonzero(np.asarray(outcome.solved) == solved)
+            if not len(found) or len(pictures) > MAX_PICTURES:
+                continue
+            index = int(found[0])
+            how = "solved" if solved else "not solved"
+            title = f"{label(name)}, task {index}: {how}"
+            episodes.append(_episode(title, evaluator, name, outcome, index, pictures))
+    return episodes, [base64.b64encode(_png(picture)).decode() for picture in pictures]
+
+
+def _episode(
+    title: str,
+    evaluator: Evaluator,
+    name: str,
+    outcome: Evaluation,
+    index: int,
+    pictures: dict[bytes, int],
+) -> Episode:
+    """One episode; its pictures are added to those of the page."""
+    state = jax.tree.map(lambda x: x[index], evaluator.tasks[name])
+    length = int(outcome.length[index])
+    actions = np.array(outcome.action[index])
+    # No direction, which changes nothing: all episodes are as long, and compile as one.
+    actions[length:] = -1
+    frames = episode_frames(state, actions, CELL_SIZE)[: length + 1]
+    return Episode(
+        title=title,
+        solved=bool(outcome.solved[index]),
+        frames=[pictures.setdefault(frame.tobytes(), len(pictures)) for frame in frames],
+        actions=[
+            f"grasp {DIRECTION_NAMES[grasp]}, move {DIRECTION_NAMES[move]}"
+            for grasp, move in actions[:length].tolist()
+        ],
+        values=[round(float(value), 4) for value in outcome.value[index, :length]],
+    )
+
+
+def _png(pixels: bytes) -> bytes:
+    from PIL import Image  # noqa: PLC0415  slow to import
+
+    side = BOARD_SIZE * CELL_SIZE
+    file = io.BytesIO()
+    Image.frombytes("RGB", (side, side), pixels).quantize(32).save(file, "png")
+    return file.getvalue()
