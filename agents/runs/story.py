@@ -99,8 +99,5 @@ def next_command(folder: RunFolder, run: Run, percent: float) -> str:
             f"--iterations {2 * config.iterations}"
         )
     if tt.task_set(config.env_id).short != "pstsy":
-        return (
-            "train on all transfers at once, python -m agents.train --preset best, or see the "
-            "agent that comes with the project, python -m agents.evaluate --pretrained pstsy"
-        )
+        return "train on all transfers at once with python -m agents.train --preset best"
     return f"compare with shortest plans, python -m agents.evaluate {folder.path} --optimality"
