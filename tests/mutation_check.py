@@ -241,16 +241,16 @@ FAULTS = (
     Fault(
         "transfers",
         "points crowd in the cube's corners",
-        "jax.random.normal(key, (5, num_features))",
-        "jax.random.uniform(key, (5, num_features), minval=-1)",
+        "jax.random.normal(loop_free(key), (5, num_features))",
+        "jax.random.uniform(loop_free(key), (5, num_features), minval=-1)",
         STRUCTURAL,
     ),
     Fault("transfers", "food changes its color", "(AGENT, FOOD)", "(AGENT,)", STRUCTURAL),
     Fault(
         "transfers",
         "the tool is never drawn",
-        "randint(key, (), 0, len(SYMBOLIC_OBJECTS))",
-        "randint(key, (), 1, len(SYMBOLIC_OBJECTS))",
+        "randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS))",
+        "randint(loop_free(key), (), 1, len(SYMBOLIC_OBJECTS))",
         SYMBOLIC,
     ),
     Fault(
@@ -277,7 +277,9 @@ FAULTS = (
         "is_object & (cells >= first)",
         SYMBOLIC,
     ),
-    Fault("transfers", "transfers share a key", "jax.random.fold_in(key, index)", "key", COMPOSE),
+    Fault(
+        "transfers", "transfers share a key", "fold_in(key, index), state)", "key, state)", COMPOSE
+    ),
     Fault(
         "transfers",
         "the last transfer comes first",

@@ -7,7 +7,7 @@ from refusal import assert_refused
 import trap_tube_jax as tt
 from trap_tube_jax import registry
 
-# Specification section 6.
+# environment.md, "Task sets".
 SPECIFIED = [
     ("TrapTube-v0", "base", "base", ()),
     ("PerceptualTrapTube-v0", "p", "{P}", (tt.perceptual,)),
@@ -31,7 +31,7 @@ def own_registry(monkeypatch):
     monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
 
 
-def test_the_papers_sets_are_those_of_the_specification():
+def test_the_papers_sets_are_those_of_the_page():
     sets = [(entry.id, entry.short, entry.label, entry.transfers) for entry in tt.PAPER_TASK_SETS]
     assert sets == SPECIFIED
     assert tt.registered_ids()[:8] == tuple(entry[0] for entry in SPECIFIED)

@@ -1,4 +1,4 @@
-"""The transfers against their exact distributions, enumerated from the specification."""
+"""The transfers against their exact distributions, enumerated from environment.md."""
 
 import functools
 from collections.abc import Callable
@@ -73,7 +73,7 @@ def drawn() -> Any:
 @pytest.fixture(scope="module")
 def layout(drawn) -> Layout:
     index = find_boards(drawn.board)
-    assert np.all(index >= 0), "a board that the specification does not allow"
+    assert np.all(index >= 0), "a board that environment.md does not allow"
     outline, variant = np.divmod(index, 8)
     vertical = (drawn.tool_extent[:, 0] > 1).astype(int)
     return Layout(outline, variant, vertical, flat(drawn.tool), flat(drawn.agent), flat(drawn.food))
@@ -265,7 +265,7 @@ def _assert_is_one_of(drawn: Any, outcomes: list[spec.Looks]) -> np.ndarray:
     corners = flat(np.array([outcome.tool for outcome in outcomes]))
     assert len(set(corners.tolist())) == len(outcomes)
     matches = flat(drawn.tool)[:, None] == corners
-    assert matches.any(axis=1).all(), "the tool is where the specification does not allow it"
+    assert matches.any(axis=1).all(), "the tool is where environment.md does not allow it"
     which = matches.argmax(axis=1)
     for name, got in zip(spec.Looks._fields, _looks(drawn), strict=True):
         expected = np.array([getattr(outcome, name) for outcome in outcomes])

@@ -1,6 +1,6 @@
 """The rules of one step: food, tool, agent, task, in that order.
 
-Source: specification section 3.
+Source: paper, section "Trap-Tube Environments"; environment.md, "One step".
 """
 
 import functools

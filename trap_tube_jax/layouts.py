@@ -1,10 +1,10 @@
 """Every layout of the perceptual transfer, enumerated once as tables.
 
-The transfer's support is small and finite, so it is written out in NumPy, cell by cell as
-the specification words it; a draw is then a few integers and as many look-ups. Counting
-out cells on masks within each draw is an order of magnitude slower under vmap on a CPU.
+The layouts are few, so they are written out in NumPy, cell by cell. A draw is then a few
+integers and as many look-ups. Counting out cells within each draw is an order of magnitude
+slower under vmap on a CPU.
 
-Source: specification section 5.
+Source: environment.md, "Perceptual".
 """
 
 import functools

@@ -1,6 +1,6 @@
 """The task sets by name: the paper's eight, and your own.
 
-Source: specification section 6.
+Source: paper, section "Experimental Setup"; environment.md, "Task sets".
 """
 
 import dataclasses

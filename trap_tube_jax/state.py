@@ -1,6 +1,6 @@
 """The state of one task, and how to build one from arrays or from a picture.
 
-Source: specification sections 1 and 4.
+Source: environment.md, "Board and objects" and "Base task".
 """
 
 from collections.abc import Sequence
@@ -170,7 +170,7 @@ class TimeStep(struct.PyTreeNode):
 
 
 def base_state(num_features: int = 3) -> State:
-    """The base task of specification section 4, in base colours of N features."""
+    """The base task (environment.md, "Base task") in base colours of N features."""
     return State.from_ascii(
         """
         ............

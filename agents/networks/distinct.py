@@ -25,11 +25,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.positions import (  # noqa: F401  (used by this name elsewhere)
+    NUM_CELLS,
+    NUM_POSITIONS,
+    cells_at,
+    position_id,
+)
 from trap_tube_jax.state import State
 
-NUM_CELLS = BOARD_SIZE * BOARD_SIZE
-NUM_POSITIONS = NUM_CELLS**3  # of agent, tool and food together
 ROW_SLOT_BITS = 16  # of a hash, in the table that `group_rows` looks up
 REMEMBERED_BYTES = 2**26  # by one `map_rows`; changes speed, not results
 
@@ -120,20 +123,6 @@ def layout_ids(state: State) -> jax.Array:
 def layout_hash(state: State) -> jax.Array:
     """A hash u32[B] of the boards, palettes and tool extents of B states."""
     return _hash_rows(_layout_content(state))
-
-
-def position_id(state: State) -> jax.Array:
-    """An id i32[] of where agent, tool and food are; with the layout it fixes the observation."""
-    cells = [state.agent, state.tool, state.food]
-    agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
-    return (agent * NUM_CELLS + tool) * NUM_CELLS + food
-
-
-def cells_at(position: jax.Array) -> jax.Array:
-    """u8[3, 2]: the cells of agent, tool and food with this id; inverse of `position_id`."""
-    agent_and_tool, food = jnp.divmod(position, NUM_CELLS)
-    cell = jnp.stack([*jnp.divmod(agent_and_tool, NUM_CELLS), food])
-    return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)
 
 
 def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
