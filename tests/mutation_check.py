@@ -282,6 +282,13 @@ FAULTS = (
     ),
     Fault(
         "transfers",
+        "own transfers get keys of a foreign type",
+        "transfer(fold_in(key, index), state)",
+        "transfer(loop_free(fold_in(key, index)), state)",
+        ("tests/test_environment.py", "-k", "mix_with_own"),
+    ),
+    Fault(
+        "transfers",
         "the last transfer comes first",
         "in enumerate(transfers):",
         "in enumerate(transfers[::-1]):",

@@ -66,6 +66,18 @@ def test_register_adds_a_set(own_registry):
     assert tt.make("Top-v0").transfers == (tt.structural, to_the_top)
 
 
+def test_register_holds_base_state_and_step_limit(own_registry):
+    base = tt.base_state(5).replace(agent=np.array((0, 0), np.int32))
+    entry = tt.register("Own-v0", (), short="own", base=base, max_steps=20)
+    assert (entry.base, entry.max_steps, entry.label) == (base, 20, "own")
+    env = tt.make("own")
+    assert (env.base, env.max_steps, env.num_features) == (base, 20, 5)
+    assert tt.make("own", num_features=5, max_steps=30).max_steps == 30
+    assert tt.make("own", base=tt.base_state()).num_features == 3
+    assert_refused(["num_features=3", "5 features"], tt.make, "own", num_features=3)
+    assert len({entry, *tt.PAPER_TASK_SETS}) == 9
+
+
 def test_register_takes_the_id_for_a_missing_short_name(own_registry):
     assert tt.register("Plain-v0", ()).short == "Plain-v0"
 
@@ -106,6 +118,21 @@ def test_make_refuses(options, words):
         ("Mine-v0", ("symbolic",), None, ["(key, state) -> state", "'symbolic'", "perceptual"]),
     ],
 )
-def test_register_refuses(own_registry, name, transfers, short, words):
+def test_register_refuses_a_name_or_transfer(own_registry, name, transfers, short, words):
     assert_refused(words, tt.register, name, transfers, short=short)
+    assert "Mine-v0" not in tt.registered_ids()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"base": "TrapTube-v0"}, ["trap_tube_jax.State", "str"]),
+        ({"base": tt.base_state().replace(terminated=np.True_)}, ["terminated", "not over"]),
+        ({"max_steps": 0}, ["max_steps", ">= 1", "0"]),
+        ({"max_steps": None}, ["max_steps", "integer >= 1", "None"]),
+    ],
+    ids=["base a name", "base solved", "no step", "no limit"],
+)
+def test_register_refuses_a_base_or_limit(own_registry, options, words):
+    assert_refused(words, tt.register, "Mine-v0", (), **options)
     assert "Mine-v0" not in tt.registered_ids()
