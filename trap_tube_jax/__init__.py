@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 
+from trap_tube_jax._version import __version__ as __version__
 from trap_tube_jax.environment import (
     ArraySpec,
     Environment,
@@ -29,8 +30,6 @@ from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 # Gymnasium's convention: importing a package registers its environments.
 with contextlib.suppress(ImportError):
     importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
-
-__version__ = "0.1.0"
 
 __all__ = [
     "PAPER_TASK_SETS",
