@@ -10,6 +10,7 @@ from trap_tube_jax.environment import (
     action_from_index,
     action_to_index,
 )
+from trap_tube_jax.graded import graded_perceptual, graded_structural
 from trap_tube_jax.objects import base_palette
 from trap_tube_jax.observation import observe, render_ascii, visible_objects
 from trap_tube_jax.registry import (
@@ -51,6 +52,8 @@ __all__ = [
     "base_state",
     "compose",
     "distances",
+    "graded_perceptual",
+    "graded_structural",
     "make",
     "observe",
     "perceptual",

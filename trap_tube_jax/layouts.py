@@ -64,8 +64,8 @@ def layout_tables() -> LayoutTables:
         [_agent_cells(corners, _extent(*frame), int(corner)) for corner in np.flatnonzero(corners)]
         for frame, corners in zip(frames, tools, strict=True)
     ]
-    tool, num_tools = _padded([np.flatnonzero(corners) for corners in tools])
-    agent, num_agents = zip(*(_padded(rows, len(tool[0])) for rows in agents), strict=True)
+    tool, num_tools = padded([np.flatnonzero(corners) for corners in tools])
+    agent, num_agents = zip(*(padded(rows, len(tool[0])) for rows in agents), strict=True)
     longest = max(rows.shape[1] for rows in agent)
     return LayoutTables(
         board=np.stack([_boards(*frame[:4]) for frame in frames]),
@@ -127,7 +127,7 @@ def _agent_cells(tool_corners: np.ndarray, extent: tuple[int, int], corner: int)
     return np.flatnonzero(~center & ~tool_corners & ~tool)
 
 
-def _padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The rows of cells as one table u8, and their lengths u32; 1 where a row is missing."""
     num_rows = num_rows or len(rows)
     table = np.zeros((num_rows, max(map(len, rows))), np.uint8)

@@ -105,14 +105,26 @@ def structural(key: jax.Array, state: State) -> State:
     Returns:
       The state with a new palette.
     """
-    num_features = state.palette.shape[-1]
+    return recolor(state, sphere_points(key, state.palette.shape[-1]))
+
+
+def sphere_points(key: jax.Array, num_features: int) -> jax.Array:
+    """f32[8, N]: for every object code the point that `structural` draws, uniform on the sphere.
+
+    The rows of agent and food are not used.
+    """
     normal = jax.random.normal(loop_free(key), (5, num_features))
     points = normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
     if num_features == 1:  # -1 and 1, which the rounded quotient may miss
         points = jnp.where(normal < 0, -1.0, 1.0)
+    return points[POINT_OF_OBJECT]
+
+
+def recolor(state: State, points: jax.Array) -> State:
+    """The state with the features of points f32[8, N] in [-1, 1]^N, but for agent and food."""
     features = jnp.floor((points + 1) / 2 * 255).astype(jnp.uint8)
     keeps = np.isin(np.arange(NUM_OBJECTS), (AGENT, FOOD))[:, None]
-    return state.replace(palette=jnp.where(keeps, state.palette, features[POINT_OF_OBJECT]))
+    return state.replace(palette=jnp.where(keeps, state.palette, features))
 
 
 def symbolic(key: jax.Array, state: State) -> State:
