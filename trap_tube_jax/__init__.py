@@ -14,6 +14,7 @@ from trap_tube_jax.graded import graded_perceptual, graded_structural
 from trap_tube_jax.objects import base_palette
 from trap_tube_jax.observation import observe, render_ascii, visible_objects
 from trap_tube_jax.registry import (
+    CONTROL_TASK_SETS,
     PAPER_TASK_SETS,
     TaskSet,
     make,
@@ -33,6 +34,7 @@ with contextlib.suppress(ImportError):
     importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
 
 __all__ = [
+    "CONTROL_TASK_SETS",
     "PAPER_TASK_SETS",
     "ArraySpec",
     "AutoReset",

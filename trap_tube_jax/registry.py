@@ -1,11 +1,12 @@
-"""The task sets by name: the paper's eight, and others.
+"""The task sets by name: the paper's eight, the controls, and your own.
 
-Source: paper, section "Experimental Setup"; environment.md, "Task sets".
+Source: paper, section "Experimental Setup"; environment.md, "Task sets"; controls.md.
 """
 
 import dataclasses
 from collections.abc import Sequence
 
+from trap_tube_jax.controls import CONTROLS, drawn_from
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.state import State, base_state, check_structure
@@ -56,11 +57,21 @@ PAPER_TASK_SETS = (
     TaskSet("PerceptualStructuralSymbolicTrapTube-v0", "pstsy", (perceptual, structural, symbolic)),
 )
 
-_task_sets = {task_set.id: task_set for task_set in PAPER_TASK_SETS}
+# "trap turned" is TrapTurnedControl-v0, in short trap-turned.
+CONTROL_TASK_SETS = tuple(
+    TaskSet(
+        id="".join(word.capitalize() for word in layouts.__name__.split("_")) + "Control-v0",
+        short=layouts.__name__.replace("_", "-"),
+        transfers=(drawn_from(layouts),),
+    )
+    for layouts in CONTROLS
+)
+
+_task_sets = {entry.id: entry for entry in (*PAPER_TASK_SETS, *CONTROL_TASK_SETS)}
 
 
 def registered_ids() -> tuple[str, ...]:
-    """The ids that `make` takes: the paper's eight first."""
+    """The ids that `make` takes: the paper's eight, the controls, your own."""
     return tuple(_task_sets)
 
 
