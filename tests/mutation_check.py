@@ -36,6 +36,7 @@ TIME = ("tests/test_environment.py", "-k", "last_step or limit_truncates or auto
 PERCEPTUAL = ("tests/test_transfers.py", "-k", "perceptual")
 STRUCTURAL = ("tests/test_transfers.py", "-k", "structural")
 SYMBOLIC = ("tests/test_transfers.py", "-k", "symbolic")
+GRADED = ("tests/test_graded.py",)
 COMPOSE = ("tests/test_transfers.py", "-k", "compose or then")
 
 
@@ -356,6 +357,55 @@ FAULTS = (
         "CENTER_LAST = 4, 8",
         "CENTER_LAST = 4, 7",
         PERCEPTUAL,
+    ),
+    Fault(
+        "graded",
+        "the agent is far from the base task's at once",
+        "(cells[:count].astype(np.int32), base.agent, strength)",
+        "(cells[:count].astype(np.int32), base.agent, 1)",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "the direction of the tool does not count",
+        "return board_cells + tool_cells[:, None]",
+        "return board_cells",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "distances start at 0, not at the least",
+        "nearest + strength * (farthest - nearest)",
+        "np.maximum(nearest, strength * farthest)",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "points turn the whole way",
+        "angle = strength * jnp.atan2",
+        "angle = jnp.atan2",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "the palette loses a half at strength 0",
+        "(state.palette.astype(jnp.float32) + 0.5)",
+        "state.palette.astype(jnp.float32)",
+        GRADED,
+    ),
+    Fault(
+        "controls",
+        "the second layout is never drawn",
+        "0, len(choices))",
+        "0, 1)",
+        ("tests/test_controls.py",),
+    ),
+    Fault(
+        "registry",
+        "the set's step limit is forgotten",
+        "entry.max_steps if max_steps is None",
+        "MAX_STEPS if max_steps is None",
+        ("tests/test_registry.py",),
     ),
 )
 

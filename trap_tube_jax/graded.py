@@ -8,14 +8,13 @@ Source: graded.md; the paper, section "Structural", for interpolation on the sph
 """
 
 import functools
-import numbers
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.geometry import bar_cells, cell_of
+from trap_tube_jax.geometry import cell_of
 from trap_tube_jax.layouts import NUM_FRAMES, layout_tables, padded
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.prng import loop_free
@@ -181,10 +180,10 @@ def _layout_distances() -> np.ndarray:
     full, base = layout_tables(), base_state()
     board = np.asarray(base.board).reshape(-1)
     board_cells = np.sum(full.board != board, axis=-1)
-    corner = np.zeros(2, np.int32)
-    own_shape = bar_cells(corner, np.asarray(base.tool_extent))
-    shapes = np.stack([bar_cells(corner, extent) for extent in full.extent])
-    return board_cells + np.sum(shapes != own_shape, axis=(1, 2))[:, None]
+    own = np.asarray(base.tool_extent)
+    shared = np.minimum(full.extent, own).prod(axis=1)
+    tool_cells = full.extent.prod(axis=1) + own.prod() - 2 * shared
+    return board_cells + tool_cells[:, None]
 
 
 def _nearest_cells(cells: np.ndarray, target: Any, strength: float) -> np.ndarray:
@@ -201,8 +200,8 @@ def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
 
 
 def _check_strength(strength: Any) -> float:
-    is_number = isinstance(strength, numbers.Real) and not isinstance(strength, bool)
-    if not is_number or not 0 <= strength <= 1:
+    is_number = isinstance(strength, int | float | np.integer | np.floating)
+    if isinstance(strength, bool) or not is_number or not 0 <= strength <= 1:
         raise ValueError(f"strength must be a number from 0 to 1, got {strength!r}")
     return float(strength)
 

@@ -27,7 +27,10 @@ _SIDES = ((3, 4), (3, 5), (4, 4), (4, 4))
 
 
 class LayoutTables(NamedTuple):
-    """The outcomes of every choice, equally likely along their last axis unless counted.
+    """The outcomes of every choice.
+
+    Along the last axis all are equally likely. Where a row ends in padding, the counts say
+    how many of its entries are outcomes.
 
     A frame is a tube's outline with a direction of the tool; an assignment says which of
     the outline's sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143.

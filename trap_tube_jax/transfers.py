@@ -133,8 +133,8 @@ def symbolic(key: jax.Array, state: State) -> State:
     The object is uniform over tool, tube1, tube2, trap and exit. The new tool starts at
     the object's top-left cell, has as many cells, and is horizontal if the first two in
     reading order share a row; the object takes the old tool's cells. "Tool" changes
-    nothing. On boards of one's own, neither does an object that could not be a tool:
-    one with no cell, more than four, or a bar that would leave the board.
+    nothing. On other boards, nor does an object that cannot be a tool: one without cells,
+    one with more than four, or one whose bar would leave the board.
 
     Args:
       key: PRNG key.

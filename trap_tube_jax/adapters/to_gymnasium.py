@@ -326,7 +326,7 @@ def _action_space(flat: bool) -> Any:
 
 
 def _grasp_and_move(actions: Any, shape: tuple[int, ...], flat: bool) -> np.ndarray:
-    """i32[..., 2] of actions in the action space; refuses others."""
+    """i32[..., 2] of actions in the action space. Raises ValueError for others."""
     array = np.asarray(actions)
     count = NUM_ACTIONS if flat else NUM_DIRECTIONS
     if array.shape != shape or array.dtype.kind not in "iu":

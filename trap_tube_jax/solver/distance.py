@@ -47,14 +47,14 @@ def distances(state: State) -> Distances:
 
     d(s) = 0 if s is solved, else 1 + min over the 16 actions a of d(step(s, a)).
 
-    It explores the whole graph, up to some two million states, which takes seconds;
-    `solve` stops at the goal.
+    It explores the whole graph, up to two million states, in seconds. `solve` stops at the
+    goal.
 
     Args:
       state: one unbatched state, at any time of an unfinished episode.
 
     Raises:
-      ValueError: the state is one that `solve` refuses.
+      ValueError: as `solve`.
     """
     from_start, nodes, successors = _explore(checked(state))
     to_goal = _distances_to_goal(from_start, nodes, successors)

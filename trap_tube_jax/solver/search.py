@@ -28,17 +28,17 @@ CHUNK_SIZES = (256, 1024, 4096)
 
 
 class Plan(struct.PyTreeNode):
-    """A shortest way to the goal, or the finding that there is none. NumPy arrays.
+    """A shortest plan, or the result that there is none. NumPy arrays.
 
     Of several shortest plans it is the first in the order of their action indices
     (4 * grasp + move), compared step by step.
 
     Attributes:
       actions: i32[L, 2], the (grasp, move) of every step. In a batch i32[B, L, 2], L
-        being the longest length: shorter plans are filled up with (-1, -1), which under
-        jit is no direction and changes nothing, and eagerly an action that is refused.
-      length: i32[] or i32[B], the number of steps, whatever an environment's step
-        limit; -1 if unsolvable.
+        being the longest length. Shorter plans end in (-1, -1). Under jit that changes
+        nothing; outside jit `Environment.step` raises ValueError for it.
+      length: i32[] or i32[B], the number of steps, which may exceed a step limit; -1 if
+        unsolvable.
       solvable: bool[] or bool[B], whether any sequence of actions leads to the goal.
     """
 
@@ -110,7 +110,7 @@ def solve_batch(states: State) -> Plan:
 
 
 def checked(state: State) -> State:
-    """Returns `state` as NumPy arrays if it can be solved; refuses it as `solve` does."""
+    """Returns a valid state as NumPy arrays; raises ValueError as `solve` does."""
     return validate(_to_host(state))
 
 
