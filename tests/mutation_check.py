@@ -30,7 +30,7 @@ import pytest
 sys.exit(pytest.main(["-x", "--no-header", "-p", "no:cacheprovider", "-n0", *sys.argv[1:]]))
 """
 # Of the exhaustive comparison the base task and its swaps are enough here.
-STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-70 and not psy-30")
+STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-12 and not psy-6")
 OBSERVE = ("tests/test_observation.py", "tests/test_golden.py")
 TIME = ("tests/test_environment.py", "-k", "last_step or limit_truncates or auto or statistics")
 PERCEPTUAL = ("tests/test_transfers.py", "-k", "perceptual")

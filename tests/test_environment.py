@@ -12,7 +12,11 @@ from refusal import assert_refused
 
 import trap_tube_jax as tt
 
-IDS = [entry.id for entry in tt.PAPER_TASK_SETS]
+# What pairs of transfers do, each of them and all three show already.
+IDS = [
+    pytest.param(entry.id, marks=[pytest.mark.slow] * (len(entry.transfers) == 2))
+    for entry in tt.PAPER_TASK_SETS
+]
 BATCH, SLICES, STEPS, LIMIT = 4096, 4, 4, 3
 
 # One of the few boards on which random actions succeed soon.
