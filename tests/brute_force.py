@@ -1,4 +1,4 @@
-"""The rules of specification section 3 in plain Python, and an exhaustive search over them.
+"""The rules of environment.md, "One step", in plain Python, and an exhaustive search over them.
 
 Shares no code with the package, on purpose.
 """

@@ -30,12 +30,13 @@ import pytest
 sys.exit(pytest.main(["-x", "--no-header", "-p", "no:cacheprovider", "-n0", *sys.argv[1:]]))
 """
 # Of the exhaustive comparison the base task and its swaps are enough here.
-STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-70 and not psy-30")
+STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-12 and not psy-6")
 OBSERVE = ("tests/test_observation.py", "tests/test_golden.py")
 TIME = ("tests/test_environment.py", "-k", "last_step or limit_truncates or auto or statistics")
 PERCEPTUAL = ("tests/test_transfers.py", "-k", "perceptual")
 STRUCTURAL = ("tests/test_transfers.py", "-k", "structural")
 SYMBOLIC = ("tests/test_transfers.py", "-k", "symbolic")
+GRADED = ("tests/test_graded.py",)
 COMPOSE = ("tests/test_transfers.py", "-k", "compose or then")
 
 
@@ -241,16 +242,16 @@ FAULTS = (
     Fault(
         "transfers",
         "points crowd in the cube's corners",
-        "jax.random.normal(key, (5, num_features))",
-        "jax.random.uniform(key, (5, num_features), minval=-1)",
+        "jax.random.normal(loop_free(key), (5, num_features))",
+        "jax.random.uniform(loop_free(key), (5, num_features), minval=-1)",
         STRUCTURAL,
     ),
     Fault("transfers", "food changes its color", "(AGENT, FOOD)", "(AGENT,)", STRUCTURAL),
     Fault(
         "transfers",
         "the tool is never drawn",
-        "randint(key, (), 0, len(SYMBOLIC_OBJECTS))",
-        "randint(key, (), 1, len(SYMBOLIC_OBJECTS))",
+        "randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS))",
+        "randint(loop_free(key), (), 1, len(SYMBOLIC_OBJECTS))",
         SYMBOLIC,
     ),
     Fault(
@@ -277,7 +278,16 @@ FAULTS = (
         "is_object & (cells >= first)",
         SYMBOLIC,
     ),
-    Fault("transfers", "transfers share a key", "jax.random.fold_in(key, index)", "key", COMPOSE),
+    Fault(
+        "transfers", "transfers share a key", "fold_in(key, index), state)", "key, state)", COMPOSE
+    ),
+    Fault(
+        "transfers",
+        "own transfers get keys of a foreign type",
+        "transfer(fold_in(key, index), state)",
+        "transfer(loop_free(fold_in(key, index)), state)",
+        ("tests/test_environment.py", "-k", "mix_with_own"),
+    ),
     Fault(
         "transfers",
         "the last transfer comes first",
@@ -347,6 +357,55 @@ FAULTS = (
         "CENTER_LAST = 4, 8",
         "CENTER_LAST = 4, 7",
         PERCEPTUAL,
+    ),
+    Fault(
+        "graded",
+        "the agent is far from the base task's at once",
+        "(cells[:count].astype(np.int32), base.agent, strength)",
+        "(cells[:count].astype(np.int32), base.agent, 1)",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "the direction of the tool does not count",
+        "return board_cells + tool_cells[:, None]",
+        "return board_cells",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "distances start at 0, not at the least",
+        "nearest + strength * (farthest - nearest)",
+        "np.maximum(nearest, strength * farthest)",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "points turn the whole way",
+        "angle = strength * jnp.atan2",
+        "angle = jnp.atan2",
+        GRADED,
+    ),
+    Fault(
+        "graded",
+        "the palette loses a half at strength 0",
+        "(state.palette.astype(jnp.float32) + 0.5)",
+        "state.palette.astype(jnp.float32)",
+        GRADED,
+    ),
+    Fault(
+        "controls",
+        "the second layout is never drawn",
+        "0, len(choices))",
+        "0, 1)",
+        ("tests/test_controls.py",),
+    ),
+    Fault(
+        "registry",
+        "the set's step limit is forgotten",
+        "entry.max_steps if max_steps is None",
+        "MAX_STEPS if max_steps is None",
+        ("tests/test_registry.py",),
     ),
 )
 

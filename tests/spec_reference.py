@@ -1,7 +1,7 @@
-"""A second reading of the environment's specification, in plain NumPy and Python.
+"""A second reading of trap_tube_jax/environment.md, in plain NumPy and Python.
 
-Written from the specification's sentences, for plainness rather than speed, and apart
-from the package: it imports nothing of it. The section numbers are the specification's.
+Written from the rules alone, for plainness rather than speed, and apart from the package:
+it imports nothing of it.
 """
 
 import functools
@@ -88,7 +88,7 @@ def on_board(cell: Cell) -> np.ndarray:
 
 
 def step(layouts: Layouts, agent: Cell, tool: Cell, food: Cell, action: tuple) -> Moved:
-    """Section 3, for an action (grasp, move). All arrays broadcast against each other."""
+    """One step of an action (grasp, move). All arrays broadcast against each other."""
     grasp, move = action
     d = Cell(*np.moveaxis(DIRECTIONS[move], -1, 0))
     next_to = agent.shifted(Cell(*np.moveaxis(DIRECTIONS[grasp], -1, 0)))
@@ -117,7 +117,7 @@ def step(layouts: Layouts, agent: Cell, tool: Cell, food: Cell, action: tuple) -
 
 
 def visible(board: np.ndarray, agent: Any, tool: Any, extent: Any, food: Any) -> np.ndarray:
-    """Section 1: the topmost object of every cell, later codes hiding earlier ones."""
+    """The topmost object of every cell: later codes hide earlier ones."""
     shown = np.array(board)
     shown[tuple(food)] = FOOD
     for cell in Layouts(board, np.asarray(extent)).bar(Cell(*tool)):
@@ -127,7 +127,7 @@ def visible(board: np.ndarray, agent: Any, tool: Any, extent: Any, food: Any) ->
 
 
 class Outline(NamedTuple):
-    """Section 5: height, width and top-left corner of the tube."""
+    """Height, width and top-left corner of the tube."""
 
     height: int
     width: int
@@ -224,7 +224,7 @@ class Looks(NamedTuple):
 
 
 def swapped(before: Looks, code: int) -> Looks:
-    """Section 5: the symbolic transfer when it draws the object `code`."""
+    """The symbolic transfer when it draws the object `code`."""
     if code == TOOL:
         return before
     cells = [tuple(cell) for cell in np.argwhere(before.board == code).tolist()]  # reading order

@@ -87,7 +87,17 @@ def _layouts(task: str, number: int) -> list[tt.State]:
     return [jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in range(number)]
 
 
-@pytest.mark.parametrize(("task", "number"), [("base", 1), ("p", 70), ("sy", 6), ("psy", 30)])
+@pytest.mark.parametrize(
+    ("task", "number"),
+    [
+        ("base", 1),
+        ("sy", 6),
+        ("p", 12),
+        ("psy", 6),
+        pytest.param("p", 70, marks=pytest.mark.slow),
+        pytest.param("psy", 30, marks=pytest.mark.slow),
+    ],
+)
 def test_every_state_and_action(task, number):
     for layout in _layouts(task, number):
         _assert_layout_agrees(layout)

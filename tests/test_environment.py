@@ -12,7 +12,11 @@ from refusal import assert_refused
 
 import trap_tube_jax as tt
 
-IDS = [entry.id for entry in tt.PAPER_TASK_SETS]
+# What pairs of transfers do, each of them and all three show already.
+IDS = [
+    pytest.param(entry.id, marks=[pytest.mark.slow] * (len(entry.transfers) == 2))
+    for entry in tt.PAPER_TASK_SETS
+]
 BATCH, SLICES, STEPS, LIMIT = 4096, 4, 4, 3
 
 # One of the few boards on which random actions succeed soon.
@@ -300,6 +304,21 @@ def test_own_transfers_apply_in_order_to_an_own_base():
     state, _ = jax.jit(env.reset)(jax.random.key(0))
     np.testing.assert_array_equal(state.agent, (11, 11))
     assert repr(env) == "Environment(transfers=(to_last_row, to_last_column), max_steps=50)"
+
+
+@pytest.mark.parametrize("make_key", [jax.random.key, jax.random.PRNGKey], ids=["typed", "raw"])
+def test_own_transfers_get_keys_that_mix_with_own_keys(make_key):
+    """Typed keys, whatever `reset` was given, and those that `compose` promises."""
+
+    def own(key, state):
+        jnp.stack([key, jax.random.key(1)])
+        jax.lax.cond(state.time == 0, lambda: key, lambda: jax.random.key(2))
+        return state.replace(agent=jax.random.randint(key, (2,), 8, 12))
+
+    key = make_key(3)
+    state, _ = tt.Environment((tt.structural, own), base=EASY).reset(key)
+    expected = jax.random.fold_in(key, 1)
+    np.testing.assert_array_equal(state.agent, jax.random.randint(expected, (2,), 8, 12))
 
 
 def test_action_numbers_are_four_times_grasp_plus_move():

@@ -121,7 +121,7 @@ def test_states_past_the_end_stay(recorded, replay):
     assert not replay.timestep.reward[past].any()
 
 
-def test_reading_of_the_specification_agrees(recorded):
+def test_reading_of_the_rules_agrees(recorded):
     """The plain-NumPy reading under `tests/` is itself held to the recording."""
     episode, time = np.nonzero(_within_episode(recorded))
     before = {name: recorded[name][episode, time] for name in ("agent", "tool", "food")}

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from trap_tube_jax.prng import loop_free, split, threefry
+import trap_tube_jax as tt
+from trap_tube_jax.prng import fold_in, loop_free, split, threefry
 
 # Salmon et al. (2011), known answers of Threefry-2x32 with 20 rounds: key, counter, result.
 KNOWN = [
@@ -52,20 +53,33 @@ def test_other_keys_stay_what_they_are():
         assert loop_free(key) is key
 
 
-@pytest.mark.parametrize(
-    "key",
-    [
-        jax.random.key(5),
-        jax.random.PRNGKey(5),
-        jax.random.key(5, impl="rbg"),
-        loop_free(jax.random.key(5)),
-    ],
-    ids=["typed", "raw", "rbg", "loop-free"],
-)
+KEYS = {
+    "typed": jax.random.key(5),
+    "raw": jax.random.PRNGKey(5),
+    "rbg": jax.random.key(5, impl="rbg"),
+    "loop-free": loop_free(jax.random.key(5)),
+}
+
+
+@pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
 def test_split_gives_the_same_keys_of_the_same_type(key):
     for ours, theirs in zip(split(key), jax.random.split(key), strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_array_equal(jax.random.key_data(ours), jax.random.key_data(theirs))
+
+
+@pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
+def test_fold_in_gives_the_same_key_of_the_same_type(key):
+    ours, theirs = fold_in(key, 3), jax.random.fold_in(key, 3)
+    assert ours.dtype == theirs.dtype
+    np.testing.assert_array_equal(jax.random.key_data(ours), jax.random.key_data(theirs))
+
+
+@pytest.mark.parametrize("transfer", [tt.perceptual, tt.structural, tt.symbolic])
+def test_the_transfers_draw_without_loops(transfer):
+    """The environment's reset is as fast as its draws."""
+    env = tt.Environment((transfer,))
+    assert "while" not in jax.jit(env.reset).lower(jax.random.key(0)).as_text()
 
 
 def test_a_loop_free_key_stays_one():

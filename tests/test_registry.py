@@ -7,7 +7,7 @@ from refusal import assert_refused
 import trap_tube_jax as tt
 from trap_tube_jax import registry
 
-# Specification section 6.
+# environment.md, "Task sets".
 SPECIFIED = [
     ("TrapTube-v0", "base", "base", ()),
     ("PerceptualTrapTube-v0", "p", "{P}", (tt.perceptual,)),
@@ -31,7 +31,7 @@ def own_registry(monkeypatch):
     monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
 
 
-def test_the_papers_sets_are_those_of_the_specification():
+def test_the_papers_sets_are_those_of_the_page():
     sets = [(entry.id, entry.short, entry.label, entry.transfers) for entry in tt.PAPER_TASK_SETS]
     assert sets == SPECIFIED
     assert tt.registered_ids()[:8] == tuple(entry[0] for entry in SPECIFIED)
@@ -64,6 +64,18 @@ def test_register_adds_a_set(own_registry):
     assert tt.task_set("top") is entry
     assert entry.label == "{St, to_the_top}"
     assert tt.make("Top-v0").transfers == (tt.structural, to_the_top)
+
+
+def test_register_holds_base_state_and_step_limit(own_registry):
+    base = tt.base_state(5).replace(agent=np.array((0, 0), np.int32))
+    entry = tt.register("Own-v0", (), short="own", base=base, max_steps=20)
+    assert (entry.base, entry.max_steps, entry.label) == (base, 20, "own")
+    env = tt.make("own")
+    assert (env.base, env.max_steps, env.num_features) == (base, 20, 5)
+    assert tt.make("own", num_features=5, max_steps=30).max_steps == 30
+    assert tt.make("own", base=tt.base_state()).num_features == 3
+    assert_refused(["num_features=3", "5 features"], tt.make, "own", num_features=3)
+    assert len({entry, *tt.PAPER_TASK_SETS}) == 9
 
 
 def test_register_takes_the_id_for_a_missing_short_name(own_registry):
@@ -106,6 +118,21 @@ def test_make_refuses(options, words):
         ("Mine-v0", ("symbolic",), None, ["(key, state) -> state", "'symbolic'", "perceptual"]),
     ],
 )
-def test_register_refuses(own_registry, name, transfers, short, words):
+def test_register_refuses_a_name_or_transfer(own_registry, name, transfers, short, words):
     assert_refused(words, tt.register, name, transfers, short=short)
+    assert "Mine-v0" not in tt.registered_ids()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"base": "TrapTube-v0"}, ["trap_tube_jax.State", "str"]),
+        ({"base": tt.base_state().replace(terminated=np.True_)}, ["terminated", "not over"]),
+        ({"max_steps": 0}, ["max_steps", ">= 1", "0"]),
+        ({"max_steps": None}, ["max_steps", "integer >= 1", "None"]),
+    ],
+    ids=["base a name", "base solved", "no step", "no limit"],
+)
+def test_register_refuses_a_base_or_limit(own_registry, options, words):
+    assert_refused(words, tt.register, "Mine-v0", (), **options)
     assert "Mine-v0" not in tt.registered_ids()

@@ -1,7 +1,6 @@
-"""The transfers against their exact distributions, enumerated from the specification."""
+"""The transfers against their exact distributions, enumerated from environment.md."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,48 +9,13 @@ import numpy as np
 import pytest
 import spec_reference as spec
 from goodness_of_fit import assert_fits
+from samples import OUTLINES, SAMPLES, batched, draw, find_boards, flat, tally
 
 import trap_tube_jax as tt
 
-SAMPLES = 2**17
-OUTLINES = list(spec.outlines())
-BOARDS = np.array([list(spec.boards(outline)) for outline in OUTLINES])  # [9, 8, 12, 12]
 SWAPPED = (spec.TOOL, spec.TUBE1, spec.TUBE2, spec.TRAP, spec.EXIT)
 # Every object in a colour of its own, the tubes too.
 DISTINCT_PALETTE = np.arange(24, dtype=np.uint8).reshape(8, 3)
-
-
-@functools.cache
-def batched(transfer: tt.Transfer) -> Callable[[jax.Array, tt.State], tt.State]:
-    """`transfer` of one state under many keys."""
-    return jax.jit(jax.vmap(transfer, (0, None)))
-
-
-def draw(transfer: tt.Transfer, seed: int, state: tt.State, number: int = SAMPLES) -> Any:
-    """A state of NumPy arrays [number, ...]."""
-    keys = jax.random.split(jax.random.key(seed), number)
-    return jax.tree.map(np.asarray, batched(transfer)(keys, state))
-
-
-def flat(cells: np.ndarray) -> np.ndarray:
-    return cells[..., 0] * 12 + cells[..., 1]
-
-
-def tally(shape: tuple[int, ...], *indices: np.ndarray) -> np.ndarray:
-    """How often each tuple of indices occurs."""
-    places = np.ravel_multi_index(indices, shape)
-    return np.bincount(places, minlength=int(np.prod(shape))).reshape(shape)
-
-
-def find_boards(boards: np.ndarray) -> np.ndarray:
-    """The index of each board among the 72 possible ones; -1 for any other."""
-    weights = np.random.default_rng(0).integers(1, 2**40, 144)
-    known = BOARDS.reshape(-1, 144).astype(np.int64) @ weights
-    order = np.argsort(known)
-    marks = boards.reshape(-1, 144).astype(np.int64) @ weights
-    index = order[np.searchsorted(known[order], marks).clip(max=len(known) - 1)]
-    same = np.all(BOARDS.reshape(-1, 12, 12)[index] == boards, axis=(1, 2))
-    return np.where(same, index, -1)
 
 
 class Layout(NamedTuple):
@@ -73,7 +37,7 @@ def drawn() -> Any:
 @pytest.fixture(scope="module")
 def layout(drawn) -> Layout:
     index = find_boards(drawn.board)
-    assert np.all(index >= 0), "a board that the specification does not allow"
+    assert np.all(index >= 0), "a board that environment.md does not allow"
     outline, variant = np.divmod(index, 8)
     vertical = (drawn.tool_extent[:, 0] > 1).astype(int)
     return Layout(outline, variant, vertical, flat(drawn.tool), flat(drawn.agent), flat(drawn.food))
@@ -265,7 +229,7 @@ def _assert_is_one_of(drawn: Any, outcomes: list[spec.Looks]) -> np.ndarray:
     corners = flat(np.array([outcome.tool for outcome in outcomes]))
     assert len(set(corners.tolist())) == len(outcomes)
     matches = flat(drawn.tool)[:, None] == corners
-    assert matches.any(axis=1).all(), "the tool is where the specification does not allow it"
+    assert matches.any(axis=1).all(), "the tool is where environment.md does not allow it"
     which = matches.argmax(axis=1)
     for name, got in zip(spec.Looks._fields, _looks(drawn), strict=True):
         expected = np.array([getattr(outcome, name) for outcome in outcomes])

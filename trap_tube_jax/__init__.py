@@ -3,15 +3,18 @@
 import contextlib
 import importlib
 
+from trap_tube_jax._version import __version__ as __version__
 from trap_tube_jax.environment import (
     ArraySpec,
     Environment,
     action_from_index,
     action_to_index,
 )
+from trap_tube_jax.graded import graded_perceptual, graded_structural
 from trap_tube_jax.objects import base_palette
 from trap_tube_jax.observation import observe, render_ascii, visible_objects
 from trap_tube_jax.registry import (
+    CONTROL_TASK_SETS,
     PAPER_TASK_SETS,
     TaskSet,
     make,
@@ -30,9 +33,8 @@ from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 with contextlib.suppress(ImportError):
     importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
 
-__version__ = "0.1.0"
-
 __all__ = [
+    "CONTROL_TASK_SETS",
     "PAPER_TASK_SETS",
     "ArraySpec",
     "AutoReset",
@@ -52,6 +54,8 @@ __all__ = [
     "base_state",
     "compose",
     "distances",
+    "graded_perceptual",
+    "graded_structural",
     "make",
     "observe",
     "perceptual",

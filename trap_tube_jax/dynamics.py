@@ -1,6 +1,6 @@
 """The rules of one step: food, tool, agent, task, in that order.
 
-Source: specification section 3.
+Source: paper, section "Trap-Tube Environments"; environment.md, "One step".
 """
 
 import functools
@@ -16,9 +16,9 @@ from trap_tube_jax.state import State
 def step(state: State, action: jax.Array) -> State:
     """Moves food, tool and agent by one action and marks success.
 
-    Pure, deterministic and total: defined for every state, also for one with the
-    agent on the tool. A state that is done stays as it is. Counting steps against a
-    limit is the environment's business, not the dynamics'.
+    Pure and deterministic. It is defined for every state, also for one with the agent on
+    the tool. A state that is done does not change. Time and the step limit belong to the
+    environment.
 
     Args:
       state: one unbatched state.

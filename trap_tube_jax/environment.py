@@ -1,6 +1,6 @@
 """The environment: a pure `reset` and a pure `step` over one task.
 
-Source: paper section "Environments", specification sections 3 to 6.
+Source: paper, section "Environments"; environment.md.
 """
 
 import dataclasses
@@ -21,7 +21,6 @@ from trap_tube_jax.objects import (
     NUM_DIRECTIONS,
 )
 from trap_tube_jax.observation import observe
-from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State, TimeStep, base_state, check_structure, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
 
@@ -62,7 +61,8 @@ class Environment:
         """Checks its arguments; a transfer of your own is tried on the base state once.
 
         Args:
-          transfers: functions (key, state) -> state, applied in order at every reset.
+          transfers: functions (key, state) -> state, applied in order at every reset, each
+            with a typed key of its own (`compose`).
           base: the state that the transfers start from; the base task if absent.
           max_steps: steps after which an unsolved episode is truncated, at least 1.
 
@@ -93,8 +93,7 @@ class Environment:
         Raises:
           ValueError: `key` is not one PRNG key.
         """
-        _check_key(key)
-        state = self._transfer(loop_free(key), self.base)
+        state = self._transfer(_typed_key(key), self.base)
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:
@@ -172,7 +171,8 @@ def _timestep(state: State, reward: jax.Array) -> TimeStep:
     )
 
 
-def _check_key(key: Any) -> None:
+def _typed_key(key: Any) -> jax.Array:
+    """One PRNG key as a typed one: transfers get this type, whatever `reset` was given."""
     is_typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     is_raw = getattr(key, "dtype", None) == jnp.uint32 and np.shape(key) == (2,)
     if not is_raw and not (is_typed and key.shape == ()):
@@ -180,6 +180,7 @@ def _check_key(key: Any) -> None:
             f"reset takes one PRNG key, got {type(key).__name__} of shape {np.shape(key)}; "
             "make one with jax.random.key(seed), and jax.vmap over several"
         )
+    return jax.random.wrap_key_data(key) if is_raw else key
 
 
 def _check_action(action: Any) -> jax.Array:

@@ -1,10 +1,10 @@
 """Every layout of the perceptual transfer, enumerated once as tables.
 
-The transfer's support is small and finite, so it is written out in NumPy, cell by cell as
-the specification words it; a draw is then a few integers and as many look-ups. Counting
-out cells on masks within each draw is an order of magnitude slower under vmap on a CPU.
+The layouts are few, so they are written out in NumPy, cell by cell. A draw is then a few
+integers and as many look-ups. Counting out cells within each draw is an order of magnitude
+slower under vmap on a CPU.
 
-Source: specification section 5.
+Source: environment.md, "Perceptual".
 """
 
 import functools
@@ -27,7 +27,10 @@ _SIDES = ((3, 4), (3, 5), (4, 4), (4, 4))
 
 
 class LayoutTables(NamedTuple):
-    """The outcomes of every choice, equally likely along their last axis unless counted.
+    """The outcomes of every choice.
+
+    Along the last axis all are equally likely. Where a row ends in padding, the counts say
+    how many of its entries are outcomes.
 
     A frame is a tube's outline with a direction of the tool; an assignment says which of
     the outline's sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143.
@@ -64,8 +67,8 @@ def layout_tables() -> LayoutTables:
         [_agent_cells(corners, _extent(*frame), int(corner)) for corner in np.flatnonzero(corners)]
         for frame, corners in zip(frames, tools, strict=True)
     ]
-    tool, num_tools = _padded([np.flatnonzero(corners) for corners in tools])
-    agent, num_agents = zip(*(_padded(rows, len(tool[0])) for rows in agents), strict=True)
+    tool, num_tools = padded([np.flatnonzero(corners) for corners in tools])
+    agent, num_agents = zip(*(padded(rows, len(tool[0])) for rows in agents), strict=True)
     longest = max(rows.shape[1] for rows in agent)
     return LayoutTables(
         board=np.stack([_boards(*frame[:4]) for frame in frames]),
@@ -127,7 +130,7 @@ def _agent_cells(tool_corners: np.ndarray, extent: tuple[int, int], corner: int)
     return np.flatnonzero(~center & ~tool_corners & ~tool)
 
 
-def _padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The rows of cells as one table u8, and their lengths u32; 1 where a row is missing."""
     num_rows = num_rows or len(rows)
     table = np.zeros((num_rows, max(map(len, rows))), np.uint8)

@@ -7,7 +7,7 @@ Glossary
     palette: one row of features (RGB by default) per object code.
     role: what an object code does, whatever it looks like.
 
-Source: specification sections 1 and 2; paper section "Environments".
+Source: paper, section "Environments"; environment.md, "Board and objects" and "Actions".
 """
 
 from typing import Final
@@ -49,10 +49,10 @@ NUM_ACTIONS: Final = NUM_DIRECTIONS**2
 def base_palette(num_features: int = 3) -> np.ndarray:
     """Features of every object before any transfer.
 
-    Three features are the RGB colours of specification section 1. Two are its red
-    and green channels; more than three repeat red, green, blue cyclically; a single
-    one is the colour's luma (ITU-R BT.601), rounded. For every N the objects differ
-    from each other, except the two tubes, which always look alike.
+    Three features are the RGB colours of environment.md, "Board and objects". Two are the
+    red and green channels. More than three repeat red, green and blue. One feature is the
+    colour's luma (ITU-R BT.601), rounded. For every N all objects differ from each other,
+    except the two tubes, which always look alike.
 
     Args:
       num_features: N >= 1, the number of feature channels.

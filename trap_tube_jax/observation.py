@@ -1,6 +1,6 @@
 """What the agent sees, and pictures for people.
 
-Source: specification section 1.
+Source: environment.md, "Board and objects".
 """
 
 import jax

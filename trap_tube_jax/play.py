@@ -207,12 +207,12 @@ def main(arguments: Arguments) -> None:
     """Plays, or says why that cannot be.
 
     Raises:
-      ValueError: naming the value and what is allowed, or what is missing.
+      ValueError: the task set is unknown, or there is no terminal to play in.
     """
     task_set(arguments.task_set)
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ValueError(
-            "needs a terminal, and input or output is none; "
+            "needs a terminal, but its input or output is not one; "
             "`python -m trap_tube_jax.gallery` draws pictures without one"
         )
     try:

@@ -1,8 +1,9 @@
 """The draws of `jax.random`, without loops: faster where few are needed at a time.
 
-On a CPU, JAX computes its Threefry hash in a loop of five rounds, which is quick to compile. In
-a reset, which needs a handful of numbers, what the loops cost is their start. `loop_free` makes
-a key whose draws are the same to the bit, and computed in one go.
+On a CPU, JAX computes its Threefry hash in a loop of five rounds. That is quick to compile, but a
+reset needs only a handful of numbers, and starting the loops takes longer than the hash itself.
+`loop_free` makes a key whose draws are the same bits, computed without a loop. It is of a type of
+its own, so it stays within this package: nobody else is handed one.
 
 Source: Salmon et al. (2011) for the hash; JAX's documentation of `jax_threefry_partitionable`
 for how the counters are chosen.
@@ -38,12 +39,13 @@ def loop_free(key: jax.Array) -> jax.Array:
 
 def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The two keys of `jax.random.split`, of the same type as `key`."""
-    pair = jax.random.split(loop_free(key))
-    if pair.dtype != key.dtype:
-        data = jax.random.key_data(pair)
-        raw = key.dtype == jnp.uint32
-        pair = data if raw else jax.random.wrap_key_data(data, impl=jax.random.key_impl(key))
+    pair = _like(jax.random.split(loop_free(key)), key)
     return pair[0], pair[1]
+
+
+def fold_in(key: jax.Array, data: int) -> jax.Array:
+    """The key of `jax.random.fold_in`, of the same type as `key`."""
+    return _like(jax.random.fold_in(loop_free(key), data), key)
 
 
 def threefry(key: jax.Array, high: jax.Array, low: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -58,6 +60,16 @@ def threefry(key: jax.Array, high: jax.Array, low: jax.Array) -> tuple[jax.Array
         high = high + words[(index + 1) % 3]
         low = low + words[(index + 2) % 3] + jnp.uint32(index + 1)
     return high, low
+
+
+def _like(keys: jax.Array, key: jax.Array) -> jax.Array:
+    """The same keys, of the type of `key`."""
+    if keys.dtype == key.dtype:
+        return keys
+    data = jax.random.key_data(keys)
+    if key.dtype == jnp.uint32:
+        return data
+    return jax.random.wrap_key_data(data, impl=jax.random.key_impl(key))
 
 
 def _seed(seed: jax.Array) -> jax.Array:

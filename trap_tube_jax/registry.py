@@ -1,11 +1,12 @@
-"""The task sets by name: the paper's eight, and your own.
+"""The task sets by name: the paper's eight, the controls, and your own.
 
-Source: specification section 6.
+Source: paper, section "Experimental Setup"; environment.md, "Task sets"; controls.md.
 """
 
 import dataclasses
 from collections.abc import Sequence
 
+from trap_tube_jax.controls import CONTROLS, drawn_from
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.state import State, base_state, check_structure
@@ -14,26 +15,35 @@ from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
 
 @dataclasses.dataclass(frozen=True)
 class TaskSet:
-    """A named set of transfers.
+    """A named distribution over tasks.
 
     Attributes:
       id: the name that `make` takes.
       short: the name in tables and file names.
       transfers: the transfers, in the order in which they apply.
+      base: the state that they start from; None is the base task.
+      max_steps: steps after which an unsolved episode is truncated.
     """
 
     id: str
     short: str
     transfers: tuple[Transfer, ...]
+    base: State | None = dataclasses.field(default=None, compare=False, repr=False)
+    max_steps: int = MAX_STEPS
 
     @property
     def label(self) -> str:
-        """The set in the paper's notation, as in "{P, St}"; "base" for no transfers."""
+        """The set in the paper's notation, as in "{P, St}".
+
+        Without transfers: "base", or the short name if the set has a base state of its own.
+        """
         symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
         names = (
             symbols.get(transfer, getattr(transfer, "__name__", "?")) for transfer in self.transfers
         )
-        return "{" + ", ".join(names) + "}" if self.transfers else "base"
+        if self.transfers:
+            return "{" + ", ".join(names) + "}"
+        return "base" if self.base is None else self.short
 
 
 PAPER_TASK_SETS = (
@@ -47,11 +57,21 @@ PAPER_TASK_SETS = (
     TaskSet("PerceptualStructuralSymbolicTrapTube-v0", "pstsy", (perceptual, structural, symbolic)),
 )
 
-_task_sets = {task_set.id: task_set for task_set in PAPER_TASK_SETS}
+# "trap turned" is TrapTurnedControl-v0, in short trap-turned.
+CONTROL_TASK_SETS = tuple(
+    TaskSet(
+        id="".join(word.capitalize() for word in layouts.__name__.split("_")) + "Control-v0",
+        short=layouts.__name__.replace("_", "-"),
+        transfers=(drawn_from(layouts),),
+    )
+    for layouts in CONTROLS
+)
+
+_task_sets = {entry.id: entry for entry in (*PAPER_TASK_SETS, *CONTROL_TASK_SETS)}
 
 
 def registered_ids() -> tuple[str, ...]:
-    """The ids that `make` takes: the paper's eight first, then your own."""
+    """The ids that `make` takes: the paper's eight, the controls, your own."""
     return tuple(_task_sets)
 
 
@@ -71,43 +91,56 @@ def task_set(name: str) -> TaskSet:
 def make(
     name: str,
     *,
-    num_features: int = 3,
+    num_features: int | None = None,
     base: State | None = None,
-    max_steps: int = MAX_STEPS,
+    max_steps: int | None = None,
 ) -> Environment:
     """Makes the environment of a registered task set.
 
     Args:
       name: an id such as "PerceptualTrapTube-v0", or its short name such as "p".
-      num_features: N >= 1, the feature channels of the base task; 3 for RGB.
-      base: another base state, whose palette then sets N.
-      max_steps: steps after which an unsolved episode is truncated.
+      num_features: N >= 1, the feature channels of the base task; 3, RGB, if absent. A base
+        state has its own N.
+      base: a base state in place of the set's.
+      max_steps: a step limit in place of the set's.
 
     Raises:
       ValueError: naming the value and what is allowed.
     """
-    transfers = task_set(name).transfers
+    entry = task_set(name)
+    base = entry.base if base is None else base
     if base is None:
-        base = base_state(num_features)
+        base = base_state(3 if num_features is None else num_features)
     check_structure(base)
-    if num_features not in (3, base.palette.shape[-1]):
+    if num_features not in (None, base.palette.shape[-1]):
         raise ValueError(
-            f"num_features={num_features} contradicts base, whose palette has "
+            f"num_features={num_features} contradicts the base state, whose palette has "
             f"{base.palette.shape[-1]} features; give one of them"
         )
-    return Environment(transfers, base=base, max_steps=max_steps)
+    max_steps = entry.max_steps if max_steps is None else max_steps
+    return Environment(entry.transfers, base=base, max_steps=max_steps)
 
 
-def register(id: str, transfers: Sequence[Transfer], *, short: str | None = None) -> TaskSet:
-    """Adds a task set of your own to those that `make` knows, for this process.
+def register(
+    id: str,
+    transfers: Sequence[Transfer],
+    *,
+    short: str | None = None,
+    base: State | None = None,
+    max_steps: int = MAX_STEPS,
+) -> TaskSet:
+    """Adds a task set to those that `make` knows, for this process.
 
     Args:
       id: its name, not yet taken.
       transfers: functions (key, state) -> state, in the order in which they apply.
       short: its name in tables; the id if absent.
+      base: the state that the transfers start from; the base task if absent.
+      max_steps: steps after which an unsolved episode is truncated, at least 1.
 
     Raises:
-      ValueError: a name is empty or taken, or a transfer is none.
+      ValueError: a name is empty or taken, a transfer is not a function, the base state is
+        invalid, or the step limit is; the message says what is allowed.
     """
     short = id if short is None else short
     taken = {name for entry in _task_sets.values() for name in (entry.id, entry.short)}
@@ -116,6 +149,6 @@ def register(id: str, transfers: Sequence[Transfer], *, short: str | None = None
             raise ValueError(f"a task set's name must be a non-empty string, got {name!r}")
         if name in taken:
             raise ValueError(f"the name {name!r} is taken; taken are: {', '.join(sorted(taken))}")
-    Environment(transfers)
-    _task_sets[id] = TaskSet(id, short, tuple(transfers))
+    Environment(transfers, base=base, max_steps=max_steps)
+    _task_sets[id] = TaskSet(id, short, tuple(transfers), base, int(max_steps))
     return _task_sets[id]

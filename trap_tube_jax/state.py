@@ -1,6 +1,6 @@
 """The state of one task, and how to build one from arrays or from a picture.
 
-Source: specification sections 1 and 4.
+Source: environment.md, "Board and objects" and "Base task".
 """
 
 from collections.abc import Sequence
@@ -114,8 +114,8 @@ class State(struct.PyTreeNode):
         """Builds a state at time 0 from a picture of 12 rows of 12 characters.
 
         `.` ground, `x` trap, `e` exit, `1` and `2` the tubes, `F` food, `T` tool,
-        `A` agent. What is drawn as food, tool or agent stands on ground. What lies
-        over something else is given by keyword instead, and then not drawn.
+        `A` agent. Below food, tool and agent that are drawn is ground. Where one lies
+        above another object, give it by keyword and do not draw it.
 
         Args:
           rows: the picture, as one string (blank margins are dropped) or as rows.
@@ -170,7 +170,7 @@ class TimeStep(struct.PyTreeNode):
 
 
 def base_state(num_features: int = 3) -> State:
-    """The base task of specification section 4, in base colours of N features."""
+    """The base task (environment.md, "Base task") in base colours of N features."""
     return State.from_ascii(
         """
         ............
@@ -191,7 +191,7 @@ def base_state(num_features: int = 3) -> State:
 
 
 def validate(state: State) -> State:
-    """Returns `state` if it is a well-formed, unfinished task; refuses it otherwise.
+    """Returns `state` if it is a valid task whose episode is not over.
 
     Args:
       state: one unbatched state of concrete arrays.
@@ -232,7 +232,7 @@ def validate(state: State) -> State:
 
 
 def check_structure(state: Any) -> None:
-    """Refuses anything but a `State` whose fields have their shapes and dtypes.
+    """Checks that `state` is a `State` whose fields have the right shapes and dtypes.
 
     Args:
       state: arrays, tracers or `jax.ShapeDtypeStruct` in the fields.

@@ -4,7 +4,7 @@ A transfer is any pure function `(key, state) -> state`. The three of the paper 
 `perceptual` (another layout), `structural` (other features) and `symbolic` (the tool
 swaps its looks with another object).
 
-Source: paper sections 3.1.1 to 3.1.3, specification section 5.
+Source: paper, sections "Perceptual", "Structural" and "Symbolic"; environment.md, "Transfers".
 """
 
 from collections.abc import Callable
@@ -28,6 +28,7 @@ from trap_tube_jax.objects import (
     TUBE1,
     TUBE2,
 )
+from trap_tube_jax.prng import fold_in, loop_free
 from trap_tube_jax.state import State
 
 Transfer = Callable[[jax.Array, State], State]
@@ -39,6 +40,8 @@ POINT_OF_OBJECT = np.array([4, 2, 3, 1, 1, 0, 0, 0], np.int32)
 
 def compose(*transfers: Transfer) -> Transfer:
     """The transfer that applies `transfers` from left to right, each with its own key.
+
+    Transfer i gets `jax.random.fold_in(key, i)`, a key of the same type as `key`.
 
     Raises:
       ValueError: one of them is not callable.
@@ -52,7 +55,7 @@ def compose(*transfers: Transfer) -> Transfer:
 
     def composed(key: jax.Array, state: State) -> State:
         for index, transfer in enumerate(transfers):
-            state = transfer(jax.random.fold_in(key, index), state)
+            state = transfer(fold_in(key, index), state)
             # Without it XLA fuses a draw into each of its uses and repeats it there.
             state = jax.lax.optimization_barrier(state)
         return state
@@ -63,8 +66,8 @@ def compose(*transfers: Transfer) -> Transfer:
 def perceptual(key: jax.Array, state: State) -> State:
     """F_P: resamples tube, openings, food, tool and agent; keeps the palette.
 
-    Every choice is uniform over what specification section 5 leaves to it; `layouts`
-    enumerates that. A number below n is the remainder of 32 random bits, off the uniform
+    environment.md, "Perceptual", has every choice and its distribution; `layouts` lists the
+    outcomes. A number below n is the remainder of 32 random bits, off the uniform
     distribution by less than n / 2**32.
 
     Args:
@@ -75,7 +78,7 @@ def perceptual(key: jax.Array, state: State) -> State:
       A state with a new layout.
     """
     tables = jax.tree.map(jnp.asarray, layout_tables())
-    layout, food, tool, agent = jax.random.bits(key, (4,), jnp.uint32)
+    layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
     frame, assignment = layout % NUM_FRAMES, layout // NUM_FRAMES % NUM_ASSIGNMENTS
     tool %= tables.num_tools[frame]
     agent %= tables.num_agents[frame, tool]
@@ -102,14 +105,26 @@ def structural(key: jax.Array, state: State) -> State:
     Returns:
       The state with a new palette.
     """
-    num_features = state.palette.shape[-1]
-    normal = jax.random.normal(key, (5, num_features))
+    return recolor(state, sphere_points(key, state.palette.shape[-1]))
+
+
+def sphere_points(key: jax.Array, num_features: int) -> jax.Array:
+    """f32[8, N]: for every object code the point that `structural` draws, uniform on the sphere.
+
+    The rows of agent and food are not used.
+    """
+    normal = jax.random.normal(loop_free(key), (5, num_features))
     points = normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
     if num_features == 1:  # -1 and 1, which the rounded quotient may miss
         points = jnp.where(normal < 0, -1.0, 1.0)
+    return points[POINT_OF_OBJECT]
+
+
+def recolor(state: State, points: jax.Array) -> State:
+    """The state with the features of points f32[8, N] in [-1, 1]^N, but for agent and food."""
     features = jnp.floor((points + 1) / 2 * 255).astype(jnp.uint8)
     keeps = np.isin(np.arange(NUM_OBJECTS), (AGENT, FOOD))[:, None]
-    return state.replace(palette=jnp.where(keeps, state.palette, features[POINT_OF_OBJECT]))
+    return state.replace(palette=jnp.where(keeps, state.palette, features))
 
 
 def symbolic(key: jax.Array, state: State) -> State:
@@ -118,8 +133,8 @@ def symbolic(key: jax.Array, state: State) -> State:
     The object is uniform over tool, tube1, tube2, trap and exit. The new tool starts at
     the object's top-left cell, has as many cells, and is horizontal if the first two in
     reading order share a row; the object takes the old tool's cells. "Tool" changes
-    nothing. On boards of one's own, neither does an object that could not be a tool:
-    one with no cell, more than four, or a bar that would leave the board.
+    nothing. On other boards, nor does an object that cannot be a tool: one without cells,
+    one with more than four, or one whose bar would leave the board.
 
     Args:
       key: PRNG key.
@@ -128,7 +143,7 @@ def symbolic(key: jax.Array, state: State) -> State:
     Returns:
       The state after the swap.
     """
-    choice = jax.random.randint(key, (), 0, len(SYMBOLIC_OBJECTS))
+    choice = jax.random.randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS))
     return swap_with_tool(state, jnp.asarray(SYMBOLIC_OBJECTS)[choice])
 
 

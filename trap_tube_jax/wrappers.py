@@ -11,7 +11,7 @@ from trap_tube_jax.state import TimeStep
 
 
 class EnvironmentLike(Protocol):
-    """What a wrapper needs and is: any state, the same timestep."""
+    """What a wrapper takes, and what it is: an environment with a state of any type."""
 
     def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
         """Starts an episode."""

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from agents.acting.episodes import Episodes, place
-from agents.acting.identity import position_id
 from agents.networks import chunks
 from agents.networks.grouping import group, slots
 from trap_tube_jax.observation import observe
+from trap_tube_jax.positions import position_id
 from trap_tube_jax.state import State
 
 SLOT_BITS = 20  # of an observation's hash, by which the cache finds it

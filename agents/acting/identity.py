@@ -5,10 +5,8 @@ import jax.numpy as jnp
 
 from agents.acting.episodes import Episodes, place
 from agents.networks.grouping import group, group_rows, hash_rows
-from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.positions import position_id
 from trap_tube_jax.state import State
-
-NUM_CELLS = BOARD_SIZE * BOARD_SIZE
 
 
 def layout_ids(layout: State) -> jax.Array:
@@ -19,13 +17,6 @@ def layout_ids(layout: State) -> jax.Array:
 def layout_hashes(layout: State) -> jax.Array:
     """A hash u32[B] of the boards, palettes and tool extents of B states."""
     return hash_rows(_layout_content(layout))
-
-
-def position_id(state: State) -> jax.Array:
-    """An id i32[] of where agent, tool and food are; with the layout it fixes the observation."""
-    cells = [state.agent, state.tool, state.food]
-    agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
-    return (agent * NUM_CELLS + tool) * NUM_CELLS + food
 
 
 def position_ids(episodes: Episodes) -> jax.Array:

@@ -17,7 +17,7 @@ import numpy as np
 
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import MAX_STEPS, NUM_ACTIONS, NUM_DIRECTIONS
+from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, registered_ids
 from trap_tube_jax.rendering import render
@@ -55,8 +55,8 @@ class TrapTubeEnv(gymnasium.Env):
         task_set: str | Environment = "TrapTube-v0",
         *,
         flat_actions: bool = False,
-        num_features: int = 3,
-        max_steps: int = MAX_STEPS,
+        num_features: int | None = None,
+        max_steps: int | None = None,
         render_mode: str | None = None,
         cell_size: int = 32,
     ):
@@ -67,8 +67,8 @@ class TrapTubeEnv(gymnasium.Env):
             which `num_features` and `max_steps` do not apply.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `MultiDiscrete([4, 4])`.
-          num_features: N, the feature channels of the observation.
-          max_steps: steps after which an unsolved episode is truncated.
+          num_features: N, the feature channels of the observation; see `make`.
+          max_steps: a step limit in place of the set's.
           render_mode: "rgb_array", "ansi" or None.
           cell_size: pixels per cell and side of a picture.
 
@@ -151,8 +151,8 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         *,
         autoreset_mode: Any = AutoresetMode.NEXT_STEP,
         flat_actions: bool = False,
-        num_features: int = 3,
-        max_steps: int = MAX_STEPS,
+        num_features: int | None = None,
+        max_steps: int | None = None,
         render_mode: str | None = None,
         cell_size: int = 32,
     ):
@@ -296,10 +296,12 @@ def _batch_programs(env: Environment, same_step: bool) -> _Programs:
     return _Programs(jax.jit(batch.reset), jax.jit(batch.step, donate_argnums=0))
 
 
-def _environment(task_set: str | Environment, num_features: int, max_steps: int) -> Environment:
+def _environment(
+    task_set: str | Environment, num_features: int | None, max_steps: int | None
+) -> Environment:
     if not isinstance(task_set, Environment):
         return _registered(task_set, num_features, max_steps)
-    if (num_features, max_steps) != (3, MAX_STEPS):
+    if (num_features, max_steps) != (None, None):
         raise ValueError(
             f"num_features={num_features} and max_steps={max_steps} do not apply to an "
             "Environment of your own; give them to it"
@@ -308,7 +310,7 @@ def _environment(task_set: str | Environment, num_features: int, max_steps: int)
 
 
 @functools.lru_cache(maxsize=32)
-def _registered(name: str, num_features: int, max_steps: int) -> Environment:
+def _registered(name: str, num_features: int | None, max_steps: int | None) -> Environment:
     return make(name, num_features=num_features, max_steps=max_steps)
 
 
@@ -324,7 +326,7 @@ def _action_space(flat: bool) -> Any:
 
 
 def _grasp_and_move(actions: Any, shape: tuple[int, ...], flat: bool) -> np.ndarray:
-    """i32[..., 2] of actions in the action space; refuses others."""
+    """i32[..., 2] of actions in the action space. Raises ValueError for others."""
     array = np.asarray(actions)
     count = NUM_ACTIONS if flat else NUM_DIRECTIONS
     if array.shape != shape or array.dtype.kind not in "iu":

@@ -64,7 +64,7 @@ class _TrapTube(environment.Environment):
         task_set: str | Environment = "TrapTube-v0",
         *,
         flat_actions: bool = True,
-        num_features: int = 3,
+        num_features: int | None = None,
     ):
         """Checks its arguments.
 
@@ -73,7 +73,7 @@ class _TrapTube(environment.Environment):
             brings its own number of features and, as the default parameter, step limit.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `Tuple((Discrete(4), Discrete(4)))` or i32[2].
-          num_features: N, the feature channels of the observation.
+          num_features: N, the feature channels of the observation; see `make` of the package.
 
         Raises:
           ValueError: naming the value and what is allowed.
@@ -82,7 +82,7 @@ class _TrapTube(environment.Environment):
         if not isinstance(task_set, Environment):
             self._name = task_set
             task_set = make_environment(task_set, num_features=num_features)
-        elif num_features != 3:
+        elif num_features is not None:
             raise ValueError(
                 f"num_features={num_features} does not apply to an Environment of your own; "
                 "give it the base state you mean"
@@ -98,7 +98,7 @@ class _TrapTube(environment.Environment):
 
     @property
     def default_params(self) -> EnvParams:
-        """The step limit of the paper, or that of the `Environment` given."""
+        """The step limit of the task set or `Environment`: 50 for the paper's sets."""
         return EnvParams(max_steps_in_episode=self._default_max_steps)
 
     @property
@@ -183,7 +183,7 @@ class FiveValueTrapTube(_TrapTube):
         task_set: str | Environment = "TrapTube-v0",
         *,
         flat_actions: bool = True,
-        num_features: int = 3,
+        num_features: int | None = None,
         final_observation: bool = False,
     ):
         """See `SixValueTrapTube`; `final_observation` adds the observation before any

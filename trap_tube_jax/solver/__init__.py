@@ -1,8 +1,8 @@
 """The oracle: exact shortest plans and distances, by search over the public step.
 
-A task is a deterministic graph: its nodes are the places of food, tool and agent, its
-edges the 16 actions. Everything here runs on the host and steps whole frontiers at once
-through `dynamics.step`, so that there is one set of rules.
+A task is a deterministic graph. Its nodes are the positions of agent, tool and food, its
+edges the 16 actions. The search runs on the host. It takes its edges from `dynamics.step`, a
+whole frontier at a time, so that there is one set of rules.
 
     search.py      breadth-first search; shortest plans
     distance.py    distances from the start and to the goal, for every reachable state

@@ -1,13 +1,14 @@
 """Distances from the start and to the goal, for every state that a task can reach.
 
-Source: specification section 3.
+Source: environment.md, "One step".
 """
 
 import numpy as np
 from flax import struct
 
 from trap_tube_jax.objects import BOARD_SIZE
-from trap_tube_jax.solver.search import NUM_NODES, checked, levels
+from trap_tube_jax.positions import NUM_POSITIONS
+from trap_tube_jax.solver.search import checked, levels
 from trap_tube_jax.state import State
 
 UNKNOWN = -1
@@ -46,19 +47,24 @@ def distances(state: State) -> Distances:
 
     d(s) = 0 if s is solved, else 1 + min over the 16 actions a of d(step(s, a)).
 
-    It explores the whole graph, up to some two million states, which takes seconds;
-    `solve` stops at the goal.
+    It explores the whole graph, up to two million states, in seconds. `solve` stops at the
+    goal.
 
     Args:
       state: one unbatched state, at any time of an unfinished episode.
 
     Raises:
-      ValueError: the state is one that `solve` refuses.
+      ValueError: as `solve`.
     """
     from_start, nodes, successors = _explore(checked(state))
     to_goal = _distances_to_goal(from_start, nodes, successors)
-    shape = (BOARD_SIZE,) * 6
-    return Distances(from_start.reshape(shape), to_goal.reshape(shape))
+    return Distances(_by_cells(from_start), _by_cells(to_goal))
+
+
+def _by_cells(table: np.ndarray) -> np.ndarray:
+    """A table by position as one by the cells of food, tool and agent, in this order."""
+    by_agent_first = table.reshape((BOARD_SIZE,) * 6)
+    return by_agent_first.transpose(4, 5, 2, 3, 0, 1)
 
 
 def count_reachable(state: State) -> int:
@@ -73,7 +79,7 @@ def count_reachable(state: State) -> int:
 
 def _explore(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`from_start` i16[144^3] by node, the unsolved nodes i32[n], their successors i32[n, 16]."""
-    from_start = np.full(NUM_NODES, UNKNOWN, np.int16)
+    from_start = np.full(NUM_POSITIONS, UNKNOWN, np.int16)
     nodes, successors = [], []
     for depth, level in enumerate(levels(state)):
         from_start[level.nodes] = depth
@@ -90,7 +96,7 @@ def _distances_to_goal(
     """`to_goal` i16[144^3] by node: breadth-first, backward from the solved nodes."""
     to_goal = np.where(from_start == UNKNOWN, np.int16(UNKNOWN), np.int16(0))
     to_goal[nodes] = UNKNOWN
-    for distance in range(1, NUM_NODES):
+    for distance in range(1, NUM_POSITIONS):
         is_next = (to_goal[successors] == distance - 1).any(axis=1)
         if not is_next.any():
             break

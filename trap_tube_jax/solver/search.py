@@ -1,10 +1,12 @@
 """Breadth-first search over a task's graph, and the shortest plans that it finds.
 
-Source: specification sections 3 and 6.
+A node of the graph is a position, as `trap_tube_jax.positions` numbers them.
+
+Source: environment.md, "One step".
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,32 +16,29 @@ from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.environment import action_from_index
-from trap_tube_jax.geometry import cell_of
-from trap_tube_jax.objects import BOARD_SIZE, NUM_ACTIONS, NUM_DIRECTIONS
+from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
+from trap_tube_jax.positions import NUM_POSITIONS, cells_at, position_id
 from trap_tube_jax.state import State, validate
 
 Record = TypeVar("Record", bound=struct.PyTreeNode)
 
-NUM_CELLS = BOARD_SIZE**2
-# A node is one integer, (food * 144 + tool) * 144 + agent, each a cell in reading order.
-NUM_NODES = NUM_CELLS**3
 NO_DIRECTION = -1
 # Frontiers are padded to one of few sizes, since each size is compiled once.
 CHUNK_SIZES = (256, 1024, 4096)
 
 
 class Plan(struct.PyTreeNode):
-    """A shortest way to the goal, or the finding that there is none. NumPy arrays.
+    """A shortest plan, or the result that there is none. NumPy arrays.
 
     Of several shortest plans it is the first in the order of their action indices
     (4 * grasp + move), compared step by step.
 
     Attributes:
       actions: i32[L, 2], the (grasp, move) of every step. In a batch i32[B, L, 2], L
-        being the longest length: shorter plans are filled up with (-1, -1), which under
-        jit is no direction and changes nothing, and eagerly an action that is refused.
-      length: i32[] or i32[B], the number of steps, whatever an environment's step
-        limit; -1 if unsolvable.
+        being the longest length. Shorter plans end in (-1, -1). Under jit that changes
+        nothing; outside jit `Environment.step` raises ValueError for it.
+      length: i32[] or i32[B], the number of steps, which may exceed a step limit; -1 if
+        unsolvable.
       solvable: bool[] or bool[B], whether any sequence of actions leads to the goal.
     """
 
@@ -111,7 +110,7 @@ def solve_batch(states: State) -> Plan:
 
 
 def checked(state: State) -> State:
-    """Returns `state` as NumPy arrays if it can be solved; refuses it as `solve` does."""
+    """Returns a valid state as NumPy arrays; raises ValueError as `solve` does."""
     return validate(_to_host(state))
 
 
@@ -131,9 +130,9 @@ def levels(state: State) -> Iterator[Level]:
     """
     # Colours play no part; without them there is one compilation for every N.
     layout = jax.device_put(state.replace(palette=np.zeros((0, 0), np.uint8)))
-    nodes = np.array([_node_of(state)], np.int32)
+    nodes = np.array([position_id(state)], np.int32)
     origin = np.empty(0, np.int32)
-    is_known = np.zeros(NUM_NODES, bool)
+    is_known = np.zeros(NUM_POSITIONS, bool)
     is_known[nodes] = True
     while len(nodes):
         successors, solved = _expand_all(layout, nodes)
@@ -187,26 +186,15 @@ def _expand(layout: State, nodes: jax.Array) -> tuple[jax.Array, jax.Array]:
     def expand_node(node: jax.Array) -> tuple[jax.Array, jax.Array]:
         state = _state_at(layout, node)
         following = jax.vmap(lambda action: dynamics.step(state, action))(actions)
-        return jax.vmap(_node_of)(following), following.terminated
+        return jax.vmap(position_id)(following), following.terminated
 
     return jax.vmap(expand_node)(nodes)
 
 
-def _node_of(state: State) -> Any:
-    """i32[]: the node that a state is, of NumPy or JAX arrays."""
-    food, tool, agent = (
-        cell[0] * BOARD_SIZE + cell[1] for cell in (state.food, state.tool, state.agent)
-    )
-    return (food * NUM_CELLS + tool) * NUM_CELLS + agent
-
-
 def _state_at(layout: State, node: jax.Array) -> State:
     """The state that a node i32[] is, on the board and with the tool of `layout`."""
-    return layout.replace(
-        food=cell_of(node // NUM_CELLS**2),
-        tool=cell_of(node // NUM_CELLS % NUM_CELLS),
-        agent=cell_of(node % NUM_CELLS),
-    )
+    agent, tool, food = cells_at(node).astype(jnp.int32)
+    return layout.replace(agent=agent, tool=tool, food=food)
 
 
 def _to_plan(indices: np.ndarray | None) -> Plan:

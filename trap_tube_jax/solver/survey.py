@@ -1,6 +1,6 @@
 """How hard a task set is: the shortest plans and the graphs of many of its tasks.
 
-Source: specification section 6.
+Source: environment.md, "Task sets", has the figures of the paper's eight.
 """
 
 import dataclasses

@@ -1,0 +1,48 @@
+"""Many draws of a transfer, and what they are: counted, and told apart by board."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+import spec_reference as spec
+
+import trap_tube_jax as tt
+
+SAMPLES = 2**17
+OUTLINES = list(spec.outlines())
+BOARDS = np.array([list(spec.boards(outline)) for outline in OUTLINES])  # [9, 8, 12, 12]
+
+
+@functools.cache
+def batched(transfer: tt.Transfer) -> Callable[[jax.Array, tt.State], tt.State]:
+    """`transfer` of one state under many keys."""
+    return jax.jit(jax.vmap(transfer, (0, None)))
+
+
+def draw(transfer: tt.Transfer, seed: int, state: tt.State, number: int = SAMPLES) -> Any:
+    """A state of NumPy arrays [number, ...]."""
+    keys = jax.random.split(jax.random.key(seed), number)
+    return jax.tree.map(np.asarray, batched(transfer)(keys, state))
+
+
+def flat(cells: np.ndarray) -> np.ndarray:
+    return cells[..., 0] * 12 + cells[..., 1]
+
+
+def tally(shape: tuple[int, ...], *indices: np.ndarray) -> np.ndarray:
+    """How often each tuple of indices occurs."""
+    places = np.ravel_multi_index(indices, shape)
+    return np.bincount(places, minlength=int(np.prod(shape))).reshape(shape)
+
+
+def find_boards(boards: np.ndarray) -> np.ndarray:
+    """The index of each board among the 72 possible ones; -1 for any other."""
+    weights = np.random.default_rng(0).integers(1, 2**40, 144)
+    known = BOARDS.reshape(-1, 144).astype(np.int64) @ weights
+    order = np.argsort(known)
+    marks = boards.reshape(-1, 144).astype(np.int64) @ weights
+    index = order[np.searchsorted(known[order], marks).clip(max=len(known) - 1)]
+    same = np.all(BOARDS.reshape(-1, 12, 12)[index] == boards, axis=(1, 2))
+    return np.where(same, index, -1)

@@ -1,0 +1,159 @@
+"""Controls of comparative psychology: layouts that tell understanding from rules of thumb.
+
+Each function lists the layouts of one control. Most differ from the base task in one thing, so
+that the two can be compared in pairs. The rules are the same as everywhere.
+
+Source: controls.md, with the studies in full.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from trap_tube_jax.objects import BOARD_SIZE, GROUND, OBJECT_CHARS
+from trap_tube_jax.prng import loop_free
+from trap_tube_jax.state import State
+from trap_tube_jax.transfers import Transfer
+
+Cell = tuple[int, int]
+FIRST_ROW = 4  # of the base task's tube
+
+
+def trap_turned() -> tuple[State, ...]:
+    """The trap is in the wall, out of the food's way, and both ends are exits.
+
+    The short way goes past the trap. An agent that keeps away from it takes the long one.
+    Source: Visalberghi and Limongelli (1994), Reaux and Povinelli (2003): the inverted tube.
+    """
+    return (_layout("....1xx1....", "....eF.e....", "....e..e....", "....2222...."),)
+
+
+def trap_exchanged() -> tuple[State, ...]:
+    """Trap and exit have changed places, so that the food must go the other way.
+
+    Source: Visalberghi and Limongelli (1994): the side of the trap varies over trials.
+    """
+    return (_layout("....1111....", "....eF.x....", "....e..x....", "....2222...."),)
+
+
+def no_trap() -> tuple[State, ...]:
+    """No trap: its end of the tube is closed, or is a second exit.
+
+    Source: Visalberghi and Trinca (1989): the plain tube.
+    """
+    return (
+        _layout("....1111....", "....1F.e....", "....1..e....", "....2222...."),
+        _layout("....1111....", "....eF.e....", "....e..e....", "....2222...."),
+    )
+
+
+def two_traps() -> tuple[State, ...]:
+    """A second trap is in the wall on the way to the exit: the food can pass it, not the other.
+
+    The exit is on the base task's side, or on the other one.
+    Source: Seed et al. (2006): tubes with one functional and one non-functional trap.
+    """
+    return (
+        _layout("....1xx1....", "....xF.e....", "....x..e....", "....2222...."),
+        _layout("....1xx1....", "....eF.x....", "....e..x....", "....2222...."),
+    )
+
+
+def far_exit() -> tuple[State, ...]:
+    """The tube is three cells longer on the side of the exit.
+
+    Source: Limongelli, Boysen and Visalberghi (1995): the trap off the middle, which parts the
+    distance to the ends from the side of the trap.
+    """
+    return (_layout("....1111111.", "....xF....e.", "....x.....e.", "....2222222."),)
+
+
+def short_tool() -> tuple[State, ...]:
+    """The tool is two cells long and reaches the food from the nearer wall only.
+
+    Source: Visalberghi and Trinca (1989): sticks too short for the usual way.
+    """
+    return (_layout(*_BASE_TUBE, tool=(5, 1), extent=(2, 1)),)
+
+
+def too_short_tool() -> tuple[State, ...]:
+    """The tool is one cell long and reaches the food from nowhere. No plan solves this.
+
+    Source: Visalberghi and Trinca (1989), Mulcahy, Call and Dunbar (2005): sticks too short.
+    """
+    return (_layout(*_BASE_TUBE, tool=(5, 1), extent=(1, 1)),)
+
+
+def tool_in_tube() -> tuple[State, ...]:
+    """The tool is in the tube already, on the wrong side of the food, and must come out first.
+
+    Source: Seed et al. (2006): the stick put into the tube before the trial.
+    """
+    return (_layout(*_BASE_TUBE, tool=(5, 6)),)
+
+
+def tool_at_food() -> tuple[State, ...]:
+    """The tool touches the food already, on the right side of it.
+
+    Source: Bates, Carlson-Luden and Bretherton (1980): tool and goal in contact.
+    """
+    return (_layout(*_BASE_TUBE, tool=(4, 4)),)
+
+
+def food_outside() -> tuple[State, ...]:
+    """The food is outside the tube, beyond it or near the agent: no tool is needed.
+
+    Source: after Köhler (1925): a tool is fetched because the goal is out of reach.
+    """
+    empty = ("....1111....", "....x..e....", "....x..e....", "....2222....")
+    return (_layout(*empty, food=(5, 10)), _layout(*empty, food=(5, 2)))
+
+
+def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
+    """The transfer that draws one of the layouts, each with equal chance.
+
+    It keeps the state's palette, time and flags, so that it composes with the others.
+
+    Args:
+      layouts: a function of no arguments that lists them, as those of this module.
+    """
+
+    def transfer(key: jax.Array, state: State) -> State:
+        choices = layouts()
+        index = jax.random.randint(loop_free(key), (), 0, len(choices))
+        fields = ("board", "agent", "tool", "tool_extent", "food")
+        tables = {name: [np.asarray(getattr(each, name)) for each in choices] for name in fields}
+        return state.replace(
+            **{name: jnp.asarray(np.stack(table))[index] for name, table in tables.items()}
+        )
+
+    transfer.__name__ = layouts.__name__.replace("_", " ")
+    return transfer
+
+
+CONTROLS = (
+    trap_turned,
+    trap_exchanged,
+    no_trap,
+    two_traps,
+    far_exit,
+    short_tool,
+    too_short_tool,
+    tool_in_tube,
+    tool_at_food,
+    food_outside,
+)
+
+_BASE_TUBE = ("....1111....", "....xF.e....", "....x..e....", "....2222....")
+
+
+def _layout(
+    *tube: str, tool: Cell = (4, 1), extent: Cell = (4, 1), food: Cell | None = None
+) -> State:
+    """The base task with other rows 4 to 7, another tool, or food that is not drawn."""
+    empty = OBJECT_CHARS[GROUND] * BOARD_SIZE
+    below = BOARD_SIZE - FIRST_ROW - len(tube)
+    rows = [*[empty] * FIRST_ROW, *tube, *[empty] * below]
+    return State.from_ascii(rows, agent=(9, 1), tool=tool, tool_extent=extent, food=food)

@@ -1,0 +1,212 @@
+"""The perceptual and the structural transfer, from none of it to all of it.
+
+A strength s from 0 to 1 says how far from the base task the draws may go. At 0 nothing is changed
+from it. At 1 the draws are those of the paper's transfer. What a layout, or the direction of a
+feature point, can be at one strength, it can be at any higher one.
+
+Source: graded.md; the paper, section "Structural", for interpolation on the sphere.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from trap_tube_jax.geometry import cell_of
+from trap_tube_jax.layouts import NUM_FRAMES, layout_tables, padded
+from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.prng import loop_free
+from trap_tube_jax.state import State, base_state
+from trap_tube_jax.transfers import Transfer, perceptual, recolor, sphere_points, structural
+
+TOLERANCE = 1e-9  # of a distance, against the rounding of strength * distance
+
+
+def graded_perceptual(strength: float) -> Transfer:
+    """The perceptual transfer with draws no farther from the base task than `strength` allows.
+
+    Every choice of `perceptual` is uniform over those of its outcomes whose distance d from
+    the base task's satisfies d <= d_min + strength * (d_max - d_min), d_min and d_max being
+    the least and the greatest distance among the outcomes of this choice. See graded.md,
+    "Layouts", for the choices and their distances.
+
+    Args:
+      strength: 0, the base task's layout, to 1, `perceptual` itself.
+
+    Returns:
+      A transfer (key, state) -> state. It keeps the state's palette, time and flags.
+
+    Raises:
+      ValueError: `strength` is not a number from 0 to 1.
+    """
+    strength = _check_strength(strength)
+    if strength == 1:
+        return perceptual
+
+    near, full = near_layouts(strength), layout_tables()
+
+    def transfer(key: jax.Array, state: State) -> State:
+        tables = jax.tree.map(jnp.asarray, near)
+        layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
+        frame, assignment = tables.layout[layout % len(tables.layout)]
+        food %= tables.num_food[frame]
+        tool %= tables.num_tools[frame]
+        agent %= tables.num_agents[frame, tool]
+        return state.replace(
+            board=jnp.asarray(full.board)[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
+            food=cell_of(tables.food[frame, food]),
+            tool=cell_of(tables.tool[frame, tool]),
+            tool_extent=jnp.asarray(full.extent)[frame],
+            agent=cell_of(tables.agent[frame, tool, agent]),
+        )
+
+    return _named(transfer, "perceptual", strength)
+
+
+def graded_structural(strength: float) -> Transfer:
+    """The structural transfer with features part of the way from the state's to the drawn ones.
+
+    `structural` draws a point u on the unit sphere for each kind of object. With r b the
+    state's own features as a point, |b| = 1, and theta the angle between b and u, the new
+    features are those of the point
+
+        ((1 - s) r + s) (cos(s theta) b + sin(s theta) t)
+
+    t being the unit vector orthogonal to b in the plane of b and u, on the side of u. So the
+    direction goes the fraction s of the great circle from b to u. For N = 1, where there is
+    no circle, the point is (1 - s) r b + s u.
+
+    Args:
+      strength: s, from 0, the palette as it is, to 1, `structural` itself.
+
+    Returns:
+      A transfer (key, state) -> state that changes the palette only.
+
+    Raises:
+      ValueError: `strength` is not a number from 0 to 1.
+    """
+    strength = _check_strength(strength)
+    if strength == 1:
+        return structural
+
+    def transfer(key: jax.Array, state: State) -> State:
+        # The middle of the interval that floor maps to the feature, so that 0 changes nothing.
+        own = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
+        drawn = sphere_points(key, state.palette.shape[-1])
+        return recolor(state, points_between(own, drawn, strength).clip(-1, 1))
+
+    return _named(transfer, "structural", strength)
+
+
+def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Array:
+    """f32[K, N]: the points of `graded_structural`, from `own` r b and `drawn` u, [K, N] each."""
+    if own.shape[-1] == 1:
+        return (1 - strength) * own + strength * drawn
+    radius = jnp.linalg.norm(own, axis=-1, keepdims=True)
+    start = own / radius
+    cosine = jnp.sum(start * drawn, axis=-1, keepdims=True)
+    across = drawn - cosine * start
+    sine = jnp.linalg.norm(across, axis=-1, keepdims=True)
+    angle = strength * jnp.atan2(sine, cosine)
+    # Where u is b or -b there is no plane, and `across` is zero.
+    direction = jnp.cos(angle) * start + jnp.sin(angle) * across / jnp.maximum(sine, 1e-12)
+    return ((1 - strength) * radius + strength) * direction
+
+
+class NearLayouts(NamedTuple):
+    """The outcomes of `graded_perceptual`; otherwise as `LayoutTables`.
+
+    Attributes:
+      layout: i32[L, 2], the (frame, assignment) pairs.
+      food: u8[32, F], the cells inside the tube, then padding.
+      num_food: u32[32], how many there are.
+      tool: u8[32, T], the candidates of the tool's top-left cell, then padding.
+      num_tools: u32[32], how many there are.
+      agent: u8[32, T, A], the agent's cells for each candidate, then padding.
+      num_agents: u32[32, T], how many there are; 1 in the padding.
+    """
+
+    layout: np.ndarray
+    food: np.ndarray
+    num_food: np.ndarray
+    tool: np.ndarray
+    num_tools: np.ndarray
+    agent: np.ndarray
+    num_agents: np.ndarray
+
+
+@functools.lru_cache(maxsize=64)
+def near_layouts(strength: float) -> NearLayouts:
+    """Builds the tables of a strength, once per process."""
+    full, base = layout_tables(), base_state()
+    foods, tools, agents = [], [], []
+    for frame in range(NUM_FRAMES):
+        foods.append(_nearest_cells(np.unique(full.food[frame]), base.food, strength))
+        corners = full.tool[frame, : full.num_tools[frame]].astype(np.int32)
+        tools.append(_nearest_cells(corners, base.tool, strength))
+        agents.append(
+            [
+                _nearest_cells(cells[:count].astype(np.int32), base.agent, strength)
+                for corner, cells, count in zip(
+                    corners, full.agent[frame], full.num_agents[frame], strict=False
+                )
+                if corner in tools[-1]
+            ]
+        )
+    food, num_food = padded(foods)
+    tool, num_tools = padded(tools)
+    agent, num_agents = zip(*(padded(rows, len(tool[0])) for rows in agents), strict=True)
+    longest = max(rows.shape[1] for rows in agent)
+    agent = np.stack([np.pad(rows, ((0, 0), (0, longest - rows.shape[1]))) for rows in agent])
+    near = _is_near(_layout_distances(), strength)
+    return NearLayouts(
+        np.argwhere(near).astype(np.int32),
+        food,
+        num_food,
+        tool,
+        num_tools,
+        agent,
+        np.stack(num_agents),
+    )
+
+
+def _layout_distances() -> np.ndarray:
+    """i64[32, 8]: cells that differ from the base task's, of the board and of the tool's shape.
+
+    The tools are compared with their top-left cells laid upon each other.
+    """
+    full, base = layout_tables(), base_state()
+    board = np.asarray(base.board).reshape(-1)
+    board_cells = np.sum(full.board != board, axis=-1)
+    own = np.asarray(base.tool_extent)
+    shared = np.minimum(full.extent, own).prod(axis=1)
+    tool_cells = full.extent.prod(axis=1) + own.prod() - 2 * shared
+    return board_cells + tool_cells[:, None]
+
+
+def _nearest_cells(cells: np.ndarray, target: Any, strength: float) -> np.ndarray:
+    """Of flat indices, those near the cell `target`; distances count steps up, down and across."""
+    row, column = np.asarray(target)
+    distance = abs(cells // BOARD_SIZE - row) + abs(cells % BOARD_SIZE - column)
+    return cells[_is_near(distance, strength)]
+
+
+def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
+    """bool[...]: whether a distance is at most d_min + strength * (d_max - d_min)."""
+    nearest, farthest = distance.min(), distance.max()
+    return distance <= nearest + strength * (farthest - nearest) + TOLERANCE
+
+
+def _check_strength(strength: Any) -> float:
+    is_number = isinstance(strength, int | float | np.integer | np.floating)
+    if isinstance(strength, bool) or not is_number or not 0 <= strength <= 1:
+        raise ValueError(f"strength must be a number from 0 to 1, got {strength!r}")
+    return float(strength)
+
+
+def _named(transfer: Any, name: str, strength: float) -> Transfer:
+    """Names the transfer as labels and messages show it."""
+    transfer.__name__ = f"{name} {strength:g}"
+    return transfer

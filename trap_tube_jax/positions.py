@@ -1,0 +1,32 @@
+"""Where agent, tool and food are, as one number, and back.
+
+Board, palette and the tool's size do not change within an episode. So this number, with the
+task, says which state an episode is in.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.state import State
+
+NUM_CELLS = BOARD_SIZE**2
+NUM_POSITIONS = NUM_CELLS**3
+
+
+def position_id(state: State) -> jax.Array:
+    """The number i32[] in 0 to 144^3 - 1 of a state's position.
+
+    (agent * 144 + tool) * 144 + food, each a cell in reading order; the tool's is its top-left
+    one. A state of NumPy arrays gives a NumPy number.
+    """
+    cells = (state.agent, state.tool, state.food)
+    agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
+    return (agent * NUM_CELLS + tool) * NUM_CELLS + food
+
+
+def cells_at(position: jax.Array) -> jax.Array:
+    """u8[3, 2]: the cells of agent, tool and food at a position. Undoes `position_id`."""
+    agent_and_tool, food = jnp.divmod(position, NUM_CELLS)
+    cell = jnp.stack([*jnp.divmod(agent_and_tool, NUM_CELLS), food])
+    return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)
