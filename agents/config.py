@@ -72,9 +72,14 @@ class Config:
       curiosity: source of the intrinsic reward. `icm`: the paper's, forward and inverse
         models over the policy's GRU outputs. `icm-detached`: an encoder of its own, trained
         by the inverse loss alone. `rnd`: imitation of a random network. `counts`: how seldom
-        training has seen an observation. `none`: plain PPO. Or a name that you registered.
-      intrinsic_scale: weight of the normalised intrinsic reward.
+        training has seen an observation. `effects`: how seldom something other than the agent
+        comes to a place that is new to the episode. `none`: plain PPO. Or a name that you
+        registered.
+      intrinsic_scale: weight of the normalised intrinsic reward, or of its advantage.
       curiosity_coef: weight of the curiosity's losses.
+      rewards: what becomes of extrinsic and intrinsic reward. `summed`: both are divided by their
+        deviation and added; there is one value. `apart`: each has a value of its own, and the
+        normalised advantages are added (`agents.ppo.streams`).
       episodic_novelty: pay the intrinsic reward only for observations that are new in
         their episode.
       reward_rate: weight of the past in the moving moments that normalise both rewards.
@@ -82,6 +87,11 @@ class Config:
       imitation_coef: weight of imitating the agent's own solved episodes; 0 for none.
       imitation_episodes: the newest solved episodes that are remembered and imitated.
 
+      replayed: share of the episodes that play tasks again that were failed.
+      failures: how many failed tasks, the newest, are kept for that.
+
+      facing: whether the agent sees and acts in a frame in which the food lies ahead at first,
+        one of the board's eight symmetries, instead of on the board as it is.
       encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
         seen from agent and food is all that is encoded.
       filters: channels of the first convolution, and of all later ones; units of the layers
@@ -118,13 +128,18 @@ class Config:
     # Intrinsic reward.
     curiosity: str = _setting("icm")
     intrinsic_scale: float = _setting(0.1, 0, unused={"curiosity": ("none",)})
-    curiosity_coef: float = _setting(10.0, 0, unused={"curiosity": ("none", "counts")})
+    curiosity_coef: float = _setting(10.0, 0, unused={"curiosity": ("none", "counts", "effects")})
+    rewards: Literal["summed", "apart"] = _setting("summed", unused={"curiosity": ("none",)})
     episodic_novelty: bool = _setting(False, unused={"curiosity": ("none",)})
     reward_rate: float = _setting(0.9, 0, 1)
     # Imitation of the agent's own successes.
     imitation_coef: float = _setting(0.0, 0)
     imitation_episodes: int = _setting(16, 1, unused={"imitation_coef": (0,)})
+    # Failed tasks, played again.
+    replayed: float = _setting(0.0, 0, 1)
+    failures: int = _setting(1024, 1, unused={"replayed": (0,)})
     # The network.
+    facing: bool = _setting(False)
     encoder: Literal["paper", "objects"] = _setting("paper")
     filters: tuple[int, int] = _setting((32, 64), 1, 4096)
     hidden: int = _setting(64, 1, 65_536)
@@ -144,6 +159,8 @@ class Config:
         registry.curiosity_factory(self.curiosity)
         for field in dataclasses.fields(self):
             self._check_use(field)
+        if self.rewards == "apart" and self.bootstrap != "value":
+            raise ValueError(f"rewards='apart' needs bootstrap='value', got {self.bootstrap!r}")
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
             raise ValueError(
@@ -203,6 +220,16 @@ class Config:
         return self.episodes * self.max_steps
 
     @property
+    def streams(self) -> int:
+        """V, how many streams of rewards have a value each."""
+        return 2 if self.rewards == "apart" else 1
+
+    @property
+    def num_replayed(self) -> int:
+        """How many episodes of an iteration play a failed task again."""
+        return round(self.replayed * self.episodes)
+
+    @property
     def gradient_steps(self) -> int:
         """The number of gradient steps of one iteration."""
         return self.epochs * (self.episodes // self.minibatch)
@@ -226,17 +253,28 @@ PRESETS: dict[str, dict[str, Any]] = {
         "intrinsic_scale": 0.3,
         "imitation_coef": 1.0,
     },
-    # Trained on {P, St, Sy}: the encoder sees objects instead of colours.
+    # Trained on {P, St, Sy}: new effects are paid, failed tasks played again, and the encoder
+    # sees objects instead of colours, ahead of it.
     "best": {
         "env_id": "pstsy",
-        "iterations": 800,
+        "iterations": 1100,
+        "episodes": 512,
         "epochs": 4,
+        "minibatch": 64,
+        "discount": 0.995,
         "bootstrap": "value",
-        "curiosity": "none",
-        "entropy_coef": 3e-3,
+        "value_coef": 0.1,
+        "entropy_coef": 0.01,
+        "learning_rate": 7e-4,
+        "curiosity": "effects",
+        "intrinsic_scale": 1.0,
+        "rewards": "apart",
+        "replayed": 0.8,
+        "facing": True,
         "encoder": "objects",
         "filters": (64, 64),
         "hidden": 128,
+        "chunk": 256,
     },
 }
 

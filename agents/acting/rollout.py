@@ -32,7 +32,7 @@ class Trajectory(NamedTuple):
       features: f32[T + 1, B, F], the encoded observations.
       embedding: f32[T, B, hidden], the GRU's outputs.
       log_prob: f32[T, B], of the actions.
-      value: f32[T + 1, B], of every observation, the last one included.
+      value: f32[T + 1, B, V], of every observation, the last one included, for each stream.
     """
 
     episodes: Episodes

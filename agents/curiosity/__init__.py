@@ -3,6 +3,7 @@
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience
 from agents.curiosity.counts import Counts
+from agents.curiosity.effects import Effects
 from agents.curiosity.icm import ICM
 from agents.curiosity.icm_detached import DetachedICM
 from agents.curiosity.rnd import RND
@@ -15,6 +16,7 @@ __all__ = ["Curiosity", "Experience", "make", "register"]
 register("icm", lambda config, env: ICM(config))
 register("icm-detached", lambda config, env: DetachedICM(config))
 register("rnd", lambda config, env: RND(config))
+register("effects", lambda config, env: Effects(config))
 register("counts", lambda config, env: Counts(env))
 register("none", lambda config, env: Curiosity())
 

@@ -26,7 +26,7 @@ class Agent:
     def __init__(self, config: Config):
         self.encoder = ENCODERS[config.encoder](config.filters)
         self.core = Core(config.hidden, config.embedding)
-        self.heads = Heads()
+        self.heads = Heads(config.streams)
         self._hidden = config.hidden
         self._board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
 

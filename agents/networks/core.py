@@ -23,7 +23,7 @@ class Outputs(NamedTuple):
 
     Attributes:
       actions: the policy's distribution of actions, leading axes [...].
-      value: f32[...].
+      value: f32[..., V], of each stream of rewards.
     """
 
     actions: ActionDistribution
@@ -114,12 +114,18 @@ class Core(nn.Module):
 
 
 class Heads(nn.Module):
-    """Grasp logits, move logits and value, each one layer from the embedding."""
+    """Grasp logits, move logits and values, each one layer from the embedding.
+
+    Attributes:
+      streams: V, how many streams of rewards have a value each.
+    """
+
+    streams: int = 1
 
     @nn.compact
     def __call__(self, embedding: jax.Array) -> Outputs:
         """Maps f32[..., hidden] to `Outputs`."""
         grasp = output_dense(NUM_DIRECTIONS, name="grasp")(embedding)
         move = output_dense(NUM_DIRECTIONS, name="move")(embedding)
-        value = output_dense(1, name="value")(embedding)[..., 0]
+        value = output_dense(self.streams, name="value")(embedding)
         return Outputs(ActionDistribution(grasp, move), value)

@@ -18,6 +18,7 @@ import optax
 from agents import curiosity as curiosities
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import Episodes, along_episodes, take
+from agents.acting.frames import Frame
 from agents.acting.identity import first_visits, observation_ids
 from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.config import Config
@@ -25,7 +26,8 @@ from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
 from agents.networks.windows import encode_rows
 from agents.parallel.sharding import ALONE, Shards
-from agents.ppo import losses, replay, returns
+from agents.ppo import losses, replay, returns, streams
+from agents.ppo.failures import Failures
 from agents.ppo.optimizer import make_optimizer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import BOARD_SIZE
@@ -47,9 +49,10 @@ class TrainState(NamedTuple):
       params: `encoder`, `core`, `heads` of the policy network, and `curiosity`.
       opt_state: the optimizer's state.
       extrinsic: moments of the extrinsic reward.
-      intrinsic: moments of the intrinsic reward.
+      intrinsic: moments of the intrinsic reward, or of its returns where rewards are apart.
       memory: what the curiosity carries along.
       replay: the newest solved episodes; never filled without imitation.
+      failures: failed tasks, to be played again.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
@@ -62,6 +65,7 @@ class TrainState(NamedTuple):
     intrinsic: returns.Moments
     memory: Any
     replay: Episodes
+    failures: Failures
     key: jax.Array
     iteration: jax.Array
     episodes: jax.Array
@@ -76,7 +80,7 @@ class Batch(NamedTuple):
       observation_id: i32[T + 1, B], equal only for equal observations.
       log_prob: f32[T, B], of the actions under the acting parameters.
       advantage: f32[T, B], normalised.
-      value_target: f32[T, B].
+      value_target: f32[T, B, V], for each stream of rewards.
     """
 
     episodes: Episodes
@@ -110,7 +114,7 @@ class Learner:
 
     def init(self, key: jax.Array) -> TrainState:
         """The first state."""
-        params_key, key = jax.random.split(key)
+        params_key, failures_key, key = jax.random.split(key, 3)
         params = self.init_params(params_key)
         zero = jnp.zeros((), jnp.int32)
         return TrainState(
@@ -122,6 +126,7 @@ class Learner:
             replay=replay.empty(
                 self.env.base, self.config.imitation_episodes, self.config.max_steps
             ),
+            failures=Failures.untried(failures_key, self.config.failures),
             key=key,
             iteration=zero,
             episodes=zero,
@@ -138,22 +143,50 @@ class Learner:
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Plays, prepares, learns: the next state, and metrics f32[] each."""
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
-        trajectory = self.play(state.params, reset_key, action_key)
+        places, reset_keys = self.draw_tasks(state.failures, reset_key)
+        trajectory = self.play(state.params, reset_keys, action_key)
         batch, state, play_metrics = self.prepare(state, trajectory)
         params, opt_state, loss_metrics = self.optimize(state, batch, update_key)
         state = state._replace(
             params=params,
             opt_state=opt_state,
+            failures=self.note_failures(state.failures, places, reset_keys, batch.episodes.solved),
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + self.config.episodes,
         )
         return state, {**play_metrics, **loss_metrics}
 
-    def play(self, params: Params, reset_key: jax.Array, action_key: jax.Array) -> Trajectory:
+    def draw_tasks(self, failures: Failures, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """An iteration's tasks, first those that were failed before, then new ones.
+
+        Returns:
+          The places i32[M] of the former in `failures`, and the reset keys [B] of all.
+        """
+        again = self.config.num_replayed
+        if not again:
+            return jnp.zeros(0, jnp.int32), jax.random.split(key, self.config.episodes)
+        failures_key, key = jax.random.split(key)
+        places = failures.draw(failures_key, again)
+        new = jax.random.split(key, self.config.episodes - again)
+        return places, jnp.concatenate([failures.reset_keys(places), new])
+
+    def note_failures(
+        self, failures: Failures, places: jax.Array, reset_keys: jax.Array, solved: jax.Array
+    ) -> Failures:
+        """The failures after an iteration; arguments as `draw_tasks` gives them, bool[B] solved."""
+        again = self.config.num_replayed
+        if not again:
+            return failures
+        failures = failures.without(places, solved[:again])
+        return failures.with_new(reset_keys[again:], ~solved[again:])
+
+    def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays this device's share of an iteration's episodes."""
-        reset_keys = jax.random.split(reset_key, self.config.episodes)
-        initial, _ = jax.vmap(self.env.reset)(self.shards.part(reset_keys))
+        initial, timestep = jax.vmap(self.env.reset)(self.shards.part(reset_keys))
+        if self.config.facing:
+            frame = jax.vmap(Frame.facing_food)(timestep.observation)
+            initial = jax.vmap(Frame.state)(frame, initial)
         choose = self.shards.drawing(sample_action)
         chunk = self.config.chunk
         return rollout(
@@ -181,11 +214,9 @@ class Learner:
         novelty = novelty * episodes.mask
         if config.episodic_novelty:
             novelty = novelty * first_visits(observation_id)[1:]
-        extrinsic = state.extrinsic.update(episodes.reward, episodes.mask, config.reward_rate)
-        intrinsic = state.intrinsic.update(novelty, episodes.mask, config.reward_rate)
-        reward = episodes.reward / extrinsic.deviation
-        reward = reward + config.intrinsic_scale * novelty / intrinsic.deviation
-        advantage, target = advantages_and_targets(config, reward, episodes, value)
+        join = advantages_of_sum if config.rewards == "summed" else advantages_apart
+        moments = (state.extrinsic, state.intrinsic)
+        advantage, target, moments = join(config, episodes, novelty, value, moments)
         batch = Batch(
             episodes=episodes,
             observation_id=observation_id,
@@ -194,14 +225,17 @@ class Learner:
             value_target=target,
         )
         metrics = {
-            "success": jnp.mean(episodes.solved.astype(jnp.float32)),
+            "success": jnp.mean(episodes.solved[config.num_replayed :].astype(jnp.float32)),
             "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
             "intrinsic_reward": jnp.sum(novelty) / jnp.sum(episodes.mask),
             "distinct_observations": jnp.max(observation_id) + 1,
         }
+        if config.num_replayed:
+            solved = episodes.solved[: config.num_replayed]
+            metrics["replayed_success"] = jnp.mean(solved.astype(jnp.float32))
         state = state._replace(
-            extrinsic=extrinsic,
-            intrinsic=intrinsic,
+            extrinsic=moments[0],
+            intrinsic=moments[1],
             memory=memory,
             transitions=state.transitions + jnp.sum(episodes.length),
         )
@@ -292,7 +326,7 @@ class Learner:
         actions, value = self.agent.act(params, embedding)
         log_prob = actions.log_prob(batch.episodes.action)
         surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
-        value_error = losses.squared_error(value, batch.value_target)
+        value_error = jnp.sum(losses.squared_error(value, batch.value_target), axis=-1)
         entropy = actions.entropy()
         terms = {
             "policy_loss": losses.padded_mean(surrogate, mask),
@@ -420,6 +454,71 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
     curiosity = curiosities.make(config, env)
     learner = Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
     return Train(learner.init, learner.iterate, learner)
+
+
+RewardMoments = tuple[returns.Moments, returns.Moments]
+
+
+def advantages_of_sum(
+    config: Config,
+    episodes: Episodes,
+    novelty: jax.Array,
+    value: jax.Array,
+    moments: RewardMoments,
+) -> tuple[jax.Array, jax.Array, RewardMoments]:
+    """Advantages of the sum of both rewards, each over its deviation.
+
+    Args:
+      config: the settings.
+      episodes: the episodes.
+      novelty: f32[T, B], the intrinsic reward, 0 after an episode's end.
+      value: f32[T + 1, B, 1], of every observation.
+      moments: of extrinsic and intrinsic reward so far.
+
+    Returns:
+      Advantages f32[T, B], the values' targets f32[T, B, 1], and the new moments.
+    """
+    extrinsic = moments[0].update(episodes.reward, episodes.mask, config.reward_rate)
+    intrinsic = moments[1].update(novelty, episodes.mask, config.reward_rate)
+    reward = episodes.reward / extrinsic.deviation
+    reward = reward + config.intrinsic_scale * novelty / intrinsic.deviation
+    advantage, target = advantages_and_targets(config, reward, episodes, value[..., 0])
+    return advantage, target[..., None], (extrinsic, intrinsic)
+
+
+def advantages_apart(
+    config: Config,
+    episodes: Episodes,
+    novelty: jax.Array,
+    value: jax.Array,
+    moments: RewardMoments,
+) -> tuple[jax.Array, jax.Array, RewardMoments]:
+    """The sum of the advantages of both rewards, normalised apart; see `agents.ppo.streams`.
+
+    The task's reward, at most 1 an episode, is taken as it is; the curiosity's is divided by the
+    deviation of its returns.
+
+    Args:
+      config: the settings.
+      episodes: the episodes.
+      novelty: f32[T, B], the intrinsic reward, 0 after an episode's end.
+      value: f32[T + 1, B, 2], of every observation: the task's and the curiosity's.
+      moments: of the extrinsic reward and of the intrinsic returns so far.
+
+    Returns:
+      Advantages f32[T, B], the values' targets f32[T, B, 2], and the new moments.
+    """
+    gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
+    mask = episodes.mask
+    intrinsic = moments[1].update(discounted_returns(novelty, gamma), mask, config.reward_rate)
+    task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
+    own = streams.continuing_value(value[..., 1], mask)
+    discount = jnp.full_like(novelty, gamma)
+    reward = novelty / intrinsic.deviation
+    curiosity = generalized_advantages(reward, discount, own, mask, lambda_)
+    target = jnp.stack([task_target, curiosity + own[:-1]], axis=-1)
+    advantage = streams.joint_advantage(task, curiosity, config.intrinsic_scale, mask)
+    return advantage, target, (moments[0], intrinsic)
 
 
 def advantages_and_targets(

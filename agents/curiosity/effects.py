@@ -1,0 +1,68 @@
+"""Effects: a step pays where something other than the agent comes to a place new to the episode.
+
+Source: own. Relatives: visits counted within an episode, in NGU (Badia et al., 2020) and NovelD
+(Zhang et al., 2021); change as a reward, in C-BET (Parisi et al., 2021); the impact of actions,
+in RIDE (Raileanu and Rocktaeschel, 2020).
+"""
+
+import jax
+import jax.numpy as jnp
+
+from agents.acting.episodes import Episodes
+from agents.acting.identity import first_visits
+from agents.config import Config
+from agents.curiosity.base import Curiosity, Experience, Params
+from trap_tube_jax.objects import BOARD_SIZE
+
+NUM_KINDS = 2
+LOWEST_RATE = 1e-4  # effects a step, below which an effect does not pay more
+
+
+class Effects(Curiosity):
+    """reward_t = sum over kinds k of new_k(o_0, ..., o_{t+1}) / rate_k.
+
+    `new` is a function of one episode's observations (`new_effects`). There are two kinds of
+    effects: on the food, and on anything else but the agent's body. Each pays the inverse of
+    its rate, a moving mean of how often it happens in a step. So all kinds pay the same in total,
+    a rare one more each time, and one that the agent learns to bring about ever less.
+
+    It assumes that the agent knows its own colour and the food's, which no transfer changes.
+
+    Args:
+      config: the settings, of which `reward_rate` counts.
+    """
+
+    needs_all_episodes = True
+
+    def __init__(self, config: Config):
+        self._keep = config.reward_rate
+
+    def memory(self) -> jax.Array:
+        """The rates f32[2]; 0 before the first batch, which is taken as it is."""
+        return jnp.zeros(NUM_KINDS)
+
+    def reward(
+        self, params: Params, memory: jax.Array, experience: Experience
+    ) -> tuple[jax.Array, jax.Array]:
+        """What the new effects of every step pay, and the rates with this iteration's."""
+        del params
+        mask = experience.episodes.mask
+        new = new_effects(experience.episodes) * mask[None]
+        rate = jnp.sum(new, axis=(1, 2)) / jnp.sum(mask)
+        rate = jnp.where(memory > 0, self._keep * memory + (1 - self._keep) * rate, rate)
+        return jnp.tensordot(1 / jnp.maximum(rate, LOWEST_RATE), new, axes=1), rate
+
+
+def new_effects(episodes: Episodes) -> jax.Array:
+    """f32[2, T, B]: 1 where a step brings the food, or the tool, to a cell new to the episode.
+
+    The tool is all that moves beside agent and food. So its cell is new exactly where the board
+    without these two looks as it has not looked before in the episode. A tool that has the
+    colour of what it moves over is the exception: its moves pay and are not seen.
+    """
+    cell = episodes.cells.astype(jnp.int32)
+    cell = cell[..., 0] * BOARD_SIZE + cell[..., 1]
+    return jnp.stack([first_visits(cell[..., thing])[1:] for thing in (FOOD, TOOL)])
+
+
+TOOL, FOOD = 1, 2  # in `Episodes.cells`

@@ -1,0 +1,106 @@
+"""Effects: what is new in an episode, outside the agent's own body."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents import Config
+from agents.acting.episodes import Episodes, cells_of
+from agents.curiosity import Experience
+from agents.curiosity.effects import Effects, new_effects
+
+STEPS, BATCH = 40, 48
+
+
+def random_episodes(env: tt.Environment) -> Episodes:
+    """Episodes of an agent that repeats its actions, so that it moves things about."""
+
+    def play(key):
+        reset_key, action_key, keep_key = jax.random.split(key, 3)
+        initial, _ = jax.vmap(env.reset)(jax.random.split(reset_key, BATCH))
+        drawn = jax.random.randint(action_key, (STEPS, BATCH, 2), 0, 4)
+        keeps = jax.random.bernoulli(keep_key, 0.7, (STEPS, BATCH, 2))
+
+        def step(carry, inputs):
+            state, last = carry
+            action = jnp.where(inputs[1], last, inputs[0])
+            after, timestep = jax.vmap(env.step)(state, action)
+            alive = 1.0 - (state.terminated | state.truncated)
+            return (after, action), (cells_of(after), action, timestep, alive)
+
+        carry = (initial, drawn[0])
+        _, (cells, action, timestep, mask) = jax.lax.scan(step, carry, (drawn, keeps))
+        cells = jnp.concatenate([cells_of(initial)[None], cells])
+        return Episodes(initial, cells, action, timestep.reward, timestep.discount, mask)
+
+    return jax.jit(play)(jax.random.key(0))
+
+
+def read_off(boards: np.ndarray, ground: np.ndarray, own: dict[str, np.ndarray]) -> np.ndarray:
+    """What is new, i64[2, T], by the boards u8[T + 1, 12, 12, N] of one episode alone.
+
+    The agent stands on ground wherever it is, and so does food outside its tube.
+    """
+    is_agent = np.asarray(np.all(boards == own["agent"], axis=-1))
+    is_food = np.asarray(np.all(boards == own["food"], axis=-1))
+    rest = boards.copy()
+    rest[is_agent | is_food] = ground
+    found = []
+    for views in (is_food, rest):
+        seen, new = set(), []
+        for view in views:
+            new.append(view.tobytes() not in seen)
+            seen.add(view.tobytes())
+        found.append(new[1:])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("short", ["base", "p", "psy", "pstsy"])
+def test_effects_can_be_read_off_the_observations(short):
+    env = tt.make(short, max_steps=STEPS)
+    episodes = random_episodes(env)
+    boards = np.asarray(jax.jit(Episodes.observations)(episodes))
+    found = np.asarray(new_effects(episodes) * episodes.mask[None])
+    own = {"agent": np.asarray(env.base.palette[7]), "food": np.asarray(env.base.palette[5])}
+    checked = 0
+    for index in range(BATCH):
+        length = int(episodes.length[index])
+        if bool(episodes.solved[index]):
+            length -= 1  # the agent stands where the food was
+        ground = np.asarray(episodes.layout.palette[index, 0])
+        expected = read_off(boards[: length + 1, index], ground, own)
+        np.testing.assert_array_equal(found[:, :length, index], expected)
+        checked += expected.sum()
+    assert checked > 0
+
+
+@pytest.fixture
+def by_hand() -> Episodes:
+    """Two episodes: columns of agent, tool and food at 5 times; the second ends after 2 steps."""
+    first = [(0, 1, 5), (0, 2, 5), (1, 1, 5), (1, 2, 6), (2, 3, 5)]
+    second = [(0, 4, 7), (1, 4, 7), (1, 5, 8), (1, 6, 9), (1, 7, 10)]
+    column = jnp.array([first, second]).swapaxes(0, 1)
+    cells = jnp.stack([jnp.zeros_like(column), column], axis=-1).astype(jnp.uint8)
+    mask = jnp.array([[1, 1, 1, 1], [1, 1, 0, 0]], jnp.float32).T
+    layout = jax.tree.map(lambda x: jnp.stack([x, x]), tt.base_state())
+    action = jnp.zeros((4, 2, 2), jnp.int32)
+    return Episodes(layout, cells, action, jnp.zeros((4, 2)), jnp.ones((4, 2)), mask)
+
+
+def test_what_returns_to_where_it_was_is_not_new(by_hand):
+    food, tool = np.asarray(new_effects(by_hand) * by_hand.mask[None])
+    np.testing.assert_array_equal(tool.T, [[1, 0, 0, 1], [0, 1, 0, 0]])
+    np.testing.assert_array_equal(food.T, [[0, 0, 1, 0], [0, 1, 0, 0]])
+
+
+def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
+    curiosity = Effects(Config(reward_rate=0.75))
+    experience = Experience(by_hand, jnp.zeros((5, 2), jnp.int32), jnp.zeros((5, 2, 0)))
+    pay, memory = curiosity.reward({}, curiosity.memory(), experience)
+    np.testing.assert_allclose(memory, [2 / 6, 3 / 6], rtol=1e-6)
+    np.testing.assert_allclose(pay.T, [[2, 0, 3, 2], [0, 5, 0, 0]], rtol=1e-6)
+    # Later the rates move slowly.
+    _, memory = curiosity.reward({}, jnp.array([0.5, 0.1]), experience)
+    np.testing.assert_allclose(memory, [0.75 * 0.5 + 0.25 / 3, 0.75 * 0.1 + 0.25 / 2], rtol=1e-6)

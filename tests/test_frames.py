@@ -1,0 +1,91 @@
+"""The eight symmetries of the board, and the one in which the food lies ahead."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents.acting.frames import Frame
+
+NUM_FRAMES = 8
+NUMBERS = range(NUM_FRAMES)
+
+
+@pytest.fixture(scope="module")
+def states() -> tt.State:
+    """States on the way of random episodes of {P, St, Sy}, [B]."""
+    env = tt.make("pstsy")
+    state, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 256))
+
+    def step(state, key):
+        action = jax.random.randint(key, (256, 2), 0, 4)
+        return jax.vmap(env.step)(state, action)[0], None
+
+    return jax.jit(lambda: jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 20))[0])()
+
+
+@pytest.fixture(scope="module")
+def images(states) -> tt.State:
+    """The image of every state in every frame, [8, B]."""
+    turn = jax.vmap(lambda frame, state: frame.state(state), in_axes=(None, 0))
+    return jax.jit(jax.vmap(turn, in_axes=(0, None)))(Frame.of(jnp.arange(NUM_FRAMES)), states)
+
+
+def mirrored(number: int, pictures: np.ndarray) -> np.ndarray:
+    """The images of pictures [B, 12, 12, N]."""
+    if number % 2:
+        pictures = pictures.swapaxes(1, 2)
+    if number // 2 % 2:
+        pictures = pictures[:, ::-1]
+    return pictures[:, :, ::-1] if number // 4 else pictures
+
+
+def one_of(images: tt.State, number: int) -> tt.State:
+    return jax.tree.map(lambda x: x[number], images)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_an_image_looks_like_the_mirrored_picture(states, images, number):
+    expected = mirrored(number, np.asarray(jax.vmap(tt.observe)(states)))
+    found = jax.vmap(tt.observe)(one_of(images, number))
+    np.testing.assert_array_equal(found, expected)
+    pictures = jax.vmap(Frame.of(jnp.asarray(number)).picture)(jax.vmap(tt.observe)(states))
+    np.testing.assert_array_equal(pictures, expected)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_the_rules_are_the_same_in_an_image(states, images, number):
+    """Acting and mirroring, and mirroring and acting the mirrored way, come to the same."""
+    env, frame = tt.Environment(), Frame.of(jnp.asarray(number))
+    actions = tt.action_from_index(jnp.arange(len(states.time)) % 16)
+
+    def both(states, turned):
+        after, _ = jax.vmap(env.step)(states, actions)
+        return jax.vmap(frame.state)(after), jax.vmap(env.step)(turned, frame.action(actions))[0]
+
+    jax.tree.map(np.testing.assert_array_equal, *jax.jit(both)(states, one_of(images, number)))
+    np.testing.assert_array_equal(frame.original_action(frame.action(actions)), actions)
+
+
+def test_the_frame_faces_the_food_and_is_that_of_all_images(states, images):
+    """A state and its seven images are the same state, in the frames that they are seen in."""
+
+    def seen(state):
+        frame = Frame.facing_food(tt.observe(state))
+        return frame.state(state)
+
+    turned = jax.jit(jax.vmap(jax.vmap(seen)))(images)
+    offset = np.asarray(turned.food - turned.agent)
+    assert np.all(offset >= 0)
+    assert np.all(offset[..., 0] >= offset[..., 1])
+    # On an axis or a diagonal of the board two images face the food.
+    unique = (offset[0, :, 0] > offset[0, :, 1]) & (offset[0, :, 1] > 0)
+    assert 0.5 < unique.mean() < 1
+    boards = np.asarray(jax.vmap(jax.vmap(tt.observe))(turned))
+    np.testing.assert_array_equal(boards[:, unique], np.repeat(boards[:1, unique], NUM_FRAMES, 0))
+
+
+def test_without_food_in_sight_the_board_stays():
+    blank = jnp.zeros((12, 12, 3), jnp.uint8)
+    assert not any(bool(part) for part in Frame.facing_food(blank))
