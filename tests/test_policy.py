@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,6 +64,21 @@ def run_path(tmp_path_factory):
     with Checkpoints(folder.checkpoints, keep=1) as checkpoints:
         checkpoints.save(6, {"params": both, "iteration": jnp.full(2, 6)}, {})
     return path
+
+
+def test_a_policy_that_faces_the_food_reaches_them_too():
+    """From observations alone it finds the frame that the evaluator finds."""
+    config = dataclasses.replace(CONFIG, facing=True)
+    policy, tasks = Policy("x", config, random_params(SEEDS[1]), 1), make_tasks()
+    solved, length, actions = drive(policy, tasks)
+    played = Evaluator(config, {"mine": tasks})(policy.params)["mine"]
+    np.testing.assert_array_equal(solved, played.solved)
+    np.testing.assert_array_equal(length, played.length)
+    for index, count in enumerate(length):
+        np.testing.assert_array_equal(actions[index, :count], played.action[index, :count])
+    # On the board as it is the same parameters act otherwise.
+    plain = policy._replace(config=CONFIG)
+    assert not np.array_equal(actions, drive(plain, tasks)[2])
 
 
 @pytest.mark.parametrize("seed", SEEDS)

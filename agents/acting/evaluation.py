@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
+from agents.acting.frames import Frame
 from agents.acting.rollout import greedy_action, rollout
 from agents.acting.scores import Optimality, Score
 from agents.config import Config
@@ -46,7 +47,8 @@ class Evaluation(NamedTuple):
       solved: bool[B].
       length: i32[B], steps taken.
       action: i32[B, T, 2], (grasp, move); without meaning from `length` on.
-      value: f32[B, T], the network's value of every state; likewise.
+      value: f32[B, T], the network's value of every state, of the task's rewards where each
+        stream of rewards has its own; likewise.
     """
 
     solved: jax.Array
@@ -147,11 +149,16 @@ def evaluate(
     if shards.count > 1:
         tasks = _rows(tasks, shards.places(num_tasks)[0])
     chunk = min(chunk, tasks.time.shape[0])
+    frame = jax.vmap(Frame.facing_food if agent.facing else Frame.of_board)(
+        jax.vmap(tt.observe)(tasks)
+    )
+    seen = jax.vmap(Frame.state)(frame, tasks)
     unused_key = jax.random.key(0)
-    played = rollout(agent, params, env, tasks, unused_key, choose=greedy_action, chunk=chunk)
+    played = rollout(agent, params, env, seen, unused_key, choose=greedy_action, chunk=chunk)
     episodes = played.episodes
-    by_episode = episodes.action.swapaxes(0, 1), played.value[:-1].swapaxes(0, 1)
-    outcome = Evaluation(episodes.solved, episodes.length, *by_episode)
+    action = jax.vmap(Frame.original_action)(frame, episodes.action.swapaxes(0, 1))
+    value = played.value[:-1, :, 0].swapaxes(0, 1)
+    outcome = Evaluation(episodes.solved, episodes.length, action, value)
     return outcome if shards.count == 1 else _rows(shards.whole(outcome), slice(num_tasks))
 
 

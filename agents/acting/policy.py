@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from agents.acting.frames import Frame
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.objects import BOARD_SIZE
@@ -16,11 +17,15 @@ class Carry(NamedTuple):
 
     Attributes:
       embedding: f32[B, hidden], the state of the GRU.
-      action_tm1: i32[B, 2], the previous (grasp, move); zeros before the first step.
+      action_tm1: i32[B, 2], the previous (grasp, move) in the frame; zeros before the first step.
+      frame: the frame bool[B] each that the first observation has fixed.
+      is_first: bool[B], whether no observation has been seen yet.
     """
 
     embedding: jax.Array
     action_tm1: jax.Array
+    frame: Frame
+    is_first: jax.Array
 
 
 class Policy(NamedTuple):
@@ -45,8 +50,13 @@ class Policy(NamedTuple):
 
     def initial(self, batch: int) -> Carry:
         """The carry before the first step of `batch` episodes."""
-        embedding = _agent(self.config).initial_state(self.params, batch)
-        return Carry(embedding, jnp.zeros((batch, 2), jnp.int32))
+        zeros = jnp.zeros(batch, jnp.int32)
+        return Carry(
+            embedding=_agent(self.config).initial_state(self.params, batch),
+            action_tm1=jnp.zeros((batch, 2), jnp.int32),
+            frame=Frame.of(zeros),
+            is_first=zeros == 0,
+        )
 
     def act(
         self, observation: jax.Array, carry: Carry, key: jax.Array | None = None
@@ -70,6 +80,11 @@ class Policy(NamedTuple):
         if key is None and not self.greedy:
             raise ValueError("a policy that draws its actions needs a key; greedy ones do not")
         agent = _agent(self.config)
+        frame = carry.frame
+        if agent.facing:
+            first = jax.vmap(Frame.facing_food)(observation)
+            frame = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, frame)
+            observation = jax.vmap(Frame.picture)(frame, observation)
         features = agent.encode(self.params, observation)
         reward_tm1 = jnp.zeros(len(observation))
         inputs = agent.core_inputs(self.params, features, carry.action_tm1, reward_tm1)
@@ -79,7 +94,8 @@ class Policy(NamedTuple):
             action = outputs.actions.mode()
         else:
             action = outputs.actions.sample(key)
-        return action, Carry(embedding, action)
+        after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first))
+        return jax.vmap(Frame.original_action)(frame, action), after
 
 
 @functools.cache

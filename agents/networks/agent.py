@@ -21,12 +21,16 @@ class Agent:
     """The functions of the policy network; holds its modules, never parameters.
 
     Parameters are a dictionary with `encoder`, `core` and `heads`; other entries are ignored.
+
+    Attributes:
+      facing: whether it is to see and act in the frame `acting.frames.Frame.facing_food`.
     """
 
     def __init__(self, config: Config):
         self.encoder = ENCODERS[config.encoder](config.filters)
         self.core = Core(config.hidden, config.embedding)
         self.heads = Heads(config.streams)
+        self.facing = config.facing
         self._hidden = config.hidden
         self._board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
 

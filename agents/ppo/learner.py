@@ -184,7 +184,7 @@ class Learner:
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays this device's share of an iteration's episodes."""
         initial, timestep = jax.vmap(self.env.reset)(self.shards.part(reset_keys))
-        if self.config.facing:
+        if self.agent.facing:
             frame = jax.vmap(Frame.facing_food)(timestep.observation)
             initial = jax.vmap(Frame.state)(frame, initial)
         choose = self.shards.drawing(sample_action)
