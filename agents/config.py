@@ -79,7 +79,7 @@ class Config:
       curiosity_coef: weight of the curiosity's losses.
       rewards: what becomes of extrinsic and intrinsic reward. `summed`: both are divided by their
         deviation and added; there is one value. `apart`: each has a value of its own, and the
-        normalised advantages are added (`agents.ppo.streams`).
+        normalised advantages are added (`agents.ppo.advantages`).
       episodic_novelty: pay the intrinsic reward only for observations that are new in
         their episode.
       reward_rate: weight of the past in the moving moments that normalise both rewards.
@@ -254,7 +254,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "imitation_coef": 1.0,
     },
     # Trained on {P, St, Sy}: new effects are paid, failed tasks played again, and the encoder
-    # sees objects instead of colours, ahead of it.
+    # sees objects instead of colours, the food ahead.
     "best": {
         "env_id": "pstsy",
         "iterations": 1100,
@@ -264,12 +264,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "discount": 0.995,
         "bootstrap": "value",
         "value_coef": 0.1,
-        "entropy_coef": 0.01,
-        "learning_rate": 7e-4,
+        "entropy_coef": 3e-3,
         "curiosity": "effects",
-        "intrinsic_scale": 1.0,
+        "intrinsic_scale": 0.5,
         "rewards": "apart",
-        "replayed": 0.8,
+        "replayed": 0.5,
         "facing": True,
         "encoder": "objects",
         "filters": (64, 64),

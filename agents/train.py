@@ -18,7 +18,8 @@ from agents.parallel import processes
 from agents.parallel.sharding import Placement
 from agents.runs import compilation_cache
 from agents.runs.folder import Run, RunFolder, write_json
-from agents.runs.session import Session, Stopped, StopSignals
+from agents.runs.session import Session
+from agents.runs.stopping import Stopped, StopSignals
 
 PROGRAM = "python -m agents.train"
 

@@ -32,7 +32,7 @@ from agents.experiments import (
 from agents.experiments.protocol import EXPERIMENTS, PROTOCOLS, QUICK, Protocol, algorithms
 from agents.parallel.sharding import ALONE
 from agents.ppo.learner import make_train
-from agents.runs import machine, report, session, tracking
+from agents.runs import machine, report, session, stopping, tracking
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
@@ -426,7 +426,7 @@ def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
             RunFolder.create(folder.path, run)
         console = Console(file=io.StringIO())
         part = session.Session(folder, run, console, checkpoint_every=3, keep=1)
-        part.train(session.StopSignals(lambda: None))
+        part.train(stopping.StopSignals(lambda: None))
         part.summarize()
         part.close()
         return contents(folder.path)

@@ -154,6 +154,25 @@ def rewritten(path, **changes):
     np.savez(path, **{**entries, "header": np.array(json.dumps(header)), **changes})
 
 
+def test_a_flipped_bit_is_refused_unless_the_numbers_are_still_the_same(run_path, tmp_path):
+    """An archive has some bytes of no meaning, such as the time of writing."""
+    path = tmp_path / "x.npz"
+    export(tmp_path, run_path)
+    good, params = path.read_bytes(), pretrained.load(path).params
+    places = range(0, len(good), len(good) // 20)
+    refused = 0
+    for place in places:
+        path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
+        try:
+            found = pretrained.load(path).params
+        except ValueError as error:
+            assert "x.npz" in str(error)  # noqa: PT017
+            refused += 1
+        else:
+            jax.tree.map(np.testing.assert_array_equal, found, params)
+    assert refused > len(places) / 2
+
+
 def test_files_that_hold_no_parameters_are_refused(run_path, tmp_path):
     path = tmp_path / "x.npz"
     export(tmp_path, run_path)
@@ -174,9 +193,6 @@ def test_files_that_hold_no_parameters_are_refused(run_path, tmp_path):
     refuses("x.npz is not a file of parameters")
     np.savez(path, a=np.zeros(3))
     refuses("x.npz is not a file of parameters")
-    middle = len(good) // 2
-    path.write_bytes(good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :])
-    refuses("x.npz is damaged")
     rewritten(path, **{"params": np.zeros(3)})
     refuses("does not hold the numbers that were saved")
     rewritten(path, header={"format": "trap-tube-jax parameters 99"})

@@ -60,15 +60,15 @@ def learn() -> Learner:
 
 def test_value_of_a_certain_reward(learn):
     reward, played = learn("value")
-    np.testing.assert_allclose(played.value[0], reward, rtol=0.1)
-    np.testing.assert_allclose(played.value[1:-1] / reward, 0.0, atol=0.1)
+    np.testing.assert_allclose(played.value[0, :, 0], reward, rtol=0.1)
+    np.testing.assert_allclose(played.value[1:-1, :, 0] / reward, 0.0, atol=0.1)
 
 
 def test_value_is_discounted(learn):
     reward, played = learn("discount")
     for time in range(probes.STEPS):
         expected = reward * DISCOUNT ** (probes.STEPS - 1 - time)
-        np.testing.assert_allclose(played.value[time], expected, rtol=0.1)
+        np.testing.assert_allclose(played.value[time, :, 0], expected, rtol=0.1)
 
 
 @pytest.mark.parametrize("kind", ["policy", "cue", "credit", "memory"])

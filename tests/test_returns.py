@@ -9,7 +9,7 @@ import pytest
 
 from agents.acting.episodes import Episodes
 from agents.config import PRESETS, Config
-from agents.ppo import learner, returns
+from agents.ppo import advantages, returns
 
 CASES, STEPS = 1_000, 23
 
@@ -87,7 +87,7 @@ def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[A
     column = [jnp.array(x, jnp.float32)[:, None] for x in (discount, mask)]
     episodes = Episodes(nothing, nothing, nothing, nothing, *column)
     value = jnp.array([10.0, 20.0, 30.0, 40.0])[:, None]
-    found = learner.advantages_and_targets(config, column[1], episodes, value)
+    found = advantages.advantages_and_targets(config, column[1], episodes, value)
     return found[0][:, 0], found[1][:, 0]
 
 

@@ -22,7 +22,8 @@ from agents.runs import compilation_cache
 from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
-from agents.runs.session import Progress, make_advance
+from agents.runs.progress import Progress
+from agents.runs.session import make_advance
 from agents.train import main, parse, select
 
 ROOT = Path(__file__).parent.parent

@@ -19,7 +19,7 @@ from agents.config import PRESETS
 from agents.experiments import records, reporting, training
 from agents.experiments.protocol import EXPERIMENTS, PROGRAM, PROTOCOLS, QUICK, Protocol
 from agents.runs import compilation_cache
-from agents.runs.session import Stopped, StopSignals
+from agents.runs.stopping import Stopped, StopSignals
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 

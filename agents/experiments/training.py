@@ -15,7 +15,8 @@ from agents.parallel.sharding import Placement
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, read_json, write_json
 from agents.runs.machine import machine
 from agents.runs.metrics import Row, read_metrics
-from agents.runs.session import Session, StopSignals
+from agents.runs.session import Session
+from agents.runs.stopping import StopSignals
 from agents.runs.tracking import Tracker
 from trap_tube_jax.state import State
 

@@ -26,7 +26,7 @@ from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
 from agents.networks.windows import encode_rows
 from agents.parallel.sharding import ALONE, Shards
-from agents.ppo import losses, replay, returns, streams
+from agents.ppo import advantages, losses, replay, returns
 from agents.ppo.failures import Failures
 from agents.ppo.optimizer import make_optimizer
 from trap_tube_jax.environment import Environment
@@ -34,12 +34,6 @@ from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.registry import make
 
 Metrics = dict[str, jax.Array]
-
-# Over [T, B] arrays.
-discounted_returns = jax.vmap(returns.discounted_returns, in_axes=(1, None), out_axes=1)
-generalized_advantages = jax.vmap(
-    returns.generalized_advantages, in_axes=(1, 1, 1, 1, None), out_axes=1
-)
 
 
 class TrainState(NamedTuple):
@@ -143,43 +137,35 @@ class Learner:
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Plays, prepares, learns: the next state, and metrics f32[] each."""
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
-        places, reset_keys = self.draw_tasks(state.failures, reset_key)
+        reset_keys = self.draw_tasks(state.failures, reset_key)
         trajectory = self.play(state.params, reset_keys, action_key)
         batch, state, play_metrics = self.prepare(state, trajectory)
         params, opt_state, loss_metrics = self.optimize(state, batch, update_key)
         state = state._replace(
             params=params,
             opt_state=opt_state,
-            failures=self.note_failures(state.failures, places, reset_keys, batch.episodes.solved),
+            failures=self.note_failures(state.failures, reset_keys, batch.episodes.solved),
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + self.config.episodes,
         )
         return state, {**play_metrics, **loss_metrics}
 
-    def draw_tasks(self, failures: Failures, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """An iteration's tasks, first those that were failed before, then new ones.
-
-        Returns:
-          The places i32[M] of the former in `failures`, and the reset keys [B] of all.
-        """
+    def draw_tasks(self, failures: Failures, key: jax.Array) -> jax.Array:
+        """The reset keys [B] of an iteration's tasks: first those failed before, then new ones."""
         again = self.config.num_replayed
         if not again:
-            return jnp.zeros(0, jnp.int32), jax.random.split(key, self.config.episodes)
+            return jax.random.split(key, self.config.episodes)
         failures_key, key = jax.random.split(key)
-        places = failures.draw(failures_key, again)
         new = jax.random.split(key, self.config.episodes - again)
-        return places, jnp.concatenate([failures.reset_keys(places), new])
+        return jnp.concatenate([failures.draw(failures_key, again), new])
 
     def note_failures(
-        self, failures: Failures, places: jax.Array, reset_keys: jax.Array, solved: jax.Array
+        self, failures: Failures, reset_keys: jax.Array, solved: jax.Array
     ) -> Failures:
-        """The failures after an iteration; arguments as `draw_tasks` gives them, bool[B] solved."""
+        """The failures after tasks [B] were played, as `draw_tasks` gave them, bool[B] solved."""
         again = self.config.num_replayed
-        if not again:
-            return failures
-        failures = failures.without(places, solved[:again])
-        return failures.with_new(reset_keys[again:], ~solved[again:])
+        return failures.remember(reset_keys[again:], ~solved[again:]) if again else failures
 
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays this device's share of an iteration's episodes."""
@@ -214,7 +200,7 @@ class Learner:
         novelty = novelty * episodes.mask
         if config.episodic_novelty:
             novelty = novelty * first_visits(observation_id)[1:]
-        join = advantages_of_sum if config.rewards == "summed" else advantages_apart
+        join = advantages.of_sum if config.rewards == "summed" else advantages.of_streams
         moments = (state.extrinsic, state.intrinsic)
         advantage, target, moments = join(config, episodes, novelty, value, moments)
         batch = Batch(
@@ -382,7 +368,9 @@ class Learner:
         )
         embedding = self.agent.unroll(params, features, solved.action, solved.reward)
         log_prob = self.agent.act(params, embedding).actions.log_prob(solved.action)
-        weight = discounted_returns(solved.reward, jnp.float32(config.discount)) * solved.mask
+        weight = (
+            advantages.discounted_returns(solved.reward, jnp.float32(config.discount)) * solved.mask
+        )
         return -config.imitation_coef * jnp.sum(weight * log_prob) / steps
 
     @functools.cached_property
@@ -454,97 +442,6 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
     curiosity = curiosities.make(config, env)
     learner = Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
     return Train(learner.init, learner.iterate, learner)
-
-
-RewardMoments = tuple[returns.Moments, returns.Moments]
-
-
-def advantages_of_sum(
-    config: Config,
-    episodes: Episodes,
-    novelty: jax.Array,
-    value: jax.Array,
-    moments: RewardMoments,
-) -> tuple[jax.Array, jax.Array, RewardMoments]:
-    """Advantages of the sum of both rewards, each over its deviation.
-
-    Args:
-      config: the settings.
-      episodes: the episodes.
-      novelty: f32[T, B], the intrinsic reward, 0 after an episode's end.
-      value: f32[T + 1, B, 1], of every observation.
-      moments: of extrinsic and intrinsic reward so far.
-
-    Returns:
-      Advantages f32[T, B], the values' targets f32[T, B, 1], and the new moments.
-    """
-    extrinsic = moments[0].update(episodes.reward, episodes.mask, config.reward_rate)
-    intrinsic = moments[1].update(novelty, episodes.mask, config.reward_rate)
-    reward = episodes.reward / extrinsic.deviation
-    reward = reward + config.intrinsic_scale * novelty / intrinsic.deviation
-    advantage, target = advantages_and_targets(config, reward, episodes, value[..., 0])
-    return advantage, target[..., None], (extrinsic, intrinsic)
-
-
-def advantages_apart(
-    config: Config,
-    episodes: Episodes,
-    novelty: jax.Array,
-    value: jax.Array,
-    moments: RewardMoments,
-) -> tuple[jax.Array, jax.Array, RewardMoments]:
-    """The sum of the advantages of both rewards, normalised apart; see `agents.ppo.streams`.
-
-    The task's reward, at most 1 an episode, is taken as it is; the curiosity's is divided by the
-    deviation of its returns.
-
-    Args:
-      config: the settings.
-      episodes: the episodes.
-      novelty: f32[T, B], the intrinsic reward, 0 after an episode's end.
-      value: f32[T + 1, B, 2], of every observation: the task's and the curiosity's.
-      moments: of the extrinsic reward and of the intrinsic returns so far.
-
-    Returns:
-      Advantages f32[T, B], the values' targets f32[T, B, 2], and the new moments.
-    """
-    gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
-    mask = episodes.mask
-    intrinsic = moments[1].update(discounted_returns(novelty, gamma), mask, config.reward_rate)
-    task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
-    own = streams.continuing_value(value[..., 1], mask)
-    discount = jnp.full_like(novelty, gamma)
-    reward = novelty / intrinsic.deviation
-    curiosity = generalized_advantages(reward, discount, own, mask, lambda_)
-    target = jnp.stack([task_target, curiosity + own[:-1]], axis=-1)
-    advantage = streams.joint_advantage(task, curiosity, config.intrinsic_scale, mask)
-    return advantage, target, (moments[0], intrinsic)
-
-
-def advantages_and_targets(
-    config: Config, reward: jax.Array, episodes: Episodes, value: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Advantages and the values' targets, f32[T, B] each, by the rule of `config.bootstrap`.
-
-    `value`: gamma is 0 where a step terminates, the value of the last observation follows a
-    truncated episode, and the target is A_t + v_t. `baseline`: gamma is the same everywhere, the
-    last step's own value follows it, and the target is the discounted sum of rewards.
-
-    Args:
-      config: the settings.
-      reward: f32[T, B], what the policy is to maximise.
-      episodes: the episodes.
-      value: f32[T + 1, B], of every observation.
-    """
-    gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
-    if config.bootstrap == "value":
-        discount = gamma * episodes.discount
-        advantage = generalized_advantages(reward, discount, value, episodes.mask, lambda_)
-        return advantage, advantage + value[:-1]
-    value = jnp.concatenate([value[:-1], value[-2:-1]])
-    discount = jnp.full_like(reward, gamma)
-    advantage = generalized_advantages(reward, discount, value, episodes.mask, lambda_)
-    return advantage, discounted_returns(reward, gamma)
 
 
 def _encode_both(

@@ -1,12 +1,11 @@
 """A run from its start or newest checkpoint to its results: training, saving, reporting."""
 
 import dataclasses
-import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,6 @@ from agents.acting.evaluation import (
 )
 from agents.acting.policy import Policy
 from agents.acting.scores import Score
-from agents.config import Config
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import DEFAULT_DEVICE, Placement
@@ -32,120 +30,15 @@ from agents.ppo.learner import Train, TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
-from agents.runs.metrics import FirstSolved, MetricsLog, Row, read_metrics
+from agents.runs.metrics import MetricsLog, Row, read_metrics
+from agents.runs.progress import Progress, first_solved
+from agents.runs.stopping import Stopped, StopSignals
 from agents.runs.story import Story
 from agents.runs.tracking import Tracker
 
 POLL_SECONDS = 0.005
 
 Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
-
-
-class Progress(NamedTuple):
-    """What a run has come to, beside the state of training.
-
-    Attributes:
-      iteration: iterations done by the seeds that still train.
-      seconds: seconds of training, compilation excluded.
-      compile_seconds: seconds of compiling the iteration, over all processes.
-      solved: for each seed, when it was first solved.
-    """
-
-    iteration: int
-    seconds: float
-    compile_seconds: float
-    solved: tuple[FirstSolved | None, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON, without `solved`, which follows from the metrics."""
-        values = self._asdict()
-        del values["solved"]
-        return values
-
-    @classmethod
-    def resumed(cls, values: Mapping[str, Any], run: Run, rows: Sequence[Row]) -> Self:
-        """The progress that was stored; further values are ignored.
-
-        Args:
-          values: what `to_dict` gave.
-          run: what is trained, which may have another threshold than when it was stored.
-          rows: the metrics, of which those after the stored iteration do not count.
-        """
-        counts = (values["iteration"], values["seconds"], values["compile_seconds"])
-        before = [row for row in rows if row["iteration"] <= values["iteration"]]
-        return cls(*counts, _first_solved(run, (None,) * run.seeds, before))
-
-    def check(self, run: Run, iterations: np.ndarray) -> None:
-        """Checks that an uninterrupted run would have come to the same states.
-
-        Args:
-          run: what is trained.
-          iterations: i32[S], the iterations that the state of each seed is after.
-
-        Raises:
-          ValueError: a seed has been trained for too long, or has stopped too early.
-        """
-        config = run.config
-        if self.iteration > config.iterations:
-            raise ValueError(
-                f"iterations must be at least {self.iteration}, which are done, got "
-                f"{config.iterations}"
-            )
-        for seed, first, done in zip(run.seed_range, self.solved, iterations, strict=True):
-            stops = first is not None and config.stop_when_solved > 0
-            wanted = first.iteration if first is not None and stops else self.iteration
-            if done != wanted:
-                raise ValueError(
-                    f"with stop_when_solved={config.stop_when_solved}, seed {seed} would be after "
-                    f"iteration {wanted}, but it is after {done}: this run cannot be continued "
-                    "with that threshold; give the former one, or begin a new run"
-                )
-
-    def active(self, config: Config) -> np.ndarray:
-        """bool[S]: the seeds that have more to learn."""
-        done = [config.stop_when_solved > 0 and first is not None for first in self.solved]
-        return ~np.array(done) & (self.iteration < config.iterations)
-
-
-class Stopped(Exception):  # noqa: N818  it is no error
-    """Training was asked to stop and has saved.
-
-    Attributes:
-      signal: the number of the signal that asked, perhaps another process.
-    """
-
-    def __init__(self, number: int):
-        super().__init__(f"signal {number}")
-        self.signal = number
-
-
-class StopSignals:
-    """Turns the first Ctrl-C or SIGTERM into a request, and the second into an exception."""
-
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self, on_request: Callable[[], None]):
-        self.received: int | None = None
-        self._on_request = on_request
-        self._previous: dict[int, Any] = {}
-
-    def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._previous = {
-                number: signal.signal(number, self._handle) for number in self.SIGNALS
-            }
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: Any) -> None:
-        del frame
-        if self.received is not None:
-            raise KeyboardInterrupt
-        self.received = number
-        self._on_request()
 
 
 class Session:
@@ -367,7 +260,7 @@ class Session:
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        solved = _first_solved(self.run, progress.solved, rows)
+        solved = first_solved(self.run, progress.solved, rows)
         rows = self._track(rows, is_due=solved != progress.solved)
         if self._log is not None:
             self._log.append(rows)
@@ -484,21 +377,6 @@ def make_advance(train: Train, num_seeds: int) -> Advance:
 
     # A vmapped loop has to carry on until the slowest of its elements is done.
     return advance_one if num_seeds == 1 else jax.vmap(advance)
-
-
-def _first_solved(
-    run: Run, solved: Sequence[FirstSolved | None], rows: Sequence[Row]
-) -> tuple[FirstSolved | None, ...]:
-    """Adds the seeds that these rows, in order of time, show to be solved for the first time."""
-    share = run.config.stop_when_solved or 1.0
-    found: dict[int, Row] = {}
-    for row in rows:
-        if row["evaluation"] >= share:
-            found.setdefault(int(row["seed"]), row)
-    return tuple(
-        FirstSolved.of(found[seed]) if first is None and seed in found else first
-        for seed, first in zip(run.seed_range, solved, strict=True)
-    )
 
 
 def _wait(arrays: Any) -> None:

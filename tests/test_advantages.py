@@ -1,4 +1,4 @@
-"""Advantages of two streams of rewards."""
+"""Advantages of two streams of rewards, normalised apart."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents import Config, make_train
-from agents.ppo import streams
+from agents.ppo import advantages
 
 TINY = {
     "env_id": "pstsy", "episodes": 8, "minibatch": 4, "epochs": 1, "filters": (4, 4),
@@ -17,7 +17,7 @@ TINY = {
 def test_after_an_episode_comes_one_that_is_worth_the_mean_of_all_starts():
     value = jnp.array([[1.0, 3.0], [5.0, 6.0], [7.0, 8.0]])
     mask = jnp.array([[1.0, 1.0], [1.0, 0.0]])
-    found = streams.continuing_value(value, mask)
+    found = advantages.continuing_value(value, mask)
     np.testing.assert_array_equal(found, [[1.0, 3.0], [5.0, 2.0], [2.0, 2.0]])
 
 
@@ -25,7 +25,7 @@ def test_a_loud_stream_does_not_drown_the_other():
     task = 100 * jax.random.normal(jax.random.key(0), (20, 30))
     curiosity = jax.random.normal(jax.random.key(1), (20, 30))
     mask = jnp.ones((20, 30))
-    found = streams.joint_advantage(task, curiosity, 0.5, mask)
+    found = advantages.joint_advantage(task, curiosity, 0.5, mask)
     for stream, scale in ((task, 1.0), (curiosity, 0.5)):
         slope = np.polyfit(np.ravel(stream / jnp.std(stream)), np.ravel(found), 1)[0]
         assert slope == pytest.approx(scale, abs=0.1)
@@ -33,7 +33,7 @@ def test_a_loud_stream_does_not_drown_the_other():
 
 def test_a_stream_that_hardly_pays_is_not_blown_up():
     task = 1e-4 * jax.random.normal(jax.random.key(0), (20, 30))
-    joint = streams.joint_advantage(task, jnp.zeros((20, 30)), 1.0, jnp.ones((20, 30)))
+    joint = advantages.joint_advantage(task, jnp.zeros((20, 30)), 1.0, jnp.ones((20, 30)))
     assert np.abs(joint).max() < 0.1
 
 

@@ -1,0 +1,47 @@
+"""Stopping a run by Ctrl-C or SIGTERM."""
+
+import signal
+import threading
+from collections.abc import Callable
+from typing import Any, Self
+
+
+class Stopped(Exception):  # noqa: N818  it is no error
+    """Training was asked to stop and has saved.
+
+    Attributes:
+      signal: the number of the signal that asked, perhaps another process.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(f"signal {number}")
+        self.signal = number
+
+
+class StopSignals:
+    """Turns the first Ctrl-C or SIGTERM into a request, and the second into an exception."""
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self, on_request: Callable[[], None]):
+        self.received: int | None = None
+        self._on_request = on_request
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {
+                number: signal.signal(number, self._handle) for number in self.SIGNALS
+            }
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        del frame
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+        self._on_request()
