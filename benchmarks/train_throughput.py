@@ -89,7 +89,8 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     iterate = jax.jit(train.iterate)
     for _ in range(warm):
         state, _ = iterate(state)
-    play = jax.jit(lambda state: train.learner.play(state.params, *jax.random.split(state.key)))
+    reset_keys = jax.random.split(state.key, config.episodes)
+    play = jax.jit(lambda state: train.learner.play(state.params, reset_keys, state.key))
     trajectory = play(state)
     batch, _, _ = jax.jit(train.learner.prepare)(state, trajectory)
     per_observation = matrix_flop(

@@ -35,8 +35,8 @@ def test_a_curiosity_of_ones_own_is_trained_with():
     register("corners", lambda config, env: Corners())
     train = make_train(Config.from_dict({**TINY, "curiosity": "corners"})).learner
     start = train.init(jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1))
-    trajectory = jax.jit(train.play)(start.params, *keys)
+    reset_keys = jax.random.split(jax.random.key(1), train.config.episodes)
+    trajectory = jax.jit(train.play)(start.params, reset_keys, jax.random.key(2))
     episodes = trajectory.episodes
     cells = episodes.cells.at[1, 0, 0].set(jnp.array([11, 0], jnp.uint8))
     trajectory = trajectory._replace(episodes=episodes._replace(cells=cells))
@@ -78,9 +78,9 @@ def episodes():
     """Random episodes of {Sy}, 40 of 4 steps."""
     settings = {**TINY, "curiosity": "counts", "episodes": 40}
     learner = make_train(Config.from_dict(settings)).learner
-    keys = jax.random.split(jax.random.key(1))
     params = learner.init_params(jax.random.key(0))
-    return jax.jit(learner.play)(params, *keys).episodes
+    reset_keys = jax.random.split(jax.random.key(1), 40)
+    return jax.jit(learner.play)(params, reset_keys, jax.random.key(2)).episodes
 
 
 def test_few_observations_share_a_slot(episodes):
