@@ -624,7 +624,8 @@ def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
 def test_pages_and_figures_are_those_of_the_records():
     found = readme_tables.read_records(readme_tables.Arguments().results)
     assert not readme_tables.stale(readme_tables.ROOT, found)
-    assert readme_tables.BLOCK.search((readme_tables.Arguments().results / "fast_preset.md").read_text())
+    page = readme_tables.Arguments().results / "fast_preset.md"
+    assert readme_tables.BLOCK.search(page.read_text())
 
 
 def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
