@@ -40,7 +40,7 @@ def of_sum(
     config: Config,
     episodes: Episodes,
     novelty: jax.Array,
-    scale: jax.Array | float,
+    scale: jax.typing.ArrayLike,
     value: jax.Array,
     moments: RewardMoments,
 ) -> tuple[jax.Array, jax.Array, RewardMoments]:
@@ -69,7 +69,7 @@ def of_streams(
     config: Config,
     episodes: Episodes,
     novelty: jax.Array,
-    scale: jax.Array | float,
+    scale: jax.typing.ArrayLike,
     value: jax.Array,
     moments: RewardMoments,
 ) -> tuple[jax.Array, jax.Array, RewardMoments]:
@@ -149,7 +149,7 @@ def continuing_value(value: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def joint_advantage(
-    task: jax.Array, curiosity: jax.Array, scale: jax.Array | float, mask: jax.Array
+    task: jax.Array, curiosity: jax.Array, scale: jax.typing.ArrayLike, mask: jax.Array
 ) -> jax.Array:
     """Both advantages f32[T, B], normalised apart; the task's plus `scale` times the other."""
     task = returns.normalize(task, mask, VARIANCE_FLOOR)
