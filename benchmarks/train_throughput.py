@@ -1,8 +1,8 @@
 """Where the time of one training iteration goes: `python -m benchmarks.train_throughput`.
 
 Times a whole iteration, then its parts by themselves on the same episodes, and compares the
-arithmetic of the encoder, which is nearly all there is, with a large matrix product. The
-parts are separate programs, so they add up to the iteration only roughly.
+useful arithmetic of encoder and recurrent part, which is nearly all there is, with a large matrix
+product. The parts are separate programs, so they add up to the iteration only roughly.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ import functools
 import math
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,20 +66,36 @@ class Part:
       env: short name of the task set.
       name: what is timed.
       timing: of one iteration's worth of it.
-      encoder_flop: the encoder's useful floating-point operations in it: each distinct
+      flop: useful floating-point operations of matrix products in it. The encoder's: each distinct
         observation whole, once per minibatch and derivative, nothing recomputed, no padding.
-        Windows that observations share count in each, though they are encoded once.
+        Windows that observations share count in each, though they are encoded once. Those of GRU
+        and heads: each step that was taken, once per epoch and derivative; twice where the
+        curiosity needs the GRU's output after the step.
     """
 
     env: str
     name: str
     timing: harness.Timing
-    encoder_flop: float
+    flop: float
 
     @property
     def flops(self) -> float:
-        """The encoder's useful operations per second."""
-        return self.encoder_flop / self.timing.median_s
+        """Useful operations per second."""
+        return self.flop / self.timing.median_s
+
+
+class Flop(NamedTuple):
+    """Useful operations of an iteration.
+
+    Attributes:
+      play: of the rollout.
+      encode: of the encoder in all gradient steps.
+      core: of GRU and heads in all gradient steps.
+    """
+
+    play: float
+    encode: float
+    core: float
 
 
 def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
@@ -93,20 +109,16 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     play = jax.jit(lambda state: train.learner.play(state.params, reset_keys, state.key))
     trajectory = play(state)
     batch, _, _ = jax.jit(train.learner.prepare)(state, trajectory)
-    per_observation = matrix_flop(
-        jax.make_jaxpr(train.agent.encoder.apply)(
-            state.params["encoder"], trajectory.episodes.observations()[0, :1]
-        )
-    )
-    distinct = jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch)
-    play_flop = per_observation * float(jnp.max(batch.observation_id) + 1)
-    # One pass forward, and one each for the derivatives by inputs and by kernels.
-    learn_flop = 3 * per_observation * config.epochs * float(distinct)
+    flop = useful_flop(train, state, batch)
     parts: list[tuple[str, Callable[[], Any], float]] = [
-        ("iteration", lambda: iterate(state), play_flop + learn_flop),
-        ("rollout", lambda: play(state), play_flop),
-        ("encoder", _jitted(_encoder_only, train, state, batch), learn_flop),
-        ("recurrent part and heads", _jitted(_core_only, train, state, batch, trajectory), 0.0),
+        ("iteration", lambda: iterate(state), sum(flop)),
+        ("rollout", lambda: play(state), flop.play),
+        ("encoder", _jitted(_encoder_only, train, state, batch), flop.encode),
+        (
+            "recurrent part and heads",
+            _jitted(_core_only, train, state, batch, trajectory),
+            flop.core,
+        ),
         ("optimiser", _jitted(_optimizer_only, train, state), 0.0),
     ]
     short = task_set(config.env_id).short
@@ -114,6 +126,31 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         Part(short, name, harness.measure(lambda _, run=run: run(), repeats), flop)
         for name, run, flop in parts
     ]
+
+
+def useful_flop(train: Train, state: TrainState, batch: Batch) -> Flop:
+    """The useful operations of an iteration with these episodes; see `Part`."""
+    config, agent = train.config, train.agent
+
+    def step(params: Params, features: jax.Array) -> Any:
+        action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
+        inputs = agent.core_inputs(params, features, action, reward)
+        return agent.act(params, agent.advance(params, agent.initial_state(params, 1), inputs))
+
+    board = batch.episodes.observations()[0, :1]
+    per_observation = matrix_flop(jax.make_jaxpr(agent.encode)(state.params, board))
+    features = agent.encode(state.params, board)
+    per_step = matrix_flop(jax.make_jaxpr(step)(state.params, features))
+    distinct = float(jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch))
+    steps = float(jnp.sum(batch.episodes.mask))
+    outputs = 2 if train.learner.curiosity.needs_embeddings else 1
+    # One pass forward, and one each for the derivatives by inputs and by kernels.
+    passes = 3 * config.epochs
+    return Flop(
+        play=per_observation * float(jnp.max(batch.observation_id) + 1) + per_step * steps,
+        encode=passes * per_observation * distinct,
+        core=passes * outputs * per_step * steps,
+    )
 
 
 def matrix_flop(jaxpr: ClosedJaxpr | Jaxpr) -> float:
@@ -242,7 +279,7 @@ def main(arguments: Arguments) -> list[Part]:
     console.print(harness.machine())
     peak = matrix_product_flops()
     console.print(f"matrix product {MATRIX} x {MATRIX}: {peak / 1e9:.0f} GFLOP/s")
-    columns = ("set", "part", "seconds", "share", "compile, s", "encoder GFLOP/s", "of peak")
+    columns = ("set", "part", "seconds", "share", "compile, s", "useful GFLOP/s", "of peak")
     table = Table(*columns, title=f"preset {arguments.preset}")
     results: list[Part] = []
     for env in arguments.env:
@@ -256,8 +293,8 @@ def main(arguments: Arguments) -> list[Part]:
                 f"{part.timing.median_s:.2f}",
                 f"{part.timing.median_s / parts[0].timing.median_s:.0%}",
                 f"{part.timing.compile_s - part.timing.median_s:.1f}",
-                f"{part.flops / 1e9:.0f}" if part.encoder_flop else "",
-                f"{part.flops / peak:.0%}" if part.encoder_flop else "",
+                f"{part.flops / 1e9:.0f}" if part.flop else "",
+                f"{part.flops / peak:.0%}" if part.flop else "",
             )
     console.print(table)
     if arguments.json is not None:

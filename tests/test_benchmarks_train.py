@@ -40,10 +40,10 @@ def test_an_iteration_is_split_into_its_parts():
     assert [part.name for part in parts] == [
         "iteration", "rollout", "encoder", "recurrent part and heads", "optimiser",
     ]  # fmt: skip
-    whole, play, encoder, *others = parts
-    assert whole.encoder_flop == play.encoder_flop + encoder.encoder_flop
-    assert encoder.encoder_flop > play.encoder_flop > 0
-    assert [part.encoder_flop for part in others] == [0, 0]
+    whole, play, encoder, core, optimiser = parts
+    assert whole.flop == play.flop + encoder.flop + core.flop
+    assert encoder.flop > play.flop > core.flop > 0
+    assert optimiser.flop == 0
     assert all(part.timing.median_s > 0 and part.env == "base" for part in parts)
 
 
