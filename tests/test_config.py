@@ -13,7 +13,7 @@ from agents.config import PRESETS
 def test_paper_preset_is_the_specification():
     config = Config.preset("paper")
     expected = {
-        "episodes": 1024, "max_steps": 50, "epochs": 10, "minibatch": 128, "discount": 0.99,
+        "episodes": 1024, "max_steps": None, "epochs": 10, "minibatch": 128, "discount": 0.99,
         "gae_lambda": 0.95, "clip": 0.2, "value_coef": 0.01, "entropy_coef": 1e-4,
         "learning_rate": 1e-3, "adam_epsilon": 1e-7, "max_gradient_norm": 1.0,
         "curiosity": "icm", "intrinsic_scale": 0.1, "curiosity_coef": 10.0, "reward_rate": 0.9,
@@ -77,4 +77,4 @@ def test_unknown_preset_lists_the_known():
 
 def test_environment_that_contradicts_the_config_is_refused():
     with pytest.raises(ValueError, match="max_steps is 9, the config's 50"):
-        make_train(Config(), tt.make("p", max_steps=9))
+        make_train(Config(max_steps=50), tt.make("p", max_steps=9))

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from agents import evaluate
-from agents.acting.evaluation import ALL_SETS
 from agents.config import PRESETS, Config
 from agents.ppo.learner import make_train
 from agents.runs import compilation_cache
@@ -25,6 +24,7 @@ from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_me
 from agents.runs.progress import Progress
 from agents.runs.session import make_advance
 from agents.train import main, parse, select
+from trap_tube_jax.scoring.tasks import ALL_SETS
 
 ROOT = Path(__file__).parent.parent
 TINY = [

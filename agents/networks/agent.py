@@ -11,10 +11,13 @@ from agents.networks.core import Core, Heads, Outputs
 from agents.networks.encoder import Encoder
 from agents.networks.layers import draw
 from agents.networks.object_encoder import ObjectEncoder
+from agents.registry import encoders
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
-ENCODERS = {"paper": Encoder, "objects": ObjectEncoder}
+
+encoders.register("paper", lambda config: Encoder(config.filters))
+encoders.register("objects", lambda config: ObjectEncoder(config.filters))
 
 
 class Agent:
@@ -27,7 +30,7 @@ class Agent:
     """
 
     def __init__(self, config: Config):
-        self.encoder = ENCODERS[config.encoder](config.filters)
+        self.encoder = encoders.factory(config.encoder)(config)
         self.core = Core(config.hidden, config.embedding)
         self.heads = Heads(config.streams)
         self.facing = config.facing
