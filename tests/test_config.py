@@ -8,6 +8,8 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.config import PRESETS
+from agents.runs.folder import Run
+from trap_tube_jax import registry
 
 
 def test_paper_preset_is_the_specification():
@@ -73,6 +75,20 @@ def test_presets_can_be_had_without_curiosity(name):
 def test_unknown_preset_lists_the_known():
     with pytest.raises(ValueError, match=r"quick.*paper.*fast"):
         Config.preset("quick")
+
+
+def test_the_sets_own_limit_holds_unless_the_settings_give_one(monkeypatch):
+    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+    tt.register("Short-v0", (), max_steps=30)
+    config = Config(env_id="Short-v0")
+    assert make_train(config).env.max_steps == config.step_limit("Short-v0") == 30
+    assert (config.transitions, config.step_limit("p")) == (30 * 1024, 50)
+    longer = Config(env_id="Short-v0", max_steps=60)
+    assert make_train(longer).env.max_steps == longer.step_limit("p") == 60
+    # A run of an earlier version has the limit of its set among its settings.
+    Run(config).check_continues(Run(Config(env_id="Short-v0", max_steps=30)))
+    with pytest.raises(ValueError, match="the run has max_steps=60, not 30"):
+        Run(config).check_continues(Run(longer))
 
 
 def test_environment_that_contradicts_the_config_is_refused():

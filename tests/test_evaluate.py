@@ -16,6 +16,7 @@ from agents.acting.evaluation import Evaluation, Evaluator
 from agents.config import Config
 from agents.networks.agent import Agent
 from agents.runs import report, report_page
+from trap_tube_jax import registry
 from trap_tube_jax.registry import PAPER_TASK_SETS
 from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, wilson_interval
 from trap_tube_jax.scoring.tasks import (
@@ -171,6 +172,29 @@ def test_blocks_change_nothing(grey_play, monkeypatch):
     monkeypatch.setattr(evaluation, "BLOCK", 3)
     blocks = Evaluator(Config(**TINY, num_features=1), evaluator.tasks)
     assert_equal(blocks(params), played)
+
+
+def test_each_set_has_its_own_limit_where_the_settings_leave_it(grey_play, monkeypatch):
+    """With a limit of 6 for both, and with 1 and 6: what took longer than 1 is not solved."""
+    evaluator, params, played = grey_play
+    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+    for name, limit in (("one", 1), ("six", 6)):
+        tt.register(name, (), base=tt.base_state(1), max_steps=limit)
+    tasks = dict.fromkeys(("one", "six"), evaluator.tasks["mine"])
+    config = Config(**{**TINY, "max_steps": None}, num_features=1)
+    own = Evaluator(config, tasks)
+    assert own.limits == {"one": 1, "six": 6}
+    outcome = own(params)
+    for name in ("solved", "length"):
+        found, expected = (getattr(each, name) for each in (outcome["six"], played["mine"]))
+        np.testing.assert_array_equal(found, expected)
+    at_once = played["mine"].solved & (played["mine"].length == 1)
+    assert 0 < at_once.sum()
+    np.testing.assert_array_equal(outcome["one"].solved, at_once)
+    np.testing.assert_array_equal(outcome["one"].length, 1)
+    assert Evaluator(Config(**TINY, num_features=1), tasks).limits == {"one": 6, "six": 6}
+    with pytest.raises(ValueError, match="unknown task set 'mine'"):
+        Evaluator(config, {"mine": tasks["one"]})
 
 
 def test_solved_episode_becomes_a_gif(grey_play, tmp_path):

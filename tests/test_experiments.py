@@ -388,6 +388,47 @@ def test_stored_protocols_are_whole():
         Protocol.from_dict(values)
 
 
+def test_folders_of_earlier_versions_hold_the_papers_sets(tmp_path):
+    usual = PROTOCOLS["exp2"]
+    values = {"experiment": "exp2", **dataclasses.asdict(usual)}
+    for name in ("train_set", "sets", "imports"):
+        del values[name]
+    (tmp_path / "experiment.json").write_text(json.dumps(values))
+    assert training.open_experiment(tmp_path, "exp2", usual, {}, create=False) == usual
+    with pytest.raises(ValueError, match="has train_set=pstsy, not sy; use another --name"):
+        training.open_experiment(tmp_path, "exp2", usual, {"train_set": "sy"}, create=False)
+
+
+def test_any_sets_are_trained_and_evaluated_on():
+    options = experiments.Options("exp1", train_set="SymbolicTrapTube-v0", sets=("base", "psy"))
+    assert options.root.name == "exp1-paper-sy"
+    protocol = dataclasses.replace(options.defaults, **options.given())
+    assert (protocol.train_set, protocol.sets) == ("sy", ("base", "psy"))
+    assert protocol.config("ppo").env_id == "SymbolicTrapTube-v0"
+    assert " --train-set sy --sets base psy --preset " in protocol.command("exp1", ["ppo"])
+    # Base, a single task, is ranked by only where it is trained on.
+    assert protocol.ranked == ("psy",)
+    assert dataclasses.replace(protocol, train_set="base").ranked == ("base", "psy")
+    assert dataclasses.replace(protocol, sets=("base",)).ranked == ("base",)
+    assert [PROTOCOLS[name].ranked for name in PROTOCOLS] == [ALL_SETS, ALL_SETS[1:]]
+    with pytest.raises(ValueError, match="unknown task set 'q'"):
+        dataclasses.replace(protocol, sets=("q",))
+    with pytest.raises(ValueError, match="name at least one task set; allowed: base, p"):
+        dataclasses.replace(protocol, sets=())
+
+
+@pytest.mark.parametrize("experiment", PROTOCOLS)
+def test_the_papers_numbers_stand_beside_its_own_sets_only(example, experiment):
+    example["experiment"] = experiment
+    example["protocol"]["train_set"] = PROTOCOLS[experiment].train_set
+    assert "PPO + ICM, paper" in tables.markdown(example)
+    assert tables.title(example).startswith("Experiment ")
+    example["protocol"]["train_set"] = "sy"
+    assert ", paper" not in tables.markdown(example)
+    assert tables.title(example) == "Train on {Sy}, preset paper"
+    assert ("{Sy} solved; " in tables.markdown(example)) == (experiment == "exp1")
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_ppo_is_ppo_alone_in_every_preset(preset):
     learner = {"method": "ppo"} if "method" in PRESETS[preset] else {}

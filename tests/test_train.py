@@ -34,13 +34,14 @@ TINY = [
 ITERATIONS = 30
 
 
-def start(module, *arguments, cache):
+def start(module, *arguments, cache, cwd=ROOT):
     """A real process of a command line, warnings being errors."""
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-m", module, *map(str, arguments)],
-        cwd=ROOT,
+        cwd=cwd,
         env={
             **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
             "XDG_CACHE_HOME": str(cache),
             "JAX_NUMPY_RANK_PROMOTION": "raise",
             "JAX_PLATFORMS": "cpu",
@@ -52,8 +53,8 @@ def start(module, *arguments, cache):
     )
 
 
-def run(module, *arguments, cache):
-    process = start(module, *arguments, cache=cache)
+def run(module, *arguments, cache, cwd=ROOT):
+    process = start(module, *arguments, cache=cache, cwd=cwd)
     output, errors = process.communicate()
     assert process.returncode == 0, errors
     assert not errors

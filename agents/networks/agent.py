@@ -8,16 +8,11 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.networks.core import Core, Heads, Outputs
-from agents.networks.encoder import Encoder
 from agents.networks.layers import draw
-from agents.networks.object_encoder import ObjectEncoder
 from agents.registry import encoders
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
-
-encoders.register("paper", lambda config: Encoder(config.filters))
-encoders.register("objects", lambda config: ObjectEncoder(config.filters))
 
 
 class Agent:
