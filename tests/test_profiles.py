@@ -230,6 +230,7 @@ def test_counts_of_a_record_made_by_hand():
     assert {length: each.tasks for length, each in by_length.items()} == {8.0: 1, 35 / 3: 3}
     outcome = summary.outcome(record, policy, "layout 1")
     assert (outcome.tasks, outcome.percent) == (5, 40.0)
+    assert outcome.optimality is not None
     assert outcome.optimality.mean == pytest.approx((1 + 8 / 12) / 2)
     table = tables.mistakes_table(record, policy).to_markdown()
     assert "| failed: tool touched | 1 |" in table

@@ -20,14 +20,16 @@ MEAN_ANGLE = 90  # degrees, from the base colours, at strength 1
 COLOURS = ("#1f5f8b", "#d1495b", "#66a182", "#8d6a9f", "#edae49", "#5c5c5c")
 MARKERS = "osD^vP"
 # Of `OUTCOMES`: solved in greens, failed from yellow to dark red, lost in black.
-OUTCOME_COLOURS = dict(
+OUTCOME_COLOURS: dict[str, str] = dict(
     zip(
         OUTCOMES,
         ("#2b7a5b", "#9ccdb0", "#f6dc85", "#eda24e", "#d0623c", "#97303a", "#57202f", "#111111"),
         strict=True,
     )
 )
-PUSH_COLOURS = dict(zip(PUSHES, ("#2b7a5b", "#eda24e", "#97303a", "#d9d9d9"), strict=True))
+PUSH_COLOURS: dict[str, str] = dict(
+    zip(PUSHES, ("#2b7a5b", "#eda24e", "#97303a", "#d9d9d9"), strict=True)
+)
 TURN_COLOURS = ("#d0623c", "#2b7a5b", "#1f5f8b", "#111111")
 COLUMNS = 3  # of panels
 BELOW: dict[str, Any] = {  # a legend's place and looks
@@ -41,7 +43,7 @@ BELOW: dict[str, Any] = {  # a legend's place and looks
 
 def drawings(record: Record, name: str) -> dict[str, Callable[[Path], None]]:
     """What draws each figure of a record, by the name of its file."""
-    made = {f"{name}.png": functools.partial(save_profile, record)}
+    made = {f"{name}.png": functools.partial(save_profile, record)} if _panels(record) else {}
     for policy in record["policies"]:
         if policy["mistakes"]:
             file = f"{name}_{re.sub('[^A-Za-z0-9-]+', '_', policy['name'])}.png"
@@ -55,9 +57,14 @@ def digest(record: Record) -> str:
 
 
 def save_profile(record: Record, path: Path) -> None:
-    """Draws percent solved and optimality over the axes, all policies in one figure, as PNG."""
+    """Draws percent solved and optimality over the axes, all policies in one figure, as PNG.
+
+    Args:
+      record: of the profile; it holds an axis.
+      path: the file to write.
+    """
     panels = _panels(record)
-    bands = max(-(-len(panels) // COLUMNS), 1)
+    bands = -(-len(panels) // COLUMNS)
     figure = _figure(3.6 * COLUMNS, 4.4 * bands + 0.4)
     for band, part in enumerate(figure.subfigures(bands, 1, squeeze=False)[:, 0]):
         axes = part.subplots(2, COLUMNS, sharex="col", sharey="row", squeeze=False)

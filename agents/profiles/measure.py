@@ -54,8 +54,8 @@ class Settings:
 
     parts: tuple[str, ...] = PARTS
     strengths: tuple[float, ...] = STRENGTHS
-    tasks: int = 300
-    episodes: int = 100
+    tasks: int = 200
+    episodes: int = 50
 
     def __post_init__(self) -> None:
         """Checks the numbers; the rest is checked where tasks are drawn.
@@ -156,8 +156,8 @@ class Played(NamedTuple):
     @classmethod
     def of(cls, tasks: State, outcome: Evaluation) -> "Played":
         """The episodes that an evaluation played."""
-        steps = np.where(outcome.solved, outcome.length, 0)
-        return cls(tasks, np.asarray(replayed(tasks, outcome.action)), outcome.action, steps)
+        action, steps = np.asarray(outcome.action), np.where(outcome.solved, outcome.length, 0)
+        return cls(tasks, np.asarray(replayed(tasks, action)), action, steps)
 
 
 def _measure(

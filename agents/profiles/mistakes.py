@@ -75,7 +75,7 @@ def walks_to_food(board: np.ndarray, extent: np.ndarray, cells: np.ndarray) -> n
       cells: u8[T, 3, 2], the cells of agent, tool and food.
     """
     agent, tool, food = np.moveaxis(cells.astype(np.int32), 1, 0)
-    every = np.stack(np.indices((BOARD_SIZE, BOARD_SIZE)), axis=-1)[None]
+    every = np.moveaxis(np.indices((BOARD_SIZE, BOARD_SIZE)), 0, -1)[None]
     is_tool = _covers(tool[:, None, None], extent, every)
     is_food = (every == food[:, None, None]).all(axis=-1) & ~is_tool
     is_free = ((board == GROUND) & ~is_tool) | is_food
@@ -86,12 +86,12 @@ def walks_to_food(board: np.ndarray, extent: np.ndarray, cells: np.ndarray) -> n
         beside = wide[:, :-2, 1:-1] | wide[:, 2:, 1:-1] | wide[:, 1:-1, :-2] | wide[:, 1:-1, 2:]
         # The food in an exit is not walked through: the task is over there.
         reached = reached | (beside & is_free)
-    return (reached & is_food).any(axis=(1, 2))
+    return np.any(reached & is_food, axis=(1, 2))
 
 
 def _covers(corner: np.ndarray, extent: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """bool[...]: whether the tool at `corner` covers `cell`."""
-    return ((cell >= corner) & (cell < corner + extent)).all(axis=-1)
+    return np.all((cell >= corner) & (cell < corner + extent), axis=-1)
 
 
 def _first(happens: np.ndarray) -> int:
