@@ -88,6 +88,7 @@ def profile(
     Raises:
       ValueError: a setting is not allowed, or there is no policy, or they differ in channels.
     """
+    here = machine()  # first: the code may be changed while this runs
     channels = {policy.config.num_features for policy in policies.values()}
     if len(channels) != 1:
         raise ValueError(
@@ -109,7 +110,6 @@ def profile(
             }
             for name, policy in policies.items()
         ]
-    here = machine()
     return {
         "schema": SCHEMA,
         "command": command,
