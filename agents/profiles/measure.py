@@ -9,9 +9,10 @@ A record holds what was measured and nothing derived from it:
     points      by name: axis and value, and of every task the length of its shortest plan, -1
                 where there is none
     pairs       by name: the two points whose tasks differ in the trap alone, one by one
-    policies    name, source, iteration and settings; by point the steps of every episode, 0
-                where it did not solve the task, and its first push (see `pushes`); and of
-                those that are not as short as can be where they go wrong (see `mistakes`)
+    policies    name, iteration and settings; by point the steps of every episode, 0 where it
+                did not solve the task, and in pairs and controls its first push (see
+                `pushes`); of the first episodes of some points, as far as they are not as short
+                as can be, where they go wrong (see `mistakes`)
 """
 
 import dataclasses
@@ -55,7 +56,7 @@ class Settings:
     parts: tuple[str, ...] = PARTS
     strengths: tuple[float, ...] = STRENGTHS
     tasks: int = 200
-    episodes: int = 50
+    episodes: int = 100
 
     def __post_init__(self) -> None:
         """Checks the numbers; the rest is checked where tasks are drawn.

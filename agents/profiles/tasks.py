@@ -34,8 +34,8 @@ class Point(NamedTuple):
     """Tasks that are alike in their distance from the base task.
 
     Attributes:
-      axis: what is changed: `base`, one of `GRADED`, `swap` (the tool's looks, in the base
-        task), `swap of both` (in tasks of {P, St}), `control` or `twin`, trap and exit exchanged.
+      axis: what is changed: `base`, nothing; one of `GRADED`; `swap`, the tool's looks in the
+        base task; `swap of both`, in tasks of {P, St}; `control`; `twin`, trap and exit exchanged.
       value: how far, or with what.
       tasks: B states at time 0.
     """
