@@ -56,7 +56,7 @@ class Settings:
     parts: tuple[str, ...] = PARTS
     strengths: tuple[float, ...] = STRENGTHS
     tasks: int = 200
-    episodes: int = 100
+    episodes: int = 50
 
     def __post_init__(self) -> None:
         """Checks the numbers; the rest is checked where tasks are drawn.
