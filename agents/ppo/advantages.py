@@ -15,6 +15,10 @@ from agents.acting.episodes import Episodes
 from agents.config import Config
 from agents.ppo import returns
 
+# Of the curiosity's returns, once scaled: like that of the task's, which lie in [0, 1], so that
+# one weight of the value's error suits both.
+RETURN_DEVIATION = 0.3
+
 # Added to the variance of advantages, so that a stream that hardly pays is not blown up.
 VARIANCE_FLOOR = 4e-4
 
@@ -78,8 +82,8 @@ def of_streams(
     Added up as rewards, the louder one decides: once easy tasks pay, what the agent still has to
     find out is lost in their variance (Burda et al., 2019b).
 
-    The task's reward, at most 1 an episode, is taken as it is; the curiosity's is divided by the
-    deviation of its returns.
+    The task's reward, at most 1 an episode, is taken as it is; the curiosity's is scaled so that
+    its returns deviate by `RETURN_DEVIATION`.
 
     Args:
       config: the settings.
@@ -98,7 +102,7 @@ def of_streams(
     task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
     own = continuing_value(value[..., 1], mask)
     discount = jnp.full_like(novelty, gamma)
-    reward = novelty / intrinsic.deviation
+    reward = RETURN_DEVIATION * novelty / intrinsic.deviation
     curiosity = generalized_advantages(reward, discount, own, mask, lambda_)
     target = jnp.stack([task_target, curiosity + own[:-1]], axis=-1)
     advantage = joint_advantage(task, curiosity, scale, mask)
