@@ -1,5 +1,6 @@
 """What the record of a profile comes to: percentages with intervals, and counts."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -130,11 +131,9 @@ def failed(policy: Record, name: str) -> list[dict[str, int]]:
     return [row for row in mistakes(policy, name) if not policy["steps"][name][row["task"]]]
 
 
-def stage(row: Record, step: int = NEVER) -> str:
-    """The last subgoal that an episode reached, before a step if one is given."""
-    reached = [
-        goal for goal in SUBGOALS if row[goal] != NEVER and (step == NEVER or row[goal] < step)
-    ]
+def stage(row: Record, before: float = math.inf) -> str:
+    """The last subgoal that an episode reached before a step."""
+    reached = [goal for goal in SUBGOALS if row[goal] != NEVER and row[goal] < before]
     return reached[-1] if reached else UNTOUCHED
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from agents.experiments.records import Record
 from agents.experiments.tables import Table, provenance
 from agents.profiles import summary
-from agents.profiles.mistakes import SUBGOALS
+from agents.profiles.mistakes import NEVER, SUBGOALS
 from agents.profiles.pushes import NO_PUSH
 from agents.profiles.summary import OUTCOMES, PUSHES, SOLVED, TURNS, UNTOUCHED, Outcome
 from agents.profiles.tasks import BASE
@@ -18,6 +18,7 @@ AXES = {
     "layout": "Layout: strength of the perceptual transfer",
     "both": "Layout and colours: strength of both transfers",
 }
+STANDING = "no step back, some without effect"
 CELLS = "solved % [95 % Wilson interval], and mean of shortest plan / steps where solved"
 
 
@@ -91,10 +92,10 @@ def mistakes_table(record: Record, policy: Record) -> Table:
         )
         for turn, text in TURNS.items()
     ]
-    begins = [Counter(summary.stage(row, row["first_rose"]) for row in each) for each in detours]
+    begins = [Counter(map(_begin, each)) for each in detours]
     rows += [
-        (f"detours that begin after: {stage}", *(str(each[stage]) for each in begins))
-        for stage in (UNTOUCHED, *SUBGOALS)
+        (f"detours, begun after: {stage}", *(str(each[stage]) for each in begins))
+        for stage in (UNTOUCHED, *SUBGOALS, STANDING)
     ]
     title = (
         f"What {policy['name']} fails at, in the first episodes of each set. Failed ones are called"
@@ -102,6 +103,11 @@ def mistakes_table(record: Record, policy: Record) -> Table:
     )
     heads = ("episodes", *map(summary.label, names))
     return Table(title, heads, tuple(rows) if names else ())
+
+
+def _begin(row: Record) -> str:
+    """The last subgoal that a detour reached before it first took the goal farther away."""
+    return STANDING if row["first_rose"] == NEVER else summary.stage(row, row["first_rose"])
 
 
 def _median(steps: list[int]) -> str:
