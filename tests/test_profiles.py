@@ -20,7 +20,7 @@ from agents.profiles import figures, measure, mistakes, summary, tables
 from agents.profiles.mistakes import NEVER, Turns, subgoals, turns, walks_to_food
 from agents.profiles.oracle import LOST, Oracle, replayed
 from agents.profiles.pushes import NO_PUSH, Push, first_push
-from agents.profiles.tasks import PARTS, STRENGTHS, points
+from agents.profiles.tasks import STRENGTHS, points
 from benchmarks import readme_tables
 from trap_tube_jax.controls import trap_and_exit_exchanged, trap_exchanged
 
@@ -149,9 +149,10 @@ def test_twins_differ_in_trap_and_exit_alone():
 
 
 def test_points_draw_what_their_names_say():
-    drawn = points(PARTS, (0.5,), 3, 3)
+    drawn = points(("colours", "pairs"), (0.5,), 3, 3)
     base = tt.base_state()
-    assert [len(point.tasks.time) for point in drawn.values() if point.axis == "layout"] == [3, 3]
+    assert [name for name in drawn if drawn[name].axis == "colours"] == ["colours 0.5", "colours 1"]
+    assert {len(point.tasks.time) for point in drawn.values() if point.axis == "layout"} == {3}
     same = {
         name: np.all(np.asarray(point.tasks.palette) == np.asarray(base.palette))
         for name, point in drawn.items()
@@ -162,12 +163,6 @@ def test_points_draw_what_their_names_say():
         np.testing.assert_array_equal(one, two)
     twins = drawn["both 1, exchanged"].tasks
     np.testing.assert_array_equal(twins.palette, drawn["both 1"].tasks.palette)
-    assert {name.removeprefix("swap ") for name in drawn if drawn[name].axis == "swap"} == {
-        "tube1",
-        "tube2",
-        "trap",
-        "exit",
-    }
     assert len([name for name in drawn if name.startswith("control ")]) == 13
 
 
@@ -246,7 +241,7 @@ def tiny():
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), shapes)
     policies = {"mine": Policy("mine", config, params, 7)}
-    settings = measure.Settings(strengths=(0.5,), tasks=2, episodes=2)
+    settings = measure.Settings(strengths=(1.0,), tasks=2, episodes=2)
     return measure.profile(policies, settings, Console(file=io.StringIO()), command="x")
 
 
@@ -272,6 +267,8 @@ def test_a_profile_holds_every_episode(tiny):
     for name, point in tiny["points"].items():
         assert len(policy["steps"][name]) == len(point["shortest"])
         assert max(policy["steps"][name]) <= TINY["max_steps"]
+    swaps = [point["shortest"] for point in tiny["points"].values() if point["axis"] == "swap"]
+    assert swaps == [[10], [8], [10], [16]]  # environment.md, "Task sets"
     assert tiny["points"]["base"]["shortest"] == [11]
     assert tiny["points"]["control too-short-tool"]["shortest"] == [-1]
     # No plan of a {P} task is as short as the step limit of this policy.
