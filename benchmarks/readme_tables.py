@@ -1,12 +1,14 @@
 """The tables and figures of all pages, from the records alone: python -m benchmarks.readme_tables.
 
 A record is `benchmarks/results/NAME.json`, which `python -m agents.experiments --record`
-writes. In any Markdown page of the project the text between `<!-- table: NAME -->` and
-`<!-- end -->` is the tables of that record; `benchmarks/results/figures/NAME.png` is its figure.
-A block or a figure whose record is not there is left as it is.
+and `python -m agents.profile --record` write. In any Markdown page of the project the text between
+`<!-- table: NAME -->` and `<!-- end -->` is the tables of that record; its figures are
+`benchmarks/results/figures/NAME.png`, and of a profile `NAME_AGENT.png` beside it. A block or a
+figure whose record is not there is left as it is.
 """
 
 import dataclasses
+import functools
 import re
 import sys
 from collections.abc import Callable
@@ -15,8 +17,11 @@ from typing import Annotated
 
 import tyro
 
+import agents.profiles.figures
+import agents.profiles.tables
 from agents.experiments import figures, tables
-from agents.experiments.records import Record, is_record, read_record
+from agents.experiments.records import SCHEMA, Record, is_record, read_record
+from agents.profiles import measure
 
 ROOT = Path(__file__).parent.parent
 PAGES = ("*.md", "agents/**/*.md", "benchmarks/**/*.md", "trap_tube_jax/**/*.md")
@@ -63,7 +68,7 @@ def read_records(results: Path) -> dict[str, Record]:
       ValueError: a record is of another schema than this version's.
     """
     paths = [path for path in sorted(results.glob("*.json")) if is_record(path)]
-    return {path.stem: read_record(path) for path in paths}
+    return {path.stem: read_record(path, SCHEMA, measure.SCHEMA) for path in paths}
 
 
 def generate(text: str, records: dict[str, Record]) -> str:
@@ -73,7 +78,8 @@ def generate(text: str, records: dict[str, Record]) -> str:
         record = records.get(match["name"])
         if record is None:
             return match[0]
-        return f"{match['start']}\n{tables.markdown(record)}\n\n{match['end']}"
+        markdown = agents.profiles.tables.markdown if _is_profile(record) else tables.markdown
+        return f"{match['start']}\n{markdown(record)}\n\n{match['end']}"
 
     return BLOCK.sub(fill, text)
 
@@ -87,9 +93,10 @@ def stale(root: Path, records: dict[str, Record]) -> dict[Path, Callable[[], obj
         if made != text:
             found[path] = lambda path=path, made=made: path.write_text(made)
     for name, record in records.items():
-        path = root / "benchmarks" / "results" / "figures" / f"{name}.png"
-        if figures.drawn_from(path) != figures.digest(record):
-            found[path] = lambda path=path, record=record: _draw(record, path)
+        for file, draw in _drawings(record, name).items():
+            path = root / "benchmarks" / "results" / "figures" / file
+            if figures.drawn_from(path) != _digest(record):
+                found[path] = lambda path=path, draw=draw: _draw(draw, path)
     return found
 
 
@@ -111,9 +118,25 @@ def main(arguments: Arguments) -> None:
         raise SystemExit(1)
 
 
-def _draw(record: Record, path: Path) -> None:
+def _is_profile(record: Record) -> bool:
+    return record["schema"] == measure.SCHEMA
+
+
+def _drawings(record: Record, name: str) -> dict[str, Callable[[Path], None]]:
+    """What draws each figure of a record, by the name of its file."""
+    if _is_profile(record):
+        return agents.profiles.figures.drawings(record, name)
+    return {f"{name}.png": functools.partial(figures.save, record)}
+
+
+def _digest(record: Record) -> str:
+    module = agents.profiles.figures if _is_profile(record) else figures
+    return module.digest(record)
+
+
+def _draw(draw: Callable[[Path], None], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    figures.save(record, path)
+    draw(path)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.objects import BOARD_SIZE, GROUND, OBJECT_CHARS
+from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND, NUM_OBJECTS, OBJECT_CHARS, TRAP
 from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State
 from trap_tube_jax.transfers import Transfer
@@ -25,7 +25,7 @@ def trap_turned() -> tuple[State, ...]:
     """The trap is in the wall, out of the food's way, and both ends are exits.
 
     The short way goes past the trap. An agent that keeps away from it takes the long one.
-    Source: Visalberghi and Limongelli (1994), Reaux and Povinelli (2003): the inverted tube.
+    Source: Visalberghi and Limongelli (1994), Reaux and Povinelli (2000): the inverted tube.
     """
     return (_layout("....1xx1....", "....eF.e....", "....e..e....", "....2222...."),)
 
@@ -33,7 +33,8 @@ def trap_turned() -> tuple[State, ...]:
 def trap_exchanged() -> tuple[State, ...]:
     """Trap and exit have changed places, so that the food must go the other way.
 
-    Source: Visalberghi and Limongelli (1994): the side of the trap varies over trials.
+    Source: Limongelli, Boysen and Visalberghi (1995): the food in the middle of the tube, the trap
+    left of it or right.
     """
     return (_layout("....1111....", "....eF.x....", "....e..x....", "....2222...."),)
 
@@ -53,7 +54,7 @@ def two_traps() -> tuple[State, ...]:
     """A second trap is in the wall on the way to the exit: the food can pass it, not the other.
 
     The exit is on the base task's side, or on the other one.
-    Source: Seed et al. (2006): tubes with one functional and one non-functional trap.
+    Source: Seed et al. (2006): tubes with two traps, of which one does nothing.
     """
     return (
         _layout("....1xx1....", "....xF.e....", "....x..e....", "....2222...."),
@@ -64,8 +65,8 @@ def two_traps() -> tuple[State, ...]:
 def far_exit() -> tuple[State, ...]:
     """The tube is three cells longer on the side of the exit.
 
-    Source: Limongelli, Boysen and Visalberghi (1995): the trap off the middle, which parts the
-    distance to the ends from the side of the trap.
+    Source: after Limongelli, Boysen and Visalberghi (1995), who moved the trap off the middle, so
+    that the distance to the ends no longer tells the side of the trap.
     """
     return (_layout("....1111111.", "....xF....e.", "....x.....e.", "....2222222."),)
 
@@ -73,7 +74,7 @@ def far_exit() -> tuple[State, ...]:
 def short_tool() -> tuple[State, ...]:
     """The tool is two cells long and reaches the food from the nearer wall only.
 
-    Source: Visalberghi and Trinca (1989): sticks too short for the usual way.
+    Source: after Visalberghi and Trinca (1989): sticks that are of use only in a certain way.
     """
     return (_layout(*_BASE_TUBE, tool=(5, 1), extent=(2, 1)),)
 
@@ -81,7 +82,7 @@ def short_tool() -> tuple[State, ...]:
 def too_short_tool() -> tuple[State, ...]:
     """The tool is one cell long and reaches the food from nowhere. No plan solves this.
 
-    Source: Visalberghi and Trinca (1989), Mulcahy, Call and Dunbar (2005): sticks too short.
+    Source: Mulcahy, Call and Dunbar (2005): tools too short to reach the food.
     """
     return (_layout(*_BASE_TUBE, tool=(5, 1), extent=(1, 1)),)
 
@@ -89,7 +90,7 @@ def too_short_tool() -> tuple[State, ...]:
 def tool_in_tube() -> tuple[State, ...]:
     """The tool is in the tube already, on the wrong side of the food, and must come out first.
 
-    Source: Seed et al. (2006): the stick put into the tube before the trial.
+    Source: after Seed et al. (2006), where the stick is in the tube before the trial.
     """
     return (_layout(*_BASE_TUBE, tool=(5, 6)),)
 
@@ -131,6 +132,17 @@ def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
 
     transfer.__name__ = layouts.__name__.replace("_", " ")
     return transfer
+
+
+def trap_and_exit_exchanged(state: State) -> State:
+    """The same task but for trap and exit, which have changed places.
+
+    With the task itself it is a pair that differs in the trap alone. The twin of a task of {P}
+    is a task of {P}.
+    """
+    other = np.arange(NUM_OBJECTS, dtype=np.uint8)
+    other[[TRAP, EXIT]] = EXIT, TRAP
+    return state.replace(board=jnp.asarray(other)[state.board])
 
 
 CONTROLS = (

@@ -170,8 +170,12 @@ def write_record(path: Path, record: Record) -> None:
     write_json(path, record)
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: Path, *schemas: str) -> Record:
     """The record in a file.
+
+    Args:
+      path: the file.
+      schemas: those allowed; that of an experiment if none is given.
 
     Raises:
       ValueError: it is none, or of another schema.
@@ -179,8 +183,10 @@ def read_record(path: Path) -> Record:
     record = read_json(path)
     if not isinstance(record, dict) or "schema" not in record:
         raise ValueError(f"{path} is no record of an experiment")
-    if record["schema"] != SCHEMA:
-        raise ValueError(f"{path} is of schema {record['schema']!r}; allowed: {SCHEMA!r}")
+    schemas = schemas or (SCHEMA,)
+    if record["schema"] not in schemas:
+        allowed = ", ".join(map(repr, schemas))
+        raise ValueError(f"{path} is of schema {record['schema']!r}; allowed: {allowed}")
     return record
 
 

@@ -1,0 +1,130 @@
+"""Generalisation profiles from the command line: python -m agents.profile --help."""
+
+import dataclasses
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from agents.acting.policy import Policy
+from agents.experiments.records import check_clean, read_record, write_record
+from agents.profiles import figures, tables
+from agents.profiles.measure import SCHEMA, Settings, profile
+from agents.profiles.tasks import PARTS, STRENGTHS
+from agents.runs import compilation_cache
+from agents.runs.folder import read_json
+from agents.runs.loading import load
+
+PROGRAM = "python -m agents.profile"
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Profiles trained agents: how success falls with the distance from the base task.
+
+    Percent solved and optimality against the angle of the colours, the distance of the layout,
+    the length of the shortest plan, and by kind of symbolic swap; the controls of comparative
+    psychology; the paired test of the first push; and at which step and subgoal plans go wrong.
+    All agents in one figure, and one more figure for each. Greedy play on tasks that training never
+    draws, compared with exact shortest plans.
+
+    Attributes:
+      runs: folders of runs, or files of parameters; of a run its first seed.
+      pretrained: names of shipped parameters.
+      parts: what to measure: some of colours, layout, both, swaps, controls, pairs.
+      strengths: how far colours and layouts are changed: above 0, the base task, to 1, the
+        paper's transfers.
+      tasks: of every point.
+      episodes: of how many of a point's episodes to find out where they go wrong.
+      out: the folder of record, tables and figures.
+      record: also write the record to this file; refused unless all is of committed code.
+      commit: the commit to note where git does not tell it.
+      draw: measure nothing; draw tables and figures of this record.
+      no_cache: compile everything anew, instead of keeping compiled programs in
+        ~/.cache/trap_tube_jax from one time to the next.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    pretrained: tuple[str, ...] = ()
+    parts: tuple[str, ...] = PARTS
+    strengths: tuple[float, ...] = STRENGTHS
+    tasks: int = Settings.tasks
+    episodes: int = Settings.episodes
+    out: Path = Path("runs/profile")
+    record: Path | None = None
+    commit: str | None = None
+    draw: Path | None = None
+    no_cache: Flag = False
+
+    def policies(self) -> dict[str, Policy]:
+        """What to profile, by the name that figures show.
+
+        Raises:
+          ValueError: nothing is given, two have one name, or one cannot be read.
+        """
+        if not self.runs and not self.pretrained:
+            raise ValueError("give runs' folders or --pretrained NAME, one or more of them")
+        sources = [(path.resolve().name, path) for path in self.runs]
+        sources += [(name, name) for name in self.pretrained]
+        names = [name for name, _ in sources]
+        if len(set(names)) < len(names):
+            raise ValueError(f"figures tell agents by their names, which differ; got {names}")
+        return {name: load(source) for name, source in sources}
+
+    def machines(self) -> list[Any]:
+        """Those that the runs were trained on."""
+        return [each for path in self.runs for each in read_json(path / "machines.json") or ()]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line; `arguments` are those of the process if absent."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    options = tyro.cli(Options, args=arguments, prog=PROGRAM)
+    if not options.no_cache:
+        compilation_cache.enable()
+    try:
+        run(options, arguments)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+
+
+def run(options: Options, arguments: Sequence[str]) -> None:
+    """Measures as the options say, and shows and writes the results.
+
+    Raises:
+      ValueError: an option is not allowed, or a record cannot be read or written.
+    """
+    console = Console()
+    if options.draw is None:
+        settings = Settings(options.parts, options.strengths, options.tasks, options.episodes)
+        found = profile(
+            options.policies(),
+            settings,
+            console,
+            command=f"{PROGRAM} {shlex.join(arguments)}",
+            machines=options.machines(),
+        )
+    else:
+        found = read_record(options.draw, SCHEMA)
+    for table in tables.tables(found):
+        console.print(table.to_rich())
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_record(options.out / "profile.json", found)
+    (options.out / "tables.md").write_text(f"# Profile\n\n{tables.markdown(found)}\n")
+    for name, save in figures.drawings(found, "profile").items():
+        save(options.out / name)
+    console.print(f"record, tables and figures: {options.out}", soft_wrap=True, highlight=False)
+    if options.record is not None:
+        check_clean(found, options.commit)
+        write_record(options.record, found)
+        console.print(f"record: {options.record}", soft_wrap=True, highlight=False)
+
+
+if __name__ == "__main__":
+    main()

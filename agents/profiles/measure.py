@@ -1,0 +1,234 @@
+"""Plays all points of a profile, compares the episodes with the oracle, and makes the record.
+
+A record holds what was measured and nothing derived from it:
+
+    schema      the name of this layout; a file of another one is refused
+    command     what to type for the same profile
+    settings    parts, strengths, tasks of a point, episodes looked into
+    machines    hardware, versions and commit, of the profile and of the runs in it
+    points      by name: axis and value, and of every task the length of its shortest plan, -1
+                where there is none
+    pairs       by name: the two points whose tasks differ in the trap alone, one by one
+    policies    name, iteration and settings; by point the steps of every episode, 0 where it
+                did not solve the task, and in pairs and controls its first push (see
+                `pushes`); of the first episodes of some points, as far as they are not as short
+                as can be, where they go wrong (see `mistakes`)
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
+
+from agents.acting.evaluation import Evaluation, Evaluator
+from agents.acting.policy import Policy
+from agents.experiments.records import Record
+from agents.profiles.mistakes import SUBGOALS, Turns, subgoals, turns
+from agents.profiles.oracle import Oracle, replayed
+from agents.profiles.pushes import Push, first_push
+from agents.profiles.tasks import PAIRS, PARTS, STRENGTHS, SWAPS, points
+from agents.runs.machine import machine
+from trap_tube_jax.state import State
+
+SCHEMA = "trap-tube-jax profile 1"
+# The points whose episodes are looked into, and those that are in pairs, where the parts hold them.
+LOOKED_INTO = ("colours 1", "layout 1", "both 1", *(f"both 1, swap {name}" for name in SWAPS))
+IN_PAIRS = {name for pair in PAIRS.values() for name in pair}
+
+Advance = Callable[[], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What a profile measures.
+
+    Attributes:
+      parts: some of `PARTS`.
+      strengths: the strengths of the graded axes, above 0, to 1.
+      tasks: of every point that has more than one.
+      episodes: of how many of a point's episodes to find out where they go wrong.
+    """
+
+    parts: tuple[str, ...] = PARTS
+    strengths: tuple[float, ...] = STRENGTHS
+    tasks: int = 200
+    episodes: int = 50
+
+    def __post_init__(self) -> None:
+        """Checks the numbers; the rest is checked where tasks are drawn.
+
+        Raises:
+          ValueError: naming the value and what is allowed.
+        """
+        for name, low in (("tasks", 1), ("episodes", 0)):
+            if getattr(self, name) < low:
+                raise ValueError(f"{name} must be >= {low}, got {getattr(self, name)}")
+
+
+def profile(
+    policies: Mapping[str, Policy],
+    settings: Settings,
+    console: Console,
+    *,
+    command: str = "",
+    machines: Sequence[Record] = (),
+) -> dict[str, Any]:
+    """Measures policies and makes their record.
+
+    Args:
+      policies: by the name that figures show; all see the same number of feature channels.
+      settings: what to measure.
+      console: where to show how far it is.
+      command: what to type for the same.
+      machines: those that the policies were trained on, if known.
+
+    Raises:
+      ValueError: a setting is not allowed, or there is no policy, or they differ in channels.
+    """
+    here = machine()  # first: the code may be changed while this runs
+    channels = {policy.config.num_features for policy in policies.values()}
+    if len(channels) != 1:
+        raise ValueError(
+            f"give policies of one number of feature channels, got {sorted(channels) or 'none'}"
+        )
+    drawn = points(settings.parts, settings.strengths, settings.tasks, channels.pop())
+    tasks = {name: jax.device_get(point.tasks) for name, point in drawn.items()}
+    pairs = {name: pair for name, pair in PAIRS.items() if {*pair} <= {*drawn}}
+    oracle = Oracle()
+    columns = [*Progress.get_default_columns(), MofNCompleteColumn()]
+    with Progress(*columns, console=console, transient=True) as bars:
+        shortest = _shortest(oracle, tasks, bars)
+        measured = [
+            {
+                "name": name,
+                "iteration": policy.iteration,
+                "config": policy.config.to_dict(),
+                **_measure(name, policy, oracle, tasks, shortest, settings.episodes, bars),
+            }
+            for name, policy in policies.items()
+        ]
+    return {
+        "schema": SCHEMA,
+        "command": command,
+        "settings": dataclasses.asdict(settings),
+        "machines": [here, *(each for each in machines if each != here)],
+        "points": {
+            name: {"axis": point.axis, "value": point.value, "shortest": shortest[name].tolist()}
+            for name, point in drawn.items()
+        },
+        "pairs": {name: list(pair) for name, pair in pairs.items()},
+        "policies": measured,
+    }
+
+
+def _shortest(oracle: Oracle, tasks: Mapping[str, State], bars: Progress) -> dict[str, np.ndarray]:
+    """By point i32[B], the lengths of the shortest plans, -1 where there is none."""
+    bar = bars.add_task("Shortest plans", total=sum(len(each.time) for each in tasks.values()))
+    found = {}
+    for name, states in tasks.items():
+        lengths = []
+        for state in rows(states):
+            cells = np.stack([state.agent, state.tool, state.food])
+            lengths.append(oracle.distance(state, cells))
+            bars.advance(bar)
+        found[name] = np.array(lengths)
+    return found
+
+
+class Played(NamedTuple):
+    """A policy's episodes of a point; NumPy arrays.
+
+    Attributes:
+      tasks: B states at time 0.
+      cells: u8[B, T + 1, 3, 2], of agent, tool and food.
+      action: i32[B, T, 2].
+      steps: i32[B], to the food; 0 where it was not reached.
+    """
+
+    tasks: State
+    cells: np.ndarray
+    action: np.ndarray
+    steps: np.ndarray
+
+    @classmethod
+    def of(cls, tasks: State, outcome: Evaluation) -> "Played":
+        """The episodes that an evaluation played."""
+        action, steps = np.asarray(outcome.action), np.where(outcome.solved, outcome.length, 0)
+        return cls(tasks, np.asarray(replayed(tasks, action)), action, steps)
+
+
+def _measure(
+    label: str,
+    policy: Policy,
+    oracle: Oracle,
+    tasks: Mapping[str, State],
+    shortest: Mapping[str, np.ndarray],
+    episodes: int,
+    bars: Progress,
+) -> dict[str, Any]:
+    """What the record says of a policy beside its settings."""
+    bar = bars.add_task(f"{label}: playing", total=None)
+    outcomes = Evaluator(policy.config, tasks)(policy.params)
+    played = {name: Played.of(tasks[name], outcome) for name, outcome in outcomes.items()}
+    pushed = [name for name in tasks if name.startswith("control ") or name in IN_PAIRS]
+    into = [name for name in tasks if name in LOOKED_INTO]
+    total = sum(len(shortest[name]) for name in pushed)
+    total += sum(min(episodes, len(shortest[name])) for name in into)
+    bars.update(bar, description=f"{label}: where plans go wrong", total=total)
+
+    def advance() -> None:
+        bars.advance(bar)
+
+    return {
+        "steps": {name: each.steps.tolist() for name, each in played.items()},
+        "pushes": {name: _pushes(oracle, played[name], advance) for name in pushed},
+        "mistakes": {
+            name: _mistakes(oracle, played[name], shortest[name][:episodes], advance)
+            for name in into
+        },
+    }
+
+
+def _pushes(oracle: Oracle, played: Played, advance: Advance) -> dict[str, list]:
+    """The first pushes of a point's episodes, as columns."""
+    found = []
+    for state, cells in zip(rows(played.tasks), played.cells, strict=True):
+        found.append(first_push(oracle, state, cells))
+        advance()
+    return {name: [getattr(push, name) for push in found] for name in Push._fields}
+
+
+def _mistakes(
+    oracle: Oracle, played: Played, shortest: np.ndarray, advance: Advance
+) -> dict[str, Any]:
+    """Where the first episodes go wrong that could be shorter; columns, by `task`.
+
+    Args:
+      oracle: what knows the distances.
+      played: the episodes.
+      shortest: i32[n], the shortest plans of the first n of them.
+      advance: called once an episode.
+    """
+    names = ("task", *Turns._fields, *SUBGOALS)
+    columns: dict[str, list[int]] = {name: [] for name in names}
+    limit = played.action.shape[1]
+    for index, state in enumerate(rows(played.tasks)[: len(shortest)]):
+        steps = played.steps[index]
+        if 0 < shortest[index] <= limit and steps != shortest[index]:
+            length = int(steps) or limit
+            cells = played.cells[index, : length + 1]
+            found = turns(oracle.along(state, cells))
+            reached = subgoals(state, cells, played.action[index, :length])
+            for name, value in zip(names, (index, *found, *reached), strict=True):
+                columns[name].append(value)
+        advance()
+    return columns
+
+
+def rows(states: State) -> list[State]:
+    """The states of a batch."""
+    return [jax.tree.map(lambda x, i=i: np.asarray(x)[i], states) for i in range(len(states.time))]
