@@ -126,7 +126,7 @@ def train_all(
             tracker=tracker,
             placement=Placement.of(resources.devices, run.config, run.seeds),
         )
-        write_json(folder.config, run.to_dict())  # more iterations, once it has been taken up
+        folder.note(run)  # more iterations, once it has been taken up
         try:
             session.train(stop)
             session.summarize()
