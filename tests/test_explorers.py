@@ -80,17 +80,17 @@ def test_an_episode_is_paid_the_same_among_others_as_apart(name):
 
 @pytest.mark.parametrize(("name", "shaped"), [("icm-detached", False), ("ride", True)])
 def test_the_forward_loss_shapes_the_features_of_ride_alone(name, shaped):
-    train = learner_of(name)
+    curious: Any = learner_of(name).curiosity
     action = jnp.zeros((2, 1, 2), jnp.int32)
     features = jax.random.normal(jax.random.key(0), (3, 1, 3))
     # The two models without their encoder, which would only take time.
     given = (jax.random.key(1), features[:-1], features[1:], action)
-    params = draw(given[0], train.curiosity._models.init(*given, method="compare"))
+    params = draw(given[0], curious._models.init(*given, method="compare"))
     episodes = Episodes(tt.base_state(), action, action, action, action, action)
 
     def loss(features, name):
         experience = Experience(episodes, jnp.zeros((3, 1)), features)
-        return jnp.sum(train.curiosity.losses(params, experience)[name])
+        return jnp.sum(curious.losses(params, experience)[name])
 
     assert bool(np.any(jax.grad(loss)(features, "forward_loss"))) == shaped
     assert np.any(jax.grad(loss)(features, "inverse_loss"))

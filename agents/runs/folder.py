@@ -141,6 +141,11 @@ class RunFolder:
         return self.path / "checkpoints"
 
     @property
+    def log(self) -> Path:
+        """What its training showed, where it ran beside others."""
+        return self.path / "log.txt"
+
+    @property
     def curves(self) -> Path:
         """The learning curves."""
         return self.path / "curves.png"
@@ -217,6 +222,17 @@ class RunFolder:
     def note(self, run: Run) -> None:
         """Writes the settings of a run, and which version does."""
         write_json(self.config, {"version": __version__, **run.to_dict()})
+
+
+def is_done(folder: RunFolder, run: Run) -> bool:
+    """Whether a run has been trained and summarised in full."""
+    summary = read_json(folder.summary)
+    if summary is None:
+        return False
+    solved = all(seed["first_solved"] for seed in summary["seeds"])
+    return summary["iterations"] >= run.config.iterations or (
+        run.config.stop_when_solved > 0 and solved
+    )
 
 
 def write_json(path: Path, values: Any) -> None:
