@@ -28,7 +28,7 @@ ROOMS = (
     ("pretrained", "runs", "evaluate"),
     ("train",),
     ("experiments",),
-    ("sweep",),
+    ("sweep", "examples"),
 )
 LEARNING = ("registry", "config", "parallel", "networks", "acting", "curiosity", "ppo")
 SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
