@@ -8,6 +8,8 @@ import difflib
 from typing import Any, Literal, Self, get_args, get_type_hints
 
 from agents import registry
+from trap_tube_jax.imports import import_modules
+from trap_tube_jax.registry import task_set
 
 _NO_LIMIT = float("inf")
 
@@ -39,9 +41,10 @@ class Config:
     `Config()` is the preset `paper`. The command line starts from the preset `fast`.
 
     Attributes:
+      imports: modules of your own, imported first, for the names that they register.
       env_id: the task set to train on, by id or short name.
       num_features: N, feature channels of the observation; 3 is RGB.
-      max_steps: steps after which an episode is truncated.
+      max_steps: steps after which an episode is truncated; None: as many as its set has.
 
       iterations: rollouts to train for, at most.
       stop_when_solved: stop early once the greedy policy solves this share of the
@@ -99,7 +102,7 @@ class Config:
       facing: whether the agent sees and acts in a frame in which the food lies ahead at first,
         one of the board's eight symmetries, instead of on the board as it is.
       encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
-        seen from agent and food is all that is encoded.
+        seen from agent and food is all that is encoded. Or a name that you registered.
       filters: channels of the first convolution, and of all later ones; units of the layers
         of `objects`.
       hidden: units of the GRU, of the layer before it and of the inverse model.
@@ -107,10 +110,11 @@ class Config:
       chunk: distinct observations that are encoded at once; changes speed, not results.
     """
 
+    imports: tuple[str, ...] = _setting(())
     # The task.
     env_id: str = _setting("TrapTube-v0")
     num_features: int = _setting(3, 1, 256)
-    max_steps: int = _setting(50, 1, 10_000)
+    max_steps: int | None = _setting(None, 1, 10_000)
     # How long, and how it is judged.
     iterations: int = _setting(250, 1)
     stop_when_solved: float = _setting(0.0, 0, 1)
@@ -148,7 +152,7 @@ class Config:
     failures: int = _setting(1024, 1, unused={"replayed": ((),)})
     # The network.
     facing: bool = _setting(False)
-    encoder: Literal["paper", "objects"] = _setting("paper")
+    encoder: str = _setting("paper")
     filters: tuple[int, int] = _setting((32, 64), 1, 4096)
     hidden: int = _setting(64, 1, 65_536)
     embedding: int = _setting(8, 1, 65_536)
@@ -164,7 +168,9 @@ class Config:
             value = getattr(self, field.name)
             _check_type(field, value)
             _check_value(field, value)
-        registry.curiosity_factory(self.curiosity)
+        import_modules(self.imports)
+        registry.curiosities.factory(self.curiosity)
+        registry.encoders.factory(self.encoder)
         for field in dataclasses.fields(self):
             self._check_use(field)
         if self.rewards == "apart" and self.bootstrap != "value":
@@ -229,10 +235,18 @@ class Config:
         """All settings as plain values, for JSON."""
         return dataclasses.asdict(self)
 
+    def step_limit(self, name: str) -> int:
+        """The steps after which an episode of a task set is truncated.
+
+        Raises:
+          ValueError: `max_steps` leaves it to the set, and there is no such set.
+        """
+        return task_set(name).max_steps if self.max_steps is None else self.max_steps
+
     @property
     def transitions(self) -> int:
         """The largest number of environment steps of one iteration."""
-        return self.episodes * self.max_steps
+        return self.episodes * self.step_limit(self.env_id)
 
     @property
     def streams(self) -> int:
@@ -303,29 +317,38 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def _check_type(field: dataclasses.Field, value: Any) -> None:
     default = field.default
-    if isinstance(default, bool) or isinstance(value, bool):
+    if default is None:
+        matches = value is None or type(value) is int
+    elif isinstance(default, bool) or isinstance(value, bool):
         matches = isinstance(default, bool) and isinstance(value, bool)
     elif isinstance(default, float):
         matches = isinstance(value, int | float)
     elif isinstance(default, tuple):
-        number = int if default else int | float
+        kind = _kind_of_items(field)
         matches = (
             isinstance(value, tuple)
             and (not default or len(value) == len(default))
-            and all(isinstance(item, number) and not isinstance(item, bool) for item in value)
+            and all(isinstance(item, kind) and not isinstance(item, bool) for item in value)
         )
     else:
         matches = isinstance(value, type(default))
     if not matches:
-        wanted = type(default).__name__
+        wanted = "int or None" if default is None else type(default).__name__
         if isinstance(default, tuple):
-            wanted = "2 integers" if default else "numbers"
+            names = {int: f"{len(default)} integers", str: "names"}
+            wanted = names.get(_kind_of_items(field), "numbers")
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
+
+
+def _kind_of_items(field: dataclasses.Field) -> Any:
+    """The type of a tuple's items; integers are numbers too."""
+    kind = get_args(get_type_hints(Config)[field.name])[0]
+    return int | float if kind is float else kind
 
 
 def _check_value(field: dataclasses.Field, value: Any) -> None:
     limits, choices = field.metadata["limits"], get_args(get_type_hints(Config)[field.name])
-    if limits is not None:
+    if limits is not None and value is not None:
         low, high = limits
         for number in value if isinstance(value, tuple) else (value,):
             if not low <= number <= high:

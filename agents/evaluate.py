@@ -10,12 +10,15 @@ import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import ALL_SETS, Evaluator, scores, shortest_lengths
+from agents.acting.evaluation import Evaluator, own_and_paper_sets, scores
 from agents.acting.policy import Policy
 from agents.pretrained import load_shipped
 from agents.runs import compilation_cache, report
 from agents.runs.folder import write_json
 from agents.runs.loading import load_policies
+from trap_tube_jax.command_line import Imports
+from trap_tube_jax.imports import import_modules
+from trap_tube_jax.scoring.tasks import shortest_lengths
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
@@ -27,7 +30,9 @@ class Options:
     Attributes:
       run: a run's folder, or a file of parameters.
       pretrained: the name of shipped parameters, instead of a run.
-      sets: ids or short names of task sets.
+      sets: ids or short names of task sets; the paper's eight, and that of training, if absent.
+      imports: modules of your own to import first, for the sets that they register; those of
+        the run are known.
       episodes: tasks per set; the run's `eval_episodes` if absent. The base set has one.
       iteration: the checkpoint to evaluate; the newest if absent.
       gif: write the first solved episode to this file.
@@ -40,7 +45,8 @@ class Options:
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     pretrained: str | None = None
-    sets: tuple[str, ...] = ALL_SETS
+    sets: tuple[str, ...] | None = None
+    imports: Imports = ()
     episodes: int | None = None
     iteration: int | None = None
     gif: Path | None = None
@@ -81,16 +87,18 @@ def evaluate(options: Options) -> None:
     Raises:
       ValueError: an option is not allowed, or there is nothing to evaluate.
     """
+    import_modules(options.imports)
     policies = options.policies()
     config = policies[0].config
+    sets = own_and_paper_sets(config) if options.sets is None else options.sets
     episodes = config.eval_episodes if options.episodes is None else options.episodes
-    evaluator = Evaluator.of_sets(config, options.sets, episodes)
+    evaluator = Evaluator.of_sets(config, sets, episodes)
     shortest = None
     if options.optimality:
         shortest = {name: shortest_lengths(tasks) for name, tasks in evaluator.tasks.items()}
     played = {policy.name: evaluator(policy.params) for policy in policies}
     results = {
-        name: scores(outcome, evaluator.tasks, config.max_steps, shortest)
+        name: scores(outcome, evaluator.tasks, evaluator.limits, shortest)
         for name, outcome in played.items()
     }
     console = Console()

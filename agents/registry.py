@@ -1,49 +1,52 @@
-"""The names by which `Config.curiosity` knows intrinsic rewards.
+"""The names by which `Config` knows intrinsic rewards and encoders.
 
-A table of its own, below everything else, so that settings can be checked without the modules
-that the names stand for. `agents.curiosity` fills it; a module of your own may add to it.
+Tables of their own, below everything else, so that settings can be checked without the modules
+that the names stand for. `agents.curiosity` and `agents.networks` fill them; a module of your own
+may add to them (agents/extending.md).
 """
 
 from collections.abc import Callable
 from typing import Any
 
-# From the settings and the environment to an `agents.curiosity.Curiosity`.
-CuriosityFactory = Callable[[Any, Any], Any]
 
-_curiosities: dict[str, CuriosityFactory] = {}
+class Registry:
+    """What is known of one kind, by name."""
+
+    def __init__(self, kind: str):
+        """An empty table; `kind` is what messages call an entry."""
+        self.kind = kind
+        self._factories: dict[str, Callable[..., Any]] = {}
+
+    def register(self, name: str, factory: Callable[..., Any]) -> None:
+        """Makes something known by a name.
+
+        Args:
+          name: what the settings call it.
+          factory: what makes it from the settings.
+
+        Raises:
+          ValueError: the name is taken.
+        """
+        if name in self._factories:
+            known = ", ".join(self.names())
+            raise ValueError(f"{self.kind} {name!r} is registered already; known: {known}")
+        self._factories[name] = factory
+
+    def names(self) -> tuple[str, ...]:
+        """The names that are known."""
+        return tuple(self._factories)
+
+    def factory(self, name: str) -> Callable[..., Any]:
+        """What was registered under this name.
+
+        Raises:
+          ValueError: nothing was.
+        """
+        if name not in self._factories:
+            known = ", ".join(self.names())
+            raise ValueError(f"unknown {self.kind} {name!r}; known: {known}")
+        return self._factories[name]
 
 
-def register_curiosity(name: str, factory: CuriosityFactory) -> None:
-    """Makes a curiosity known by a name.
-
-    Args:
-      name: what `Config.curiosity` calls it.
-      factory: `factory(config, env)` returns the `Curiosity`.
-
-    Raises:
-      ValueError: the name is taken.
-    """
-    if name in _curiosities:
-        raise ValueError(f"curiosity {name!r} is registered already; known: {known()}")
-    _curiosities[name] = factory
-
-
-def curiosities() -> tuple[str, ...]:
-    """The names that are known."""
-    return tuple(_curiosities)
-
-
-def curiosity_factory(name: str) -> CuriosityFactory:
-    """What was registered under this name.
-
-    Raises:
-      ValueError: nothing was.
-    """
-    if name not in _curiosities:
-        raise ValueError(f"unknown curiosity {name!r}; known: {known()}")
-    return _curiosities[name]
-
-
-def known() -> str:
-    """The names that are known, for people."""
-    return ", ".join(_curiosities)
+curiosities = Registry("curiosity")
+encoders = Registry("encoder")

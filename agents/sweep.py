@@ -23,6 +23,7 @@ from agents.runs.folder import is_done, write_json
 from agents.runs.report import NOTHING
 from agents.runs.results import results
 from agents.runs.stopping import Stopped, StopSignals
+from trap_tube_jax.command_line import Imports
 
 PERCENT = "percent_"
 
@@ -37,6 +38,8 @@ class Options:
 
     Attributes:
       settings: what varies, as NAME=VALUE,VALUE; a single value holds for all runs.
+      imports: modules of your own to import first, for the curiosities, encoders and task sets
+        that they register.
       preset: the named settings to start from.
       env: the task set to train on, by id or short name.
       seeds: how many seeds, from --seed on.
@@ -50,6 +53,7 @@ class Options:
     """
 
     settings: tuple[str, ...] = ()
+    imports: Imports = ()
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
     env: str | None = None
     seeds: int = 1
@@ -83,7 +87,8 @@ class Options:
         values = dict(map(_values, self.settings))
         if len(values) < len(self.settings):
             raise ValueError(f"every setting is given once, got {' '.join(self.settings)}")
-        given = {} if self.env is None else {"env_id": self.env}
+        given: dict[str, Any] = {"imports": self.imports} if self.imports else {}
+        given |= {} if self.env is None else {"env_id": self.env}
         configs = {}
         for point in itertools.product(*values.values()):
             settings = dict(zip(values, point, strict=True))

@@ -6,7 +6,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import jax
 import tyro
@@ -20,6 +20,8 @@ from agents.runs import compilation_cache
 from agents.runs.folder import Run, RunFolder
 from agents.runs.session import Session
 from agents.runs.stopping import Stopped, StopSignals
+from trap_tube_jax.command_line import Imports
+from trap_tube_jax.imports import import_modules
 
 PROGRAM = "python -m agents.train"
 
@@ -30,6 +32,8 @@ class Selection(processes.Job):
 
     Attributes:
       preset: the named settings to start from.
+      modules: modules of your own to import first, for the curiosities, encoders and task sets
+        that they register; the same as --imports.
       env: the task set to train on, by id or short name; the same as --env-id.
       seed: the first seed.
       seeds: how many seeds to train side by side, from --seed on.
@@ -40,6 +44,7 @@ class Selection(processes.Job):
     """
 
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
+    modules: Imports = ()
     env: str | None = None
     seed: int = 0
     seeds: int = 1
@@ -135,6 +140,7 @@ def start(arguments: Sequence[str]) -> Session:
     selection.join()
     console = Console(quiet=not processes.is_first())
     options, folder, run = processes.from_first(lambda: open_run(selection, arguments))
+    import_modules(run.config.imports)  # in the processes that were told of the run
     if not options.no_cache:
         compilation_cache.enable()
     session = Session(
@@ -187,14 +193,18 @@ def parse(selection: Selection, arguments: Sequence[str]) -> tuple[Run | None, O
     Raises:
       ValueError: a value is not allowed.
     """
-    given = {} if selection.env is None else {"env_id": selection.env}
-    config = Config.preset(selection.preset, **given)
+    given: dict[str, Any] = {} if selection.env is None else {"env_id": selection.env}
+    own = {"imports": selection.modules} if selection.modules else {}
+    config = Config.preset(selection.preset, **given, **own)
     stored, defaults = None, Options(preset=selection.preset, config=config)
     path = run_path(selection, config.env_id)
     if selection.resume:
         _, stored = RunFolder.open(path)
         defaults = Options(
-            preset=stored.preset, seed=stored.seed, seeds=stored.seeds, config=stored.config
+            preset=stored.preset,
+            seed=stored.seed,
+            seeds=stored.seeds,
+            config=dataclasses.replace(stored.config, **own),
         )
     options = tyro.cli(
         Options, args=arguments, prog=PROGRAM, default=defaults, config=(tyro.conf.OmitArgPrefixes,)

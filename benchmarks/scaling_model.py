@@ -152,7 +152,7 @@ def repeated_seconds(config: Config, repeats: int = 5) -> float:
     train = make_train(dataclasses.replace(config, curiosity=curiosity))
     state = jax.jit(train.init)(jax.random.key(0))
     logits = jnp.zeros((config.episodes, NUM_DIRECTIONS))
-    step_keys = jax.random.split(jax.random.key(2), config.max_steps)
+    step_keys = jax.random.split(jax.random.key(2), train.env.max_steps)
 
     @jax.jit
     def repeat(trajectory: Any) -> Any:

@@ -10,11 +10,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from agents.acting.evaluation import Evaluator, evaluation_tasks
+from agents.acting.evaluation import Evaluator
 from agents.config import Config
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays
+from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 SEEDS = 2
 CONFIG = Config.preset(
@@ -119,7 +120,7 @@ def main(folder):
         restored, _ = checkpoints.restore(jax.eval_shape(lambda: start))
     from_eight, _ = on_one_device(restored, 2)
     twice, _ = trainer(restored, 2)
-    tasks = {name: evaluation_tasks(name, 3, max_steps=6) for name in ("base", "st")}
+    tasks = {name: evaluation_tasks(name, 3) for name in ("base", "st")}
     params = jax.tree.map(lambda x: x[0], once.params)
     played = [Evaluator(CONFIG, tasks, place)(params) for place in (Placement(), placement)]
     same = jax.tree.map(is_same, *played)

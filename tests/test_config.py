@@ -8,12 +8,14 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.config import PRESETS
+from agents.runs.folder import Run
+from trap_tube_jax import registry
 
 
 def test_paper_preset_is_the_specification():
     config = Config.preset("paper")
     expected = {
-        "episodes": 1024, "max_steps": 50, "epochs": 10, "minibatch": 128, "discount": 0.99,
+        "episodes": 1024, "max_steps": None, "epochs": 10, "minibatch": 128, "discount": 0.99,
         "gae_lambda": 0.95, "clip": 0.2, "value_coef": 0.01, "entropy_coef": 1e-4,
         "learning_rate": 1e-3, "adam_epsilon": 1e-7, "max_gradient_norm": 1.0,
         "curiosity": "icm", "intrinsic_scale": 0.1, "curiosity_coef": 10.0, "reward_rate": 0.9,
@@ -75,6 +77,20 @@ def test_unknown_preset_lists_the_known():
         Config.preset("quick")
 
 
+def test_the_sets_own_limit_holds_unless_the_settings_give_one(monkeypatch):
+    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+    tt.register("Short-v0", (), max_steps=30)
+    config = Config(env_id="Short-v0")
+    assert make_train(config).env.max_steps == config.step_limit("Short-v0") == 30
+    assert (config.transitions, config.step_limit("p")) == (30 * 1024, 50)
+    longer = Config(env_id="Short-v0", max_steps=60)
+    assert make_train(longer).env.max_steps == longer.step_limit("p") == 60
+    # A run of an earlier version has the limit of its set among its settings.
+    Run(config).check_continues(Run(Config(env_id="Short-v0", max_steps=30)))
+    with pytest.raises(ValueError, match="the run has max_steps=60, not 30"):
+        Run(config).check_continues(Run(longer))
+
+
 def test_environment_that_contradicts_the_config_is_refused():
     with pytest.raises(ValueError, match="max_steps is 9, the config's 50"):
-        make_train(Config(), tt.make("p", max_steps=9))
+        make_train(Config(max_steps=50), tt.make("p", max_steps=9))

@@ -28,7 +28,7 @@ class Corners(Curiosity):
 
 @pytest.fixture(autouse=True)
 def own_table(monkeypatch):
-    monkeypatch.setattr(registry, "_curiosities", dict(registry._curiosities))
+    monkeypatch.setattr(registry.curiosities, "_factories", dict(registry.curiosities._factories))
 
 
 def test_a_curiosity_of_ones_own_is_trained_with():

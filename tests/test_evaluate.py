@@ -12,19 +12,21 @@ from PIL import Image
 import trap_tube_jax as tt
 from agents import make_train
 from agents.acting import evaluation
-from agents.acting.evaluation import (
-    Evaluation,
-    Evaluator,
+from agents.acting.evaluation import Evaluation, Evaluator
+from agents.config import Config
+from agents.networks.agent import Agent
+from agents.runs import report, report_page
+from trap_tube_jax import registry
+from trap_tube_jax.registry import PAPER_TASK_SETS
+from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, wilson_interval
+from trap_tube_jax.scoring.tasks import (
+    NUM_LAYOUTS,
     evaluation_keys,
     evaluation_tasks,
     fixed_tasks,
     layout_numbers,
+    shortest_lengths,
 )
-from agents.acting.scores import Layouts, Optimality, Score, wilson_interval
-from agents.config import Config
-from agents.networks.agent import Agent
-from agents.runs import report, report_page
-from trap_tube_jax.registry import PAPER_TASK_SETS
 
 TINY = {
     "episodes": 4,
@@ -70,7 +72,7 @@ def random_params(config):
 def grey_play():
     """A random policy on grey boards: every set's tasks, and an own set of known outcome."""
     config = Config(**TINY, num_features=1)
-    tasks = {name: evaluation_tasks(name, 2, 1, 6) for name in ("base", "p")}
+    tasks = {name: evaluation_tasks(name, 2, 1) for name in ("base", "p")}
     evaluator = Evaluator(config, {**tasks, "mine": food_beside_agent(1)})
     params = random_params(config)
     return evaluator, params, evaluator(params)
@@ -156,7 +158,9 @@ def test_own_tasks_are_evaluated(grey_play):
     assert outcome.solved.any()
     assert 1 in outcome.length[outcome.solved]
     assert not played["base"].solved.any()  # needs 11 steps, has 6
-    by_set = {score.set: score for score in evaluation.scores(played, evaluator.tasks, 6)}
+    by_set = {
+        score.set: score for score in evaluation.scores(played, evaluator.tasks, evaluator.limits)
+    }
     assert by_set["mine"].percent == 25 * outcome.solved.sum()
     assert by_set["mine"].interval is not None
     assert by_set["base"].interval is None
@@ -168,6 +172,29 @@ def test_blocks_change_nothing(grey_play, monkeypatch):
     monkeypatch.setattr(evaluation, "BLOCK", 3)
     blocks = Evaluator(Config(**TINY, num_features=1), evaluator.tasks)
     assert_equal(blocks(params), played)
+
+
+def test_each_set_has_its_own_limit_where_the_settings_leave_it(grey_play, monkeypatch):
+    """With a limit of 6 for both, and with 1 and 6: what took longer than 1 is not solved."""
+    evaluator, params, played = grey_play
+    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+    for name, limit in (("one", 1), ("six", 6)):
+        tt.register(name, (), base=tt.base_state(1), max_steps=limit)
+    tasks = dict.fromkeys(("one", "six"), evaluator.tasks["mine"])
+    config = Config(**{**TINY, "max_steps": None}, num_features=1)
+    own = Evaluator(config, tasks)
+    assert own.limits == {"one": 1, "six": 6}
+    outcome = own(params)
+    for name in ("solved", "length"):
+        found, expected = (getattr(each, name) for each in (outcome["six"], played["mine"]))
+        np.testing.assert_array_equal(found, expected)
+    at_once = played["mine"].solved & (played["mine"].length == 1)
+    assert 0 < at_once.sum()
+    np.testing.assert_array_equal(outcome["one"].solved, at_once)
+    np.testing.assert_array_equal(outcome["one"].length, 1)
+    assert Evaluator(Config(**TINY, num_features=1), tasks).limits == {"one": 6, "six": 6}
+    with pytest.raises(ValueError, match="unknown task set 'mine'"):
+        Evaluator(config, {"mine": tasks["one"]})
 
 
 def test_solved_episode_becomes_a_gif(grey_play, tmp_path):
@@ -195,7 +222,7 @@ def test_a_page_shows_solved_and_unsolved_episodes(grey_play, tmp_path):
         title="<mine>",
         sentences=["It does not transfer."],
         settings={"hidden": 4},
-        scores={"seed 0": evaluation.scores(played, evaluator.tasks, 6)},
+        scores={"seed 0": evaluation.scores(played, evaluator.tasks, evaluator.limits)},
         curves=tmp_path / "curves.png",
         evaluator=evaluator,
         played=played,
@@ -225,7 +252,7 @@ def test_a_page_shows_solved_and_unsolved_episodes(grey_play, tmp_path):
 
 
 def test_shortest_lengths_of_the_base_task():
-    assert evaluation.shortest_lengths(evaluation_tasks("base", 1)).tolist() == [11]
+    assert shortest_lengths(evaluation_tasks("base", 1)).tolist() == [11]
 
 
 def test_optimality_compares_with_shortest_plans():
@@ -245,7 +272,9 @@ def test_optimality_compares_with_shortest_plans():
 def test_scores_use_the_paper_notation():
     outcome = Evaluation(jnp.array([True, False]), jnp.array([11, 50]), *[jnp.zeros((2, 50))] * 2)
     tasks = evaluation_tasks("pst", 2)
-    (score,) = evaluation.scores({"pst": outcome}, {"pst": tasks}, 50, {"pst": np.array([11, 12])})
+    (score,) = evaluation.scores(
+        {"pst": outcome}, {"pst": tasks}, {"pst": 50}, {"pst": np.array([11, 12])}
+    )
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
     assert score.mean_steps == 11
     assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)
@@ -269,9 +298,9 @@ def test_wilson_interval_refuses(successes, trials):
 @pytest.mark.parametrize("name", SHORTS)
 def test_sets_with_few_layouts_are_named(name):
     layout = layout_numbers(name, evaluation_tasks(name, 64))
-    if name in evaluation.NUM_LAYOUTS:
+    if name in NUM_LAYOUTS:
         assert layout is not None
-        assert sorted(set(layout.tolist())) == list(range(evaluation.NUM_LAYOUTS[name]))
+        assert sorted(set(layout.tolist())) == list(range(NUM_LAYOUTS[name]))
     else:
         assert layout is None
 

@@ -29,7 +29,7 @@ from agents.experiments import (
     tables,
     training,
 )
-from agents.experiments.protocol import EXPERIMENTS, PROTOCOLS, QUICK, Protocol, algorithms
+from agents.experiments.protocol import PROTOCOLS, QUICK, Protocol, algorithms
 from agents.parallel.sharding import ALONE
 from agents.ppo.learner import make_train
 from agents.runs import machine, report, session, stopping, tracking
@@ -37,6 +37,7 @@ from agents.runs.checkpoint import Checkpoints, digest, to_arrays
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
 from benchmarks import readme_tables
+from trap_tube_jax.scoring.tasks import ALL_SETS
 
 ROOT = Path(__file__).parent.parent
 FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
@@ -110,7 +111,6 @@ def lab():
         "p": jax.tree.map(lambda *x: jnp.stack(x), *(base.replace(agent=x) for x in columns)),
     }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXPERIMENTS, "exp1", EXPERIMENTS["exp1"]._replace(ranked=tuple(tasks)))
         patch.setattr(session, "make_train", fake_train)
         patch.setattr(session, "evaluate", fake_evaluate)
         patch.setattr(report, "save_curves", lambda *args: None)
@@ -126,7 +126,19 @@ def lab():
 def run(out, *arguments, seeds=2, iterations=ITERATIONS):
     settings = ["--settings", "max_steps=6", *SMALL, "--tasks", 4, "--evaluate-every", 2]
     counts = ["--seeds", seeds, "--iterations", iterations, "--checkpoint-every", 3]
-    given = ["exp1", "--algorithms", "ppo", *settings, *counts, "--no-cache", "--out", out]
+    given = [
+        "exp1",
+        "--sets",
+        "base",
+        "p",
+        "--algorithms",
+        "ppo",
+        *settings,
+        *counts,
+        "--no-cache",
+        "--out",
+        out,
+    ]
     experiments.main([str(argument) for argument in [*given, "--name", "x", *arguments]])
     return out / "x"
 
@@ -356,14 +368,14 @@ def test_a_folder_holds_one_experiment(capsys, whole):
 
 def test_protocols_are_the_papers():
     assert (PROTOCOLS["exp1"].iterations, PROTOCOLS["exp2"].iterations) == (250, 500)
-    for name, protocol in PROTOCOLS.items():
+    for protocol in PROTOCOLS.values():
         assert (protocol.preset, protocol.seeds, protocol.tasks) == ("paper", 5, 128)
         assert protocol.algorithms == ("ppo", "ppo+icm")
-        config = protocol.config(EXPERIMENTS[name], "ppo+icm")
+        config = protocol.config("ppo+icm")
         assert (config.curiosity, config.episodes, config.stop_when_solved) == ("icm", 1024, 0)
-        assert protocol.config(EXPERIMENTS[name], "ppo").curiosity == "none"
+        assert protocol.config("ppo").curiosity == "none"
         assert (protocol.selection, protocol.num_reported) == ("validation", 1000)
-    fast = QUICK["exp1"].config(EXPERIMENTS["exp1"], "preset")
+    fast = QUICK["exp1"].config("preset")
     assert (fast.curiosity, fast.imitation_coef, fast.eval_episodes) == ("counts", 1.0, 16)
 
 
@@ -376,36 +388,76 @@ def test_stored_protocols_are_whole():
         Protocol.from_dict(values)
 
 
+def test_folders_of_earlier_versions_hold_the_papers_sets(tmp_path):
+    usual = PROTOCOLS["exp2"]
+    values = {"experiment": "exp2", **dataclasses.asdict(usual)}
+    for name in ("train_set", "sets", "imports"):
+        del values[name]
+    (tmp_path / "experiment.json").write_text(json.dumps(values))
+    assert training.open_experiment(tmp_path, "exp2", usual, {}, create=False) == usual
+    with pytest.raises(ValueError, match="has train_set=pstsy, not sy; use another --name"):
+        training.open_experiment(tmp_path, "exp2", usual, {"train_set": "sy"}, create=False)
+
+
+def test_any_sets_are_trained_and_evaluated_on():
+    options = experiments.Options("exp1", train_set="SymbolicTrapTube-v0", sets=("base", "psy"))
+    assert options.root.name == "exp1-paper-sy"
+    protocol = dataclasses.replace(options.defaults, **options.given())
+    assert (protocol.train_set, protocol.sets) == ("sy", ("base", "psy"))
+    assert protocol.config("ppo").env_id == "SymbolicTrapTube-v0"
+    assert " --train-set sy --sets base psy --preset " in protocol.command("exp1", ["ppo"])
+    # Base, a single task, is ranked by only where it is trained on.
+    assert protocol.ranked == ("psy",)
+    assert dataclasses.replace(protocol, train_set="base").ranked == ("base", "psy")
+    assert dataclasses.replace(protocol, sets=("base",)).ranked == ("base",)
+    assert [PROTOCOLS[name].ranked for name in PROTOCOLS] == [ALL_SETS, ALL_SETS[1:]]
+    with pytest.raises(ValueError, match="unknown task set 'q'"):
+        dataclasses.replace(protocol, sets=("q",))
+    with pytest.raises(ValueError, match="name at least one task set; allowed: base, p"):
+        dataclasses.replace(protocol, sets=())
+
+
+@pytest.mark.parametrize("experiment", PROTOCOLS)
+def test_the_papers_numbers_stand_beside_its_own_sets_only(example, experiment):
+    example["experiment"] = experiment
+    example["protocol"]["train_set"] = PROTOCOLS[experiment].train_set
+    assert "PPO + ICM, paper" in tables.markdown(example)
+    assert tables.title(example).startswith("Experiment ")
+    example["protocol"]["train_set"] = "sy"
+    assert ", paper" not in tables.markdown(example)
+    assert tables.title(example) == "Train on {Sy}, preset paper"
+    assert ("{Sy} solved; " in tables.markdown(example)) == (experiment == "exp1")
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_ppo_is_ppo_alone_in_every_preset(preset):
     learner = {"method": "ppo"} if "method" in PRESETS[preset] else {}
     protocol = Protocol(preset=preset, settings=learner)
-    whole = protocol.config(EXPERIMENTS["exp1"], "preset")
+    whole = protocol.config("preset")
     for name in ("ppo", "ppo+icm", "ppo+counts"):
-        config = protocol.config(EXPERIMENTS["exp1"], name)
+        config = protocol.config(name)
         assert config.imitation_coef == 0
         assert config.curiosity == (name.partition("+")[2] or "none")
         assert config.learning_rate == whole.learning_rate
-    assert not protocol.config(EXPERIMENTS["exp1"], "ppo").episodic_novelty
+    assert not protocol.config("ppo").episodic_novelty
 
 
 def test_a_name_may_say_that_the_agent_imitates():
     fast = Protocol(preset="fast")
-    whole = fast.config(EXPERIMENTS["exp1"], "preset")
+    whole = fast.config("preset")
     assert whole.imitation_coef > 0
-    named = fast.config(EXPERIMENTS["exp1"], f"ppo+{whole.curiosity}+imitation")
+    named = fast.config(f"ppo+{whole.curiosity}+imitation")
     assert named == whole
-    plain = fast.config(EXPERIMENTS["exp1"], "ppo+imitation")
+    plain = fast.config("ppo+imitation")
     assert (plain.curiosity, plain.imitation_coef) == ("none", whole.imitation_coef)
 
 
 def test_runs_with_a_cooldown_are_not_extended(tmp_path):
-    experiment = EXPERIMENTS["exp1"]
     short = Protocol(algorithms=("ppo",), seeds=1, settings={"cooldown": 0.5}, iterations=4)
-    training.plan(tmp_path, short, experiment, side_by_side=False)
+    training.plan(tmp_path, short, side_by_side=False)
     longer = dataclasses.replace(short, iterations=8)
     with pytest.raises(ValueError, match=r"ppo-seed0: the run has cooldown=0.5 and iterations=4"):
-        training.plan(tmp_path, longer, experiment, side_by_side=False)
+        training.plan(tmp_path, longer, side_by_side=False)
 
 
 def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
@@ -472,7 +524,7 @@ def example_record(tmp_path, greedy, iterations):
     """Runs with these evaluations; in test tasks they take 10 * seed, 20 and 0 steps."""
     entries = []
     for seed, values in enumerate(greedy):
-        config = Protocol(iterations=iterations).config(EXPERIMENTS["exp1"], "ppo+icm")
+        config = Protocol(iterations=iterations).config("ppo+icm")
         made = Run(config, seed=seed)
         folder = RunFolder.create(tmp_path / f"ppo+icm-seed{seed}", made)
         entries.append(training.AlgorithmRun("ppo+icm", folder, made, rows(seed, values)))
@@ -488,12 +540,12 @@ def example_record(tmp_path, greedy, iterations):
         for entry in entries
     ]
     config = entries[0].run.config.to_dict()
-    about = {"equal_to_base": 25.0, "layout": None, "shortest": [5, 10, -1]}
+    about = {"max_steps": 50, "equal_to_base": 25.0, "layout": None, "shortest": [5, 10, -1]}
     return {
         "schema": records.SCHEMA,
         "experiment": "exp2",
         "command": "x",
-        "protocol": dataclasses.asdict(Protocol(iterations=iterations)),
+        "protocol": dataclasses.asdict(Protocol(train_set="pstsy", iterations=iterations)),
         "ranked": ["p"],
         "machines": machines,
         "sets": {"base": {**about, "layout": [0], "shortest": [11]}, "p": about},
@@ -614,7 +666,7 @@ def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
     episodes, values = figures.by_iteration(some, "greedy_p")
     assert episodes.tolist() == [1024, 3072]
     np.testing.assert_array_equal(values, [[0, 1], [0.25, np.nan]])
-    for experiment in EXPERIMENTS:
+    for experiment in PROTOCOLS:
         example["experiment"] = experiment
         figures.save(example, tmp_path / "x.png")
         assert figures.drawn_from(tmp_path / "x.png") == figures.digest(example)
@@ -688,4 +740,4 @@ def test_the_quick_protocol_runs(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     (entry,) = json.loads((tmp_path / "exp1-fast-quick/summary.json").read_text())["algorithms"]
     (trial,) = entry["runs"]
-    assert list(trial["best"]["steps"]) == list(evaluation.ALL_SETS)
+    assert list(trial["best"]["steps"]) == list(ALL_SETS)

@@ -110,7 +110,7 @@ def test_training_resumes_to_the_same_bits(name):
 
 
 def test_every_name_makes_a_curiosity():
-    names = registry.curiosities()
+    names = registry.curiosities.names()
     assert {"noveld", "ride", "e3b"} <= set(names)
     for name in names:
         assert isinstance(learner_of(name).curiosity, curiosity.Curiosity)

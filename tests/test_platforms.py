@@ -26,7 +26,7 @@ TINY = Config(
     embedding=2, chunk=4,
 ).to_dict()  # fmt: skip
 OBJECTS = {"curiosity": "rnd", "encoder": "objects"}
-CURIOSITIES = curiosities()
+CURIOSITIES = curiosities.names()
 # What XLA wants to know of a GPU that it cannot ask.
 H200 = """
 platform_name: "CUDA"

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +8,13 @@ import pytest
 
 import agents
 import trap_tube_jax as tt
-from agents import Config, Policy, pretrained
+from agents import Config, Policy, evaluate, pretrained
 from agents.acting.evaluation import Evaluator
 from agents.networks.agent import Agent
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.folder import Run, RunFolder
+from trap_tube_jax import registry
+from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 CONFIG = Config(
     env_id="SymbolicTrapTube-v0",
@@ -45,7 +48,8 @@ def drive(policy, tasks):
     step, act = jax.jit(jax.vmap(env.step)), jax.jit(policy.act)
     state, carry = tasks, policy.initial(len(tasks.time))
     observation = jax.vmap(tt.observe)(state)
-    solved, length, actions = np.zeros(4, bool), np.zeros(4, int), []
+    batch = len(tasks.time)
+    solved, length, actions = np.zeros(batch, bool), np.zeros(batch, int), []
     for time in range(CONFIG.max_steps):
         action, carry = act(observation, carry, jax.random.key(time))
         length += ~np.asarray(state.terminated | state.truncated)
@@ -93,6 +97,29 @@ def test_a_loaded_policy_reaches_the_evaluators_outcomes(run_path, seed):
     assert length.max() > 1  # the recurrent state matters
     for index, count in enumerate(length):
         np.testing.assert_array_equal(actions[index, :count], played.action[index, :count])
+
+
+def test_driving_scoring_and_evaluating_come_to_the_same(run_path, tmp_path, monkeypatch):
+    """On the fixed tasks of a registered set."""
+    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+
+    def food_beside(key, state):
+        cells = jnp.array(FOOD_BESIDE, jnp.int32)
+        return state.replace(food=cells[jax.random.randint(key, (), 0, 4)])
+
+    base = tt.base_state(1)
+    tt.register("Beside-v0", (food_beside,), base=base, max_steps=CONFIG.max_steps)
+    arguments = [str(run_path), "--sets", "Beside-v0", "--episodes", "8", "--no-cache"]
+    evaluate.main([*arguments, "--json", str(tmp_path / "table.json")])
+    first, _ = json.loads((tmp_path / "table.json").read_text())
+    (found,) = first["sets"]
+    assert 0 < found["percent"] < 100
+    policy = agents.load(run_path)
+    solved, length, _ = drive(policy, evaluation_tasks("Beside-v0", 8))
+    assert found["percent"] == 100 * solved.mean()
+    scored = tt.score(policy, ["Beside-v0"], tasks=8)["Beside-v0"]
+    assert dataclasses.asdict(scored)["mean_steps"] == found["mean_steps"] == length[solved].mean()
+    assert scored.percent == found["percent"]
 
 
 def test_runs_files_and_names_are_loaded(run_path, tmp_path):

@@ -3,12 +3,16 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from agents.experiments import statistics
+from agents.experiments.records import read_record
 from trap_tube_jax import registry
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
+PROTOCOL = ROOT / "trap_tube_jax" / "protocol.md"
 
 
 def blocks_of(page: Path) -> list[str]:
@@ -34,6 +38,26 @@ def test_own_tasks(monkeypatch):
     for block in blocks_of(ROOT / "trap_tube_jax" / "own_tasks.md"):
         exec(compile(block, "own_tasks.md", "exec"), session)
     assert "timestep" in session
+
+
+def test_the_protocol(capsys):
+    session: dict[str, object] = {}
+    for block in blocks_of(PROTOCOL):
+        exec(compile(block, "protocol.md", "exec"), session)
+    output = capsys.readouterr().out
+    assert re.search(r"^\| base +\| +1 \| +0 \|", output, re.MULTILINE)
+    assert re.search(r"^\| \{P, St, Sy\} +\| +100 \|", output, re.MULTILINE)
+
+
+def test_the_leaderboard_is_of_the_records():
+    record = read_record(ROOT / "benchmarks" / "results" / "fast_base.json")
+    (entry,) = record["algorithms"]
+    summaries = statistics.by_set(record, entry).values()
+    means = [f"{summary.percent.mean:.1f}" for summary in summaries if summary.percent]
+    (row,) = re.findall(r"^\| `fast`.*?\| (.*) \|$", PROTOCOL.read_text(), re.MULTILINE)
+    steps = np.mean([run["transitions"] for run in entry["runs"]])
+    assert row.split(" | ") == [*means, "1,000", f"{steps:,.0f}"]
+    assert record["command"] in " ".join(PROTOCOL.read_text().split())
 
 
 @pytest.mark.interop

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from agents.acting.evaluation import ALL_SETS, label
-from agents.acting.scores import Score
 from agents.config import Config
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved
 from agents.runs.story import Story
+from trap_tube_jax.scoring.scores import Score
+from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
 FIRST = FirstSolved(iteration=3, episodes=3763, transitions=9, seconds=1.0)
 

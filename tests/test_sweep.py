@@ -67,6 +67,14 @@ def test_lists_and_truth_values_are_values_too():
     assert list(sweep.Options(settings=("clip=0.3",), preset="paper").configs()) == ["paper"]
 
 
+def test_modules_of_ones_own_are_imported_first():
+    given = sweep.Options(
+        settings=("curiosity=none,icm",), env="near-food", imports=("agents.examples.near_food",)
+    )
+    config = given.configs()["curiosity=none"]
+    assert (config.env_id, config.imports) == ("NearFood-v0", ("agents.examples.near_food",))
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from agents import evaluate
-from agents.acting.evaluation import ALL_SETS
 from agents.config import PRESETS, Config
 from agents.ppo.learner import make_train
 from agents.runs import compilation_cache
@@ -25,6 +24,7 @@ from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_me
 from agents.runs.progress import Progress
 from agents.runs.session import make_advance
 from agents.train import main, parse, select
+from trap_tube_jax.scoring.tasks import ALL_SETS
 
 ROOT = Path(__file__).parent.parent
 TINY = [
@@ -34,13 +34,14 @@ TINY = [
 ITERATIONS = 30
 
 
-def start(module, *arguments, cache):
+def start(module, *arguments, cache, cwd=ROOT):
     """A real process of a command line, warnings being errors."""
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-m", module, *map(str, arguments)],
-        cwd=ROOT,
+        cwd=cwd,
         env={
             **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
             "XDG_CACHE_HOME": str(cache),
             "JAX_NUMPY_RANK_PROMOTION": "raise",
             "JAX_PLATFORMS": "cpu",
@@ -52,8 +53,8 @@ def start(module, *arguments, cache):
     )
 
 
-def run(module, *arguments, cache):
-    process = start(module, *arguments, cache=cache)
+def run(module, *arguments, cache, cwd=ROOT):
+    process = start(module, *arguments, cache=cache, cwd=cwd)
     output, errors = process.communicate()
     assert process.returncode == 0, errors
     assert not errors

@@ -23,6 +23,8 @@ from trap_tube_jax.registry import (
     task_set,
 )
 from trap_tube_jax.rendering import render, save_gif
+from trap_tube_jax.scoring.benchmark import score, score_gymnasium
+from trap_tube_jax.scoring.scores import Score, Scores
 from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
@@ -42,6 +44,8 @@ __all__ = [
     "Environment",
     "EpisodeStatistics",
     "Plan",
+    "Score",
+    "Scores",
     "State",
     "TaskSet",
     "TimeStep",
@@ -64,6 +68,8 @@ __all__ = [
     "render",
     "render_ascii",
     "save_gif",
+    "score",
+    "score_gymnasium",
     "solve",
     "solve_batch",
     "structural",

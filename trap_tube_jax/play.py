@@ -16,6 +16,8 @@ import jax
 import numpy as np
 import tyro
 
+from trap_tube_jax.command_line import Imports
+from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import (
     AGENT,
     BASE_COLORS,
@@ -73,11 +75,13 @@ class Arguments:
       task_set: an id such as PerceptualTrapTube-v0, or a short name such as p.
       seed: the first task; the next ones follow it.
       out: the folder for recordings.
+      imports: modules of your own to import first, for the sets that they register.
     """
 
     task_set: Annotated[str, tyro.conf.Positional] = "TrapTube-v0"
     seed: int = 0
     out: pathlib.Path = pathlib.Path(".")
+    imports: Imports = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,6 +213,7 @@ def main(arguments: Arguments) -> None:
     Raises:
       ValueError: the task set is unknown, or there is no terminal to play in.
     """
+    import_modules(arguments.imports)
     task_set(arguments.task_set)
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ValueError(

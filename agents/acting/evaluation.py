@@ -1,13 +1,7 @@
-"""Greedy evaluation on fixed tasks, drawn with keys that training never draws.
+"""Greedy evaluation on the fixed tasks of the benchmark's protocol, by the network's fast path."""
 
-A key that training never draws may still give a task that it has seen: base is one task, {Sy}
-five, {St} and {St, Sy} one and five layouts in any colours.
-"""
-
-import functools
-import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,28 +10,15 @@ import numpy as np
 import trap_tube_jax as tt
 from agents.acting.frames import Frame
 from agents.acting.rollout import greedy_action, rollout
-from agents.acting.scores import Optimality, Score
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from agents.parallel.sharding import ALONE, DEFAULT_DEVICE, Placement, Shards
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import MAX_STEPS
-from trap_tube_jax.registry import PAPER_TASK_SETS
+from trap_tube_jax.scoring.scores import Optimality, Score
+from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks, label, layout_numbers
 from trap_tube_jax.state import State
 
-Purpose = Literal["test", "validation"]
-
-ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
-# How many layouts a set has, whatever their colours, where these are few.
-NUM_LAYOUTS = {"base": 1, "st": 1, "sy": 5, "stsy": 5}
 BLOCK = 1024  # tasks played at once: bounds the memory, whatever their number
-
-# "trap" and "tube", or "trap" and "vali". The first word of every `jax.random.key(seed)` is
-# 0, so no seed of training leads here.
-_ROOTS: dict[Purpose, np.ndarray] = {
-    "test": np.array([0x74726170, 0x74756265], np.uint32),
-    "validation": np.array([0x74726170, 0x76616C69], np.uint32),
-}
 
 
 class Evaluation(NamedTuple):
@@ -55,76 +36,6 @@ class Evaluation(NamedTuple):
     length: jax.Array
     action: jax.Array
     value: jax.Array
-
-
-def evaluation_tasks(
-    task_set: str,
-    num_tasks: int,
-    num_features: int = 3,
-    max_steps: int = MAX_STEPS,
-    purpose: Purpose = "test",
-) -> State:
-    """The fixed evaluation tasks of a registered set: B states, the same at every call.
-
-    B is `num_tasks`, or 1 for a set without transfers, whose tasks are all the same.
-
-    Args:
-      task_set: an id or a short name.
-      num_tasks: at least 1.
-      num_features: N, feature channels.
-      max_steps: the step limit.
-      purpose: `test` tasks are reported; by `validation` tasks training is stopped, and its
-        best parameters are chosen.
-
-    Raises:
-      ValueError: naming the value and what is allowed.
-    """
-    env = tt.make(task_set, num_features=num_features, max_steps=max_steps)
-    return fixed_tasks(env, tt.task_set(task_set).id, num_tasks, purpose)
-
-
-def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = "test") -> State:
-    """As `evaluation_tasks`, for any environment; `name` sets its tasks apart from others'.
-
-    They are the tasks that `env.reset` draws from `evaluation_keys(name, B, purpose)`.
-
-    Raises:
-      ValueError: `num_tasks` is below 1.
-    """
-    if num_tasks < 1:
-        raise ValueError(f"the number of evaluation tasks must be >= 1, got {num_tasks}")
-    count = num_tasks if env.transfers else 1
-    # Transfers are compiled one by one: the sets share them, so eight sets take three
-    # compilations, and a transfer has the same bits in each.
-    draw = tt.compose(*map(_compiled, env.transfers))
-    base = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), env.base)
-    return jax.vmap(draw)(evaluation_keys(name, count, purpose), base)
-
-
-def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax.Array:
-    """The PRNG keys [B] of the evaluation tasks of the set with this id.
-
-    More tasks begin with the same ones. No key serves two purposes or sets.
-    """
-    root = jax.random.wrap_key_data(jnp.asarray(_ROOTS[purpose]), impl="threefry2x32")
-    set_key = jax.random.fold_in(root, zlib.crc32(name.encode()))
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(set_key, jnp.arange(num_tasks))
-
-
-def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
-    """The layout i32[B] of each task, counted from 0; None unless the set has few.
-
-    A layout is a state without its colours.
-
-    Args:
-      name: the set's short name.
-      tasks: B states at time 0.
-    """
-    if name not in NUM_LAYOUTS:
-        return None
-    parts = (tasks.board, tasks.agent, tasks.tool, tasks.tool_extent, tasks.food)
-    rows = np.concatenate([np.asarray(part).reshape(len(part), -1) for part in parts], axis=1)
-    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
 
 
 def evaluate(
@@ -172,17 +83,24 @@ class Evaluator:
 
         Args:
           config: the settings of the policies to come.
-          tasks: the tasks of each set, by any name; see `evaluation_tasks`.
+          tasks: the tasks of each set, by name; see `evaluation_tasks`. Where `config.max_steps`
+            is None, the names are those of registered sets, whose limits hold.
           placement: the devices that share the tasks.
+
+        Raises:
+          ValueError: a name is to be that of a registered set, and is not.
         """
         self.tasks = dict(tasks)
+        self.limits = {name: config.step_limit(name) for name in self.tasks}
         self._total = sum(len(states.time) for states in self.tasks.values())
         block = min(BLOCK, self._total)
         self._blocks = [
             _rows(self._all_tasks(), np.arange(start, start + block) % self._total)
             for start in range(0, self._total, block)
         ]
-        env = tt.Environment(base=tt.base_state(config.num_features), max_steps=config.max_steps)
+        # All sets are played up to the largest limit; `__call__` cuts off what is beyond a set's.
+        longest = max(self.limits.values())
+        env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
         agent = Agent(config)
         shards = Shards(placement.num_devices)
         self._play: Any = placement.share(
@@ -205,13 +123,8 @@ class Evaluator:
         if not sets:
             raise ValueError(f"name at least one task set; allowed: {', '.join(ALL_SETS)}")
         names = [tt.task_set(name).short for name in sets]
-        make = functools.partial(
-            evaluation_tasks,
-            num_tasks=num_tasks,
-            num_features=config.num_features,
-            max_steps=config.max_steps,
-        )
-        return cls(config, {name: make(name) for name in names}, placement)
+        tasks = {name: evaluation_tasks(name, num_tasks, config.num_features) for name in names}
+        return cls(config, tasks, placement)
 
     def compile(self, params: Params) -> None:
         """Compiles for parameters of these shapes, as the first call would; for one device."""
@@ -224,7 +137,7 @@ class Evaluator:
         ends = np.cumsum([len(states.time) for states in self.tasks.values()])
         starts = np.concatenate([[0], ends[:-1]])
         return {
-            name: _rows(whole, slice(start, end))
+            name: _within(_rows(whole, slice(start, end)), self.limits[name])
             for name, start, end in zip(self.tasks, starts, ends, strict=True)
         }
 
@@ -232,17 +145,10 @@ class Evaluator:
         return jax.tree.map(lambda *parts: jnp.concatenate(parts), *self.tasks.values())
 
 
-def shortest_lengths(tasks: State) -> np.ndarray:
-    """i32[B]: the lengths of the shortest plans, -1 where unsolvable."""
-    from trap_tube_jax import solver  # noqa: PLC0415  needed on request only
-
-    return np.asarray(solver.solve_batch(tasks).length)
-
-
 def scores(
     played: Mapping[str, Evaluation],
     tasks: Mapping[str, State],
-    max_steps: int,
+    limits: Mapping[str, int],
     shortest: Mapping[str, np.ndarray] | None = None,
 ) -> list[Score]:
     """The score of every set; with `shortest`, by set, compared with shortest plans.
@@ -250,7 +156,7 @@ def scores(
     Args:
       played: what an `Evaluator` returned.
       tasks: its tasks.
-      max_steps: the step limit.
+      limits: its step limit of each set.
       shortest: the lengths i32[B] of each set's shortest plans, if known.
     """
     made = []
@@ -258,21 +164,23 @@ def scores(
         solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
         found = None
         if shortest is not None:
-            found = Optimality.of(solved, length, shortest[name], max_steps)
+            found = Optimality.of(solved, length, shortest[name], limits[name])
         layout = layout_numbers(name, tasks[name])
         made.append(Score.of(name, label(name), solved, length, layout=layout, optimality=found))
     return made
 
 
-def label(name: str) -> str:
-    """A registered set's name in the paper's notation; any other name as it is."""
-    known = {tt.task_set(id).short: tt.task_set(id).label for id in tt.registered_ids()}
-    return known.get(name, name)
+def own_and_paper_sets(config: Config) -> tuple[str, ...]:
+    """The short names of the paper's eight sets, and of that of training if it is another one."""
+    return tuple(dict.fromkeys((*ALL_SETS, tt.task_set(config.env_id).short)))
 
 
-@functools.cache
-def _compiled(transfer: tt.Transfer) -> tt.Transfer:
-    return jax.jit(transfer)
+def _within(outcome: Evaluation, limit: int) -> Evaluation:
+    """The episodes as they are if truncated after `limit` steps."""
+    return outcome._replace(
+        solved=outcome.solved & (outcome.length <= limit),
+        length=np.minimum(outcome.length, limit),
+    )
 
 
 def _rows(tree: Any, index: Any) -> Any:

@@ -10,11 +10,12 @@ from agents.curiosity.icm_detached import DetachedICM
 from agents.curiosity.noveld import NovelD
 from agents.curiosity.ride import RIDE
 from agents.curiosity.rnd import RND
-from agents.registry import curiosity_factory
-from agents.registry import register_curiosity as register
+from agents.registry import curiosities
 from trap_tube_jax.environment import Environment
 
 __all__ = ["Curiosity", "Experience", "make", "register"]
+
+register = curiosities.register
 
 register("icm", lambda config, env: ICM(config))
 register("icm-detached", lambda config, env: DetachedICM(config))
@@ -33,4 +34,4 @@ def make(config: Config, env: Environment) -> Curiosity:
     Raises:
       ValueError: it is unknown, or not for this environment.
     """
-    return curiosity_factory(config.curiosity)(config, env)
+    return curiosities.factory(config.curiosity)(config, env)

@@ -1,14 +1,6 @@
 """What an intrinsic reward is: one object with a few functions.
 
-To add one, subclass `Curiosity`, override what it needs, and register it:
-
-    class Corners(Curiosity):
-        def reward(self, params, memory, experience):
-            agent = experience.episodes.cells[1:, :, 0]
-            return jnp.all(agent % 11 == 0, axis=-1).astype(jnp.float32), memory
-
-    register("corners", lambda config, env: Corners())
-    make_train(Config(curiosity="corners"))
+To add one, subclass `Curiosity`, override what it needs, and register it: agents/extending.md.
 
 Source: agents/agent.md, "Curiosity".
 """

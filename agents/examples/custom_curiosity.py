@@ -1,6 +1,7 @@
 """A curiosity of one's own: a step pays where the tool moves, less the more it has moved.
 
 python -m agents.examples.custom_curiosity
+python -m agents.train --import agents.examples.custom_curiosity --curiosity tool-moves
 """
 
 from typing import Any

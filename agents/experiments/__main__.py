@@ -17,9 +17,12 @@ from rich.console import Console
 
 from agents.config import PRESETS
 from agents.experiments import records, reporting, training
-from agents.experiments.protocol import EXPERIMENTS, PROGRAM, PROTOCOLS, QUICK, Protocol
+from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol
 from agents.runs import compilation_cache
 from agents.runs.stopping import Stopped, StopSignals
+from trap_tube_jax.command_line import Imports
+from trap_tube_jax.imports import import_modules
+from trap_tube_jax.registry import task_set
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
@@ -35,7 +38,11 @@ class Options:
     decided by the folder, if it exists, and else by the paper's protocol.
 
     Attributes:
-      experiment: exp1 trains on base, exp2 on {P, St, Sy}.
+      experiment: exp1 trains on base, exp2 on {P, St, Sy}, unless --train-set says otherwise.
+      train_set: the set to train on, by id or short name.
+      sets: the sets to evaluate on; the paper's eight if absent.
+      imports: modules of your own to import first, for the curiosities, encoders and sets that
+        they register.
       preset: the named settings; the paper's if absent.
       algorithms: ppo: the preset without curiosity and without imitation; ppo+icm,
         ppo+rnd and so on: with that curiosity; each followed by +imitation: with the
@@ -58,7 +65,8 @@ class Options:
       side_by_side: train all missing seeds of an algorithm at once, for a GPU.
       devices: how many devices share a run's episodes and seeds, or `all` there are; one if
         absent.
-      name: the folder within --out; <experiment>-<preset> if absent, with -quick.
+      name: the folder within --out; <experiment>-<preset> if absent, with the --train-set if
+        one is given, and with -quick.
       out: the folder of all runs.
       report_only: train nothing; draw tables and figures from what there is.
       no_optimality: do not search for shortest plans, to compare solved episodes with.
@@ -71,6 +79,9 @@ class Options:
     """
 
     experiment: Annotated[Literal["exp1", "exp2"], tyro.conf.Positional]
+    train_set: str | None = None
+    sets: tuple[str, ...] | None = None
+    imports: Imports = ()
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     algorithms: tuple[str, ...] | None = None
     seeds: int | None = None
@@ -115,8 +126,9 @@ class Options:
     @property
     def root(self) -> Path:
         """The experiment's folder."""
-        suffix = "-quick" if self.quick else ""
-        name = f"{self.experiment}-{self.preset or self.defaults.preset}{suffix}"
+        parts = [self.experiment, self.preset or self.defaults.preset]
+        parts += [] if self.train_set is None else [task_set(self.train_set).short]
+        name = "-".join([*parts, *(["quick"] if self.quick else [])])
         return self.out / (self.name or name)
 
     @property
@@ -130,10 +142,16 @@ class Options:
         """The options that were given, by their names in the protocol.
 
         Raises:
-          ValueError: a setting is not NAME=VALUE.
+          ValueError: a setting is not NAME=VALUE, or there is no such set.
         """
         names = [field.name for field in dataclasses.fields(Protocol)]
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        if not self.imports:
+            del given["imports"]
+        if self.train_set is not None:
+            given["train_set"] = task_set(self.train_set).short
+        if self.sets is not None:
+            given["sets"] = tuple(task_set(name).short for name in self.sets)
         if self.settings is not None:
             given["settings"] = dict(map(_setting, self.settings))
         return given
@@ -165,14 +183,13 @@ def run(options: Options, console: Console, stop: StopSignals) -> None:
       ValueError: an option is not allowed, or a run cannot be continued or recorded.
       Stopped: on request; everything is saved.
     """
+    import_modules(options.imports)
     root, experiment, create = options.root, options.experiment, not options.report_only
     protocol = training.open_experiment(
         root, experiment, options.defaults, options.given(), create=create
     )
     if create:
-        training.train_all(
-            root, EXPERIMENTS[experiment], protocol, options.resources, console, stop
-        )
+        training.train_all(root, protocol, options.resources, console, stop)
     record = reporting.make_record(
         root, experiment, protocol, console, optimality=not options.no_optimality
     )

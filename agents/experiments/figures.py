@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-import trap_tube_jax as tt
 from agents.experiments import tables
 from agents.experiments.records import Record, rows_of
 from agents.runs.metrics import Row
 from agents.runs.tracking import OVERALL, PREFIX
+from trap_tube_jax.scoring.tasks import label
 
 Curves = Mapping[str, Sequence[Row]]  # by algorithm, the rows of all its seeds
 
@@ -68,10 +68,9 @@ def save_rewards(
 
 def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:
     """Experiment 2: mean ± sd and maximum over seeds, of training and of every set."""
-    known = {PREFIX + entry.short: entry.label for entry in tt.PAPER_TASK_SETS}
-    columns = {name for rows in curves.values() for row in rows for name in row}
-    panels = {"training": "success"}
-    panels |= {label: name for name, label in known.items() if name in columns}
+    columns = dict.fromkeys(name for rows in curves.values() for row in rows for name in row)
+    sets = [name for name in columns if name.startswith(PREFIX) and name != OVERALL]
+    panels = {"training": "success", **{label(name.removeprefix(PREFIX)): name for name in sets}}
     if OVERALL in columns:
         panels["overall"] = OVERALL
     title = f"{title}: mean, ± sd, maximum (dotted)"

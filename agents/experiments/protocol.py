@@ -6,11 +6,13 @@ Source: paper section "Results"; its Tables 1 and 2.
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-from agents.acting.evaluation import ALL_SETS, Purpose
 from agents.config import Config
 from agents.registry import curiosities
+from trap_tube_jax.imports import import_modules
+from trap_tube_jax.registry import task_set
+from trap_tube_jax.scoring.tasks import ALL_SETS, Purpose
 
 PROGRAM = "python -m agents.experiments"
 PRESET = "preset"
@@ -26,34 +28,12 @@ def algorithms() -> dict[str, dict[str, Any]]:
     the preset's weights. `preset` is the preset as it is.
     """
     named: dict[str, dict[str, Any]] = {"ppo": WITHOUT_CURIOSITY}
-    named |= {f"ppo+{name}": {"curiosity": name} for name in curiosities() if name != "none"}
+    named |= {f"ppo+{name}": {"curiosity": name} for name in curiosities.names() if name != "none"}
     pure = {name: {**changes, **WITHOUT_IMITATION} for name, changes in named.items()}
     imitating = {name + IMITATION: changes for name, changes in named.items()}
     return {**pure, **imitating, PRESET: {}}
 
 
-class Experiment(NamedTuple):
-    """What an experiment trains on and by what it ranks evaluations.
-
-    Attributes:
-      title: what to call it.
-      env_id: the task set to train on.
-      ranked: the sets whose mean decides which evaluation is the best overall.
-    """
-
-    title: str
-    env_id: str
-    ranked: tuple[str, ...]
-
-
-EXPERIMENTS = {
-    "exp1": Experiment("Experiment 1: train on base", "TrapTube-v0", ALL_SETS),
-    "exp2": Experiment(
-        "Experiment 2: train on {P, St, Sy}",
-        "PerceptualStructuralSymbolicTrapTube-v0",
-        ALL_SETS[1:],
-    ),
-}
 SELECTIONS = ("validation", "paper")
 
 
@@ -62,6 +42,9 @@ class Protocol:
     """How an experiment is run.
 
     Attributes:
+      train_set: the set to train on, by its short name.
+      sets: the sets to evaluate on, by their short names.
+      imports: modules of your own, imported first, for the names that they register.
       preset: the named settings.
       algorithms: which of `algorithms()`.
       seeds: how many, from `seed` on.
@@ -76,6 +59,9 @@ class Protocol:
       seed: the first seed.
     """
 
+    train_set: str = "base"
+    sets: tuple[str, ...] = ALL_SETS
+    imports: tuple[str, ...] = ()
     preset: str = "paper"
     algorithms: tuple[str, ...] = ("ppo", "ppo+icm")
     seeds: int = 5
@@ -94,6 +80,11 @@ class Protocol:
         Raises:
           ValueError: naming the value and what is allowed.
         """
+        import_modules(self.imports)
+        for name in (self.train_set, *self.sets):
+            task_set(name)
+        if not self.sets:
+            raise ValueError(f"name at least one task set; allowed: {', '.join(ALL_SETS)}, ...")
         allowed = ", ".join(algorithms())
         for name in self.algorithms:
             if name not in algorithms():
@@ -122,7 +113,19 @@ class Protocol:
         missing = [name for name in known if name not in values]
         if missing:
             raise ValueError(f"a protocol lacks {', '.join(missing)}")
-        return cls(**{**values, "algorithms": tuple(values["algorithms"])})
+        read: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
+        }
+        return cls(**read)
+
+    @property
+    def ranked(self) -> tuple[str, ...]:
+        """The sets whose mean decides which evaluation is the best.
+
+        All, but base, which is a single task, only where it is what is trained on.
+        """
+        many = tuple(name for name in self.sets if name != "base" or self.train_set == "base")
+        return many or self.sets
 
     @property
     def selects_on(self) -> Purpose:
@@ -134,7 +137,7 @@ class Protocol:
         """Tasks per set that the tables report."""
         return self.reported if self.selection == "validation" else self.tasks
 
-    def config(self, experiment: Experiment, algorithm: str) -> Config:
+    def config(self, algorithm: str) -> Config:
         """The settings of an algorithm's runs.
 
         Raises:
@@ -142,7 +145,8 @@ class Protocol:
             preset has no imitation where the algorithm's name says so.
         """
         fixed = {
-            "env_id": experiment.env_id,
+            "imports": self.imports,
+            "env_id": task_set(self.train_set).id,
             "iterations": self.iterations,
             "eval_episodes": self.tasks,
             "stop_when_solved": self.stop_when_solved,
@@ -158,11 +162,18 @@ class Protocol:
 
     def command(self, experiment: str, algorithms: Sequence[str]) -> str:
         """What to type for the same runs in a new folder."""
-        parts = [PROGRAM, experiment, "--preset", self.preset, "--algorithms", *algorithms]
+        usual = PROTOCOLS[experiment]
+        parts = [PROGRAM, experiment]
+        parts += [part for name in self.imports for part in ("--import", name)]
+        if self.train_set != usual.train_set:
+            parts += ["--train-set", self.train_set]
+        if self.sets != usual.sets:
+            parts += ["--sets", *self.sets]
+        parts += ["--preset", self.preset, "--algorithms", *algorithms]
         names = ("seeds", "iterations", "tasks", "reported", "selection", "evaluate_every")
         for name in (*names, "stop_when_solved", "seed"):
             value = getattr(self, name)
-            if value != getattr(PROTOCOLS[experiment], name):
+            if value != getattr(usual, name):
                 parts += [f"--{name.replace('_', '-')}", str(value)]
         if self.settings:
             pairs = [f"{name}={json.dumps(value)}" for name, value in self.settings.items()]
@@ -171,11 +182,16 @@ class Protocol:
 
 
 # Nothing of these may differ between the runs of one folder.
-FIXED = ("preset", "tasks", "selection", "evaluate_every", "stop_when_solved", "settings")
+FIXED = (
+    *("train_set", "sets", "imports", "preset", "tasks", "selection", "evaluate_every"),
+    *("stop_when_solved", "settings"),
+)
+# What the folder of an earlier version does not say: it holds one of the paper's experiments.
+LATER = ("train_set", "sets", "imports")
 
 PROTOCOLS = {
     "exp1": Protocol(iterations=250),
-    "exp2": Protocol(iterations=500),
+    "exp2": Protocol(train_set="pstsy", iterations=500),
 }
 # Some minutes on two cores: too short for the paper's numbers, long enough to see that the
 # `fast` preset's curiosity and imitation find the food where PPO alone does not.
@@ -191,6 +207,7 @@ QUICK = {
         stop_when_solved=1.0,
     ),
     "exp2": Protocol(
+        train_set="pstsy",
         preset="fast",
         algorithms=("ppo", PRESET),
         seeds=1,

@@ -10,9 +10,10 @@ policy took in each reported task. Tables and figures are functions of a record 
     protocol    the settings of the experiment
     ranked      the sets whose mean chose the best evaluation
     machines    hardware, versions and commit of every process that trained
-    sets        by set: `equal_to_base`, percent of the reported tasks that equal the base
-                task; `layout`, the layout of each task, where the set has few; `shortest`,
-                the lengths of the first tasks' shortest plans, -1 where unsolvable
+    sets        by set: `max_steps`, its step limit; `equal_to_base`, percent of the reported
+                tasks that equal the base task; `layout`, the layout of each task, where the
+                set has few; `shortest`, the lengths of the first tasks' shortest plans, -1
+                where unsolvable
     algorithms  by algorithm: its name, its settings, and its runs, one per seed
 """
 

@@ -13,15 +13,16 @@ from rich.progress import Progress as Bar
 
 import trap_tube_jax as tt
 from agents import pretrained
-from agents.acting.evaluation import Evaluator, layout_numbers, shortest_lengths
+from agents.acting.evaluation import Evaluator
 from agents.experiments import figures, records, tables
-from agents.experiments.protocol import EXPERIMENTS, Protocol, algorithms
+from agents.experiments.protocol import Protocol, algorithms
 from agents.experiments.records import Record, Steps
 from agents.experiments.training import AlgorithmRun, draw_tasks, find_runs
 from agents.networks.agent import Params
 from agents.runs.folder import read_json, write_json
 from agents.runs.metrics import read_metrics
 from agents.runs.tracking import outcome, steps_taken
+from trap_tube_jax.scoring.tasks import layout_numbers, shortest_lengths
 from trap_tube_jax.state import State
 
 SHORTEST_FILE = "shortest.json"
@@ -38,7 +39,7 @@ def make_record(
 
     Args:
       root: the folder.
-      experiment: which of `EXPERIMENTS`.
+      experiment: which of `PROTOCOLS`.
       protocol: how it is run.
       console: where to show what is being done.
       optimality: search for shortest plans, to compare solved episodes with.
@@ -49,7 +50,7 @@ def make_record(
     runs = [entry for entry in find_runs(root) if entry.rows]
     if not runs:
         raise ValueError(f"{root} holds no run with a first iteration yet")
-    tasks = draw_tasks(runs[0].run.config, protocol.num_reported, "test")
+    tasks = draw_tasks(runs[0].run.config, protocol.sets, protocol.num_reported, "test")
     shortest = find_shortest(root / SHORTEST_FILE, tasks, console) if optimality else {}
     names = [name for name in algorithms() if any(entry.algorithm == name for entry in runs)]
     machines: list[Any] = []
@@ -64,9 +65,15 @@ def make_record(
         "experiment": experiment,
         "command": whole.command(experiment, names),
         "protocol": dataclasses.asdict(whole),
-        "ranked": list(EXPERIMENTS[experiment].ranked),
+        "ranked": list(protocol.ranked),
         "machines": machines,
-        "sets": {name: _about(name, states, shortest) for name, states in tasks.items()},
+        "sets": {
+            name: {
+                "max_steps": runs[0].run.config.step_limit(name),
+                **_about(name, states, shortest),
+            }
+            for name, states in tasks.items()
+        },
         "algorithms": reached,
     }
 

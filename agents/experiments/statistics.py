@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.acting.evaluation import label
-from agents.acting.scores import Layouts, Optimality, Score
 from agents.experiments.records import Record
+from trap_tube_jax.scoring.scores import Layouts, Optimality, Score
+from trap_tube_jax.scoring.tasks import label
 
 # Quantiles at 0.975 of Student's t with 1, 2, ... degrees of freedom.
 STUDENT_T = (
@@ -120,9 +120,14 @@ def tested(entry: Record) -> list[Record]:
 
 def seed_scores(record: Record, entry: Record, run: Record) -> dict[str, Score]:
     """The scores of a seed's best policy, by set in the record's order."""
-    max_steps, steps = entry["config"]["max_steps"], run["best"]["steps"]
+    steps = run["best"]["steps"]
+    # Earlier records have one limit for all sets, among the settings.
+    limits = {
+        name: about.get("max_steps", entry["config"]["max_steps"])
+        for name, about in record["sets"].items()
+    }
     return {
-        name: _score(name, np.array(steps[name]), about, max_steps)
+        name: _score(name, np.array(steps[name]), about, limits[name])
         for name, about in record["sets"].items()
         if name in steps
     }

@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 from rich.table import Table as RichTable
 
-from agents.acting.scores import Layouts
 from agents.experiments import statistics
-from agents.experiments.protocol import EXPERIMENTS, PRESET
+from agents.experiments.protocol import PRESET, PROTOCOLS
 from agents.experiments.records import Record
 from agents.experiments.statistics import Spread
 from agents.runs.report import FEW_LAYOUTS, NOTHING, TABLE_STYLE, duration
+from trap_tube_jax.scoring.scores import Layouts
+from trap_tube_jax.scoring.tasks import label
 
 
 class PaperSolved(NamedTuple):
@@ -51,6 +52,10 @@ PAPER_PERCENT: dict[str, dict[str, Spread]] = {
     },
 }
 
+TITLES = {
+    "exp1": "Experiment 1: train on base",
+    "exp2": "Experiment 2: train on {P, St, Sy}",
+}
 LABELS = {"ppo": "PPO", "ppo+icm": "PPO + ICM"}
 SPREAD = "mean ± sd [95 % confidence interval of the mean, Student t over seeds]"
 MEAN_OF_SETS = "mean of the sets apart from base"
@@ -100,7 +105,20 @@ def tables(record: Record) -> list[Table]:
 
 def title(record: Record) -> str:
     """What a record is of, for the head of a page or figure."""
-    return f"{EXPERIMENTS[record['experiment']].title}, preset {record['protocol']['preset']}"
+    what = f"Train on {label(train_set(record))}"
+    if is_of_paper(record):
+        what = TITLES[record["experiment"]]
+    return f"{what}, preset {record['protocol']['preset']}"
+
+
+def train_set(record: Record) -> str:
+    """The short name of the set that was trained on; records of earlier versions do not say."""
+    return record["protocol"].get("train_set", PROTOCOLS[record["experiment"]].train_set)
+
+
+def is_of_paper(record: Record) -> bool:
+    """Whether a record is of what the paper trained on, so that its numbers stand beside it."""
+    return train_set(record) == PROTOCOLS[record["experiment"]].train_set
 
 
 def solved_table(record: Record) -> Table:
@@ -110,11 +128,12 @@ def solved_table(record: Record) -> Table:
         episodes = statistics.episodes_to_solve(entry)
         trials = f"{len(episodes)} / {len(entry['runs'])}"
         rows.append((_label(record, entry), trials, _spread(Spread.of(episodes), ",.0f")))
-    for name, paper in PAPER_SOLVED.items():
+    for name, paper in PAPER_SOLVED.items() if is_of_paper(record) else ():
         trials = f"{paper.solved} / {paper.trials}"
         rows.append((f"{LABELS[name]}, paper", trials, _spread(paper.episodes, ",.0f")))
     heads = ("algorithm", "trials solved", "episodes to solve")
-    return Table(f"Base task solved; episodes to solve it, {SPREAD}", heads, tuple(rows))
+    what = "Base task" if is_of_paper(record) else label(train_set(record))
+    return Table(f"{what} solved; episodes to solve it, {SPREAD}", heads, tuple(rows))
 
 
 def percent_table(record: Record) -> Table:
@@ -131,7 +150,8 @@ def percent_table(record: Record) -> Table:
         cells = {name: _percent(summary.percent) for name, summary in summaries.items()}
         mean = _percent(statistics.mean_of_sets(record, entry))
         columns[_label(record, entry)] = {**cells, MEAN_OF_SETS: mean}
-    for name, paper in PAPER_PERCENT.items() if record["experiment"] == "exp2" else ():
+    with_paper = record["experiment"] == "exp2" and is_of_paper(record)
+    for name, paper in PAPER_PERCENT.items() if with_paper else ():
         columns[f"{LABELS[name]}, paper"] = {
             name: _percent(spread) for name, spread in paper.items()
         }

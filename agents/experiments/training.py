@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from agents.acting.evaluation import ALL_SETS, Purpose, evaluation_tasks
 from agents.config import Config
-from agents.experiments.protocol import EXPERIMENTS, FIXED, Experiment, Protocol
+from agents.experiments.protocol import FIXED, LATER, Protocol
 from agents.parallel.sharding import Placement
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, is_done, read_json, write_json
 from agents.runs.machine import machine
@@ -18,6 +17,7 @@ from agents.runs.metrics import Row, read_metrics
 from agents.runs.session import Session
 from agents.runs.stopping import StopSignals
 from agents.runs.tracking import Tracker
+from trap_tube_jax.scoring.tasks import Purpose, evaluation_tasks
 from trap_tube_jax.state import State
 
 PROTOCOL_FILE = "experiment.json"
@@ -63,7 +63,7 @@ def open_experiment(
 
     Args:
       root: the folder.
-      experiment: which of `EXPERIMENTS`.
+      experiment: which of `PROTOCOLS`.
       defaults: what holds where the folder holds no experiment yet.
       given: values that go before the defaults and before what the folder says.
       create: make or update the folder; otherwise it must hold an experiment.
@@ -77,14 +77,15 @@ def open_experiment(
     if stored is not None:
         if stored.pop("experiment", None) != experiment:
             raise ValueError(f"{root} holds another experiment than {experiment}")
-        defaults = Protocol.from_dict({**stored, "seed": defaults.seed})
+        earlier = {name: getattr(defaults, name) for name in LATER}
+        defaults = Protocol.from_dict({**earlier, **stored, "seed": defaults.seed})
     protocol = dataclasses.replace(defaults, **given)
     for field in FIXED if stored is not None else ():
         before, now = getattr(defaults, field), getattr(protocol, field)
         if before != now:
             raise ValueError(f"{root} has {field}={before}, not {now}; use another --name")
     for algorithm in protocol.algorithms:
-        Run(protocol.config(EXPERIMENTS[experiment], algorithm), protocol.preset)
+        Run(protocol.config(algorithm), protocol.preset)
     if create:
         root.mkdir(parents=True, exist_ok=True)
         values = {"experiment": experiment, **dataclasses.asdict(protocol)}
@@ -94,7 +95,6 @@ def open_experiment(
 
 def train_all(
     root: Path,
-    experiment: Experiment,
     protocol: Protocol,
     resources: Resources,
     console: Console,
@@ -106,17 +106,15 @@ def train_all(
       ValueError: a run in the folder has other settings.
       Stopped: on request; everything is saved.
     """
-    planned = plan(root, protocol, experiment, resources.side_by_side)
+    planned = plan(root, protocol, resources.side_by_side)
     todo = [(folder, run) for folder, run in planned if not is_done(folder, run)]
     if not todo:
         return
-    tasks = draw_tasks(todo[0][1].config, protocol.tasks, protocol.selects_on)
+    tasks = draw_tasks(todo[0][1].config, protocol.sets, protocol.tasks, protocol.selects_on)
     for number, (folder, run) in enumerate(todo, 1):
         console.rule(f"run {number} of {len(todo)}: {folder.path.name}")
         note_machine(folder, resources.commit)
-        tracker = Tracker(
-            folder, run, tasks, ranked=experiment.ranked, every=protocol.evaluate_every
-        )
+        tracker = Tracker(folder, run, tasks, ranked=protocol.ranked, every=protocol.evaluate_every)
         session = Session(
             folder,
             run,
@@ -134,15 +132,13 @@ def train_all(
             session.close()
 
 
-def plan(
-    root: Path, protocol: Protocol, experiment: Experiment, side_by_side: bool
-) -> list[tuple[RunFolder, Run]]:
+def plan(root: Path, protocol: Protocol, side_by_side: bool) -> list[tuple[RunFolder, Run]]:
     """The runs that hold the protocol's seeds; see `plan_runs`.
 
     Raises:
       ValueError: a run has other settings than the protocol.
     """
-    configs = {name: protocol.config(experiment, name) for name in protocol.algorithms}
+    configs = {name: protocol.config(name) for name in protocol.algorithms}
     seeds = range(protocol.seed, protocol.seed + protocol.seeds)
     return plan_runs(root, configs, protocol.preset, seeds, side_by_side=side_by_side)
 
@@ -186,12 +182,11 @@ def plan_runs(
     return planned
 
 
-def draw_tasks(config: Config, num_tasks: int, purpose: Purpose) -> dict[str, State]:
-    """The fixed evaluation tasks of all sets."""
-    return {
-        name: evaluation_tasks(name, num_tasks, config.num_features, config.max_steps, purpose)
-        for name in ALL_SETS
-    }
+def draw_tasks(
+    config: Config, sets: Sequence[str], num_tasks: int, purpose: Purpose
+) -> dict[str, State]:
+    """The fixed evaluation tasks of the sets."""
+    return {name: evaluation_tasks(name, num_tasks, config.num_features, purpose) for name in sets}
 
 
 def note_machine(folder: RunFolder, commit: str | None) -> None:

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.networks.core import Core, Heads, Outputs
-from agents.networks.encoder import Encoder
 from agents.networks.layers import draw
-from agents.networks.object_encoder import ObjectEncoder
+from agents.registry import encoders
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
-ENCODERS = {"paper": Encoder, "objects": ObjectEncoder}
 
 
 class Agent:
@@ -27,7 +25,7 @@ class Agent:
     """
 
     def __init__(self, config: Config):
-        self.encoder = ENCODERS[config.encoder](config.filters)
+        self.encoder = encoders.factory(config.encoder)(config)
         self.core = Core(config.hidden, config.embedding)
         self.heads = Heads(config.streams)
         self.facing = config.facing

@@ -45,7 +45,7 @@ def encode_rows(
 
     A row function of `chunks.map_rows`, which explains the rest.
     """
-    if isinstance(encoder, Encoder):
+    if type(encoder) is Encoder:  # one that is derived from it may compute something else
         return encode_by_windows(params, observation, remembered)
     return encoder.apply(params, observation), None
 

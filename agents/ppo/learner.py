@@ -117,9 +117,7 @@ class Learner:
             extrinsic=returns.Moments.zero(),
             intrinsic=returns.Moments.zero(),
             memory=self.curiosity.memory(),
-            replay=replay.empty(
-                self.env.base, self.config.imitation_episodes, self.config.max_steps
-            ),
+            replay=replay.empty(self.env.base, self.config.imitation_episodes, self.env.max_steps),
             failures=Failures.untried(
                 failures_key, len(self.config.replayed), self.config.failures
             ),
@@ -437,7 +435,7 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
     if env is None:
         env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
     for name in ("num_features", "max_steps"):
-        if getattr(env, name) != getattr(config, name):
+        if getattr(config, name) not in (None, getattr(env, name)):
             raise ValueError(
                 f"the environment's {name} is {getattr(env, name)}, the config's "
                 f"{getattr(config, name)}; they must agree"

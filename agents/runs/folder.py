@@ -70,7 +70,7 @@ class Run:
         Raises:
           ValueError: a setting differs that shapes what has been trained so far.
         """
-        old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
+        old, new = (run._shaping() for run in (before, self))
         for name, value in old.items():
             if name not in (*EXTENDABLE, "config") and new[name] != value:
                 raise ValueError(
@@ -84,6 +84,12 @@ class Run:
                     f"{new['iterations']}: its schedule depends on their number, so another "
                     "number of them is another run; begin a new one"
                 )
+
+    def _shaping(self) -> dict[str, Any]:
+        """All values, the step limit as it is for what is trained on."""
+        config = self.config
+        limit = config.step_limit(config.env_id)
+        return {**self.to_dict(), **config.to_dict(), "max_steps": limit}
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:

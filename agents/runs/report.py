@@ -17,10 +17,10 @@ from rich.text import Text
 
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.acting.policy import Policy
-from agents.acting.scores import Score
 from agents.runs.metrics import FirstSolved, Row, column
 from trap_tube_jax.gallery import episode_frames
 from trap_tube_jax.rendering import save_gif
+from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.state import State
 
 TABLE_STYLE: dict[str, Any] = {"box": SIMPLE_HEAD, "padding": (0, 0, 0, 1), "pad_edge": False}

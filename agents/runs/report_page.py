@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from agents.acting.evaluation import Evaluation, Evaluator, label
-from agents.acting.scores import Score
+from agents.acting.evaluation import Evaluation, Evaluator
 from agents.runs.report import FEW_LAYOUTS, NOTHING
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
 from trap_tube_jax.rendering import episode_frames
+from trap_tube_jax.scoring.scores import Score
+from trap_tube_jax.scoring.tasks import label
 
 CELL_SIZE = 16  # pixels
 MAX_PICTURES = 600  # of all episodes, of at most two kilobytes each

@@ -13,16 +13,8 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import (
-    ALL_SETS,
-    Evaluation,
-    Evaluator,
-    evaluate,
-    evaluation_tasks,
-    scores,
-)
+from agents.acting.evaluation import Evaluation, Evaluator, evaluate, own_and_paper_sets, scores
 from agents.acting.policy import Policy
-from agents.acting.scores import Score
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import DEFAULT_DEVICE, Placement
@@ -35,6 +27,8 @@ from agents.runs.progress import Progress, first_solved
 from agents.runs.stopping import Stopped, StopSignals
 from agents.runs.story import Story
 from agents.runs.tracking import Tracker
+from trap_tube_jax.scoring.scores import Score
+from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 POLL_SECONDS = 0.005
 
@@ -135,7 +129,7 @@ class Session:
         if self._log is None:
             return
         results = {
-            name: scores(outcome, evaluator.tasks, run.config.max_steps)
+            name: scores(outcome, evaluator.tasks, evaluator.limits)
             for name, outcome in played.items()
         }
         write_json(folder.evaluation, report.results_json(policies, results))
@@ -237,7 +231,8 @@ class Session:
 
     def _make_evaluator(self) -> Evaluator:
         config = self.run.config
-        return Evaluator.of_sets(config, ALL_SETS, config.eval_episodes, self._placement)
+        sets = own_and_paper_sets(config)
+        return Evaluator.of_sets(config, sets, config.eval_episodes, self._placement)
 
     def _iterate(self, advance: Advance) -> list[Row]:
         config, progress = self.run.config, self._progress
@@ -352,9 +347,7 @@ def make_advance(train: Train, num_seeds: int) -> Advance:
     as they are. It returns the states and metrics [S].
     """
     config = train.config
-    tasks = evaluation_tasks(
-        config.env_id, config.eval_episodes, config.num_features, config.max_steps, "validation"
-    )
+    tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")
 
     def advance(state: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
         after, metrics = train.iterate(state)

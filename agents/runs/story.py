@@ -5,9 +5,9 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import trap_tube_jax as tt
-from agents.acting.scores import Score
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved
+from trap_tube_jax.scoring.scores import Score
 
 LITTLE, MUCH = 20.0, 80.0  # percent solved, below and above which transfer is named no and yes
 

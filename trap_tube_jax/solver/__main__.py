@@ -15,6 +15,8 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
+from trap_tube_jax.command_line import Imports
+from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
@@ -43,6 +45,7 @@ class Options:
         PNG instead.
       output: the file to write; shortest_plans.png, plan.gif or distances.png if absent.
       json: whether to print JSON in place of a table or text.
+      imports: modules of your own to import first, for the sets that they register.
     """
 
     sets: tuple[str, ...] = ("base", "sy", "p", "psy")
@@ -53,12 +56,14 @@ class Options:
     distances: str | None = None
     output: Path | None = None
     json: Flag = False
+    imports: Imports = ()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m trap_tube_jax.solver")
     try:
+        import_modules(options.imports)
         if options.show is not None and options.distances is not None:
             raise ValueError("--show and --distances exclude each other; allowed: one of them")
         if options.show is not None:

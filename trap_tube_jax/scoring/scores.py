@@ -1,7 +1,11 @@
-"""Scores of greedy play on one task set: the share solved, its interval, and optimality."""
+"""Scores of play on fixed tasks: the share solved, its interval, and optimality.
+
+Source: protocol.md, "What is reported".
+"""
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
@@ -63,7 +67,7 @@ class Layouts:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Greedy play on the fixed tasks of one set.
+    """Play on the fixed tasks of one set.
 
     Attributes:
       set: the set's short name.
@@ -122,6 +126,71 @@ class Score:
             layouts=None if layout is None else Layouts.of(solved, layout),
             optimality=optimality,
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class Scores:
+    """What an agent reaches under the benchmark's protocol. Print it for a table in Markdown.
+
+    Attributes:
+      protocol: the version of the fixed tasks.
+      version: that of this package.
+      seed: of the draws of the agent's actions; None where it made its own.
+      sets: the score of every set.
+    """
+
+    protocol: int
+    version: str
+    seed: int | None
+    sets: tuple[Score, ...]
+
+    def __getitem__(self, name: str) -> Score:
+        """The score of the set with this short name.
+
+        Raises:
+          ValueError: the set was not scored.
+        """
+        by_name = {score.set: score for score in self.sets}
+        if name not in by_name:
+            raise ValueError(f"no score of {name!r}; allowed: {', '.join(by_name)}")
+        return by_name[name]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it as plain values, for JSON; `sets` is a list of records."""
+        return {**dataclasses.asdict(self), "sets": list(map(dataclasses.asdict, self.sets))}
+
+    def __str__(self) -> str:
+        heads = ["set", "tasks", "solved", "%", "95 % interval", "layouts", "steps"]
+        if any(score.optimality for score in self.sets):
+            heads += ["of solvable %", "optimality"]
+        rows = [heads, *(_cells(score)[: len(heads)] for score in self.sets)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        rows.insert(1, ["-" * widths[0], *["-" * (width - 1) + ":" for width in widths[1:]]])
+        lines = [
+            " | ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
+            for row in rows
+        ]
+        end = f"Protocol {self.protocol}, trap-tube-jax {self.version}."
+        return "\n".join([*(f"| {line} |" for line in lines), "", end])
+
+
+def _cells(score: Score) -> list[str]:
+    interval, found = score.interval, score.optimality
+    return [
+        score.label,
+        str(score.tasks),
+        str(score.solved),
+        f"{score.percent:.1f}",
+        "–" if interval is None else f"{interval[0]:.1f}–{interval[1]:.1f}",
+        "–" if score.layouts is None else str(score.layouts),
+        _number(score.mean_steps, ".1f"),
+        _number(found and found.percent_of_solvable, ".1f"),
+        _number(found and found.mean, ".3f"),
+    ]
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

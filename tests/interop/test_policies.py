@@ -1,0 +1,105 @@
+"""A trained policy drives other libraries' interfaces as it drives the environment."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_policy import CONFIG, FOOD_BESIDE, SEEDS, random_params
+
+import trap_tube_jax as tt
+from agents import Policy, evaluate, pretrained
+from trap_tube_jax import registry
+
+pytest.importorskip("gymnasium")
+pytest.importorskip("gymnax")
+
+from trap_tube_jax.adapters import to_gymnax
+from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv, TrapTubeVectorEnv
+
+pytestmark = pytest.mark.interop
+NAMES = [f"Beside{index}-v0" for index in range(len(FOOD_BESIDE))]
+POLICY = Policy("mine", CONFIG, random_params(SEEDS[0]), 1)
+ACT = jax.jit(POLICY.act)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def expected(tmp_path_factory):
+    """The percentages that `agents.evaluate` finds on four sets of one task each."""
+    folder = tmp_path_factory.mktemp("policy")
+    pretrained.save(folder / "mine.npz", POLICY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "_task_sets", dict(registry._task_sets))
+        for name, cell in zip(NAMES, FOOD_BESIDE, strict=True):
+            base = tt.base_state(1).replace(food=jnp.array(cell, jnp.int32))
+            tt.register(name, (), base=base, max_steps=CONFIG.max_steps)
+        arguments = [str(folder / "mine.npz"), "--sets", *NAMES, "--no-cache"]
+        evaluate.main([*arguments, "--json", str(folder / "table.json")])
+        (table,) = json.loads((folder / "table.json").read_text())
+        found = [score["percent"] for score in table["sets"]]
+        assert 0 < np.mean(found) < 100
+        yield found
+
+
+def percent(returns):
+    return [100.0 * value for value in returns]
+
+
+def test_the_environment(expected):
+    def reward(name):
+        env, carry = tt.make(name), POLICY.initial(1)
+        state, timestep = env.reset(jax.random.key(0))
+        total, step = 0.0, jax.jit(env.step)
+        while not timestep.done:
+            action, carry = ACT(timestep.observation[None], carry)
+            state, timestep = step(state, action[0])
+            total += float(timestep.reward)
+        return total
+
+    assert percent(map(reward, NAMES)) == expected
+
+
+def test_gymnasiums_single_environment(expected):
+    def reward(name):
+        env, carry, over, total = TrapTubeEnv(name), POLICY.initial(1), False, 0.0
+        observation, _ = env.reset(seed=0)
+        while not over:
+            action, carry = ACT(observation[None], carry)
+            observation, gained, terminated, truncated, _ = env.step(np.asarray(action[0]))
+            over, total = terminated or truncated, total + gained
+        return total
+
+    assert percent(map(reward, NAMES)) == expected
+
+
+def test_gymnasiums_vector_environment(expected):
+    def reward(name):
+        envs, carry = TrapTubeVectorEnv(name, 2), POLICY.initial(2)
+        over, total = np.zeros(2, bool), np.zeros(2)
+        observation, _ = envs.reset(seed=0)
+        while not over.all():
+            action, carry = ACT(observation, carry)
+            observation, gained, terminated, truncated, _ = envs.step(np.asarray(action))
+            total += gained * ~over
+            over |= terminated | truncated
+        assert total[0] == total[1]
+        return total[0]
+
+    assert percent(map(reward, NAMES)) == expected
+
+
+def test_gymnaxs_step(expected):
+    def reward(name):
+        (env, params), carry = to_gymnax.make(name, flat_actions=False), POLICY.initial(1)
+        observation, state = env.reset(jax.random.key(0), params)
+        done, total = False, 0.0
+        while not done:
+            action, carry = ACT(observation[None], carry)
+            observation, state, gained, done, _ = env.step(
+                jax.random.key(1), state, action[0], params
+            )
+            total += float(gained)
+        return total
+
+    assert percent(map(reward, NAMES)) == expected

@@ -1,0 +1,116 @@
+"""The fixed tasks on which policies are compared, drawn with keys that training never draws.
+
+A key that training never draws may still give a task that it has seen: base is one task, {Sy}
+five, {St} and {St, Sy} one and five layouts in any colours.
+
+Source: protocol.md, "Tasks".
+"""
+
+import functools
+import zlib
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from trap_tube_jax.environment import Environment
+from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
+from trap_tube_jax.solver import solve_batch
+from trap_tube_jax.state import State
+from trap_tube_jax.transfers import Transfer, compose
+
+Purpose = Literal["test", "validation"]
+
+# The version of the fixed tasks: what is scored under different ones does not compare.
+PROTOCOL = 1
+ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
+# How many layouts a set has, whatever their colours, where these are few.
+NUM_LAYOUTS = {"base": 1, "st": 1, "sy": 5, "stsy": 5}
+
+# "trap" and "tube", or "trap" and "vali". The first word of every `jax.random.key(seed)` is
+# 0, so no seed of training leads here.
+_ROOTS: dict[Purpose, np.ndarray] = {
+    "test": np.array([0x74726170, 0x74756265], np.uint32),
+    "validation": np.array([0x74726170, 0x76616C69], np.uint32),
+}
+
+
+def evaluation_tasks(
+    name: str, num_tasks: int, num_features: int | None = None, purpose: Purpose = "test"
+) -> State:
+    """The fixed evaluation tasks of a registered set: B states, the same at every call.
+
+    B is `num_tasks`, or 1 for a set without transfers, whose tasks are all the same.
+
+    Args:
+      name: the set's id or short name.
+      num_tasks: at least 1.
+      num_features: N, feature channels; see `make`.
+      purpose: `test` tasks are reported; by `validation` tasks training is stopped, and its
+        best parameters are chosen.
+
+    Raises:
+      ValueError: naming the value and what is allowed.
+    """
+    return fixed_tasks(make(name, num_features=num_features), task_set(name).id, num_tasks, purpose)
+
+
+def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = "test") -> State:
+    """As `evaluation_tasks`, for any environment; `name` sets its tasks apart from others'.
+
+    They are the tasks that `env.reset` draws from `evaluation_keys(name, B, purpose)`.
+
+    Raises:
+      ValueError: `num_tasks` is below 1.
+    """
+    if num_tasks < 1:
+        raise ValueError(f"the number of evaluation tasks must be >= 1, got {num_tasks}")
+    count = num_tasks if env.transfers else 1
+    # Transfers are compiled one by one: the sets share them, so eight sets take three
+    # compilations, and a transfer has the same bits in each.
+    draw = compose(*map(_compiled, env.transfers))
+    base = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), env.base)
+    return jax.vmap(draw)(evaluation_keys(name, count, purpose), base)
+
+
+def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax.Array:
+    """The PRNG keys [B] of the evaluation tasks of the set with this id.
+
+    More tasks begin with the same ones. No key serves two purposes or sets.
+    """
+    root = jax.random.wrap_key_data(jnp.asarray(_ROOTS[purpose]), impl="threefry2x32")
+    set_key = jax.random.fold_in(root, zlib.crc32(name.encode()))
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(set_key, jnp.arange(num_tasks))
+
+
+def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
+    """The layout i32[B] of each task, counted from 0; None unless the set has few.
+
+    A layout is a state without its colours.
+
+    Args:
+      name: the set's short name.
+      tasks: B states at time 0.
+    """
+    if name not in NUM_LAYOUTS:
+        return None
+    parts = (tasks.board, tasks.agent, tasks.tool, tasks.tool_extent, tasks.food)
+    rows = np.concatenate([np.asarray(part).reshape(len(part), -1) for part in parts], axis=1)
+    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
+
+
+def shortest_lengths(tasks: State) -> np.ndarray:
+    """i32[B]: the lengths of the shortest plans, -1 where unsolvable."""
+    return np.asarray(solve_batch(tasks).length)
+
+
+def label(name: str) -> str:
+    """A registered set's name in the paper's notation; any other name as it is."""
+    known = {task_set(id).short: task_set(id).label for id in registered_ids()}
+    return known.get(name, name)
+
+
+@functools.cache
+def _compiled(transfer: Transfer) -> Transfer:
+    return jax.jit(transfer)
