@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -248,4 +247,3 @@ def test_killed_sweeps_continue_to_the_same_result(tmp_path):
         assert untimed[0] == untimed[1]
         assert len(whole) == 40
     assert (root / "table.md").is_file()
-    shutil.rmtree(tmp_path)
