@@ -32,7 +32,7 @@ class Selection(processes.Job):
 
     Attributes:
       preset: the named settings to start from.
-      modules: modules of your own to import first, for the curiosities, encoders and task sets
+      imports: modules of your own to import first, for the curiosities, encoders and task sets
         that they register; the same as --imports.
       env: the task set to train on, by id or short name; the same as --env-id.
       seed: the first seed.
@@ -44,7 +44,7 @@ class Selection(processes.Job):
     """
 
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
-    modules: Imports = ()
+    imports: Imports = ()
     env: str | None = None
     seed: int = 0
     seeds: int = 1
@@ -194,7 +194,7 @@ def parse(selection: Selection, arguments: Sequence[str]) -> tuple[Run | None, O
       ValueError: a value is not allowed.
     """
     given: dict[str, Any] = {} if selection.env is None else {"env_id": selection.env}
-    own = {"imports": selection.modules} if selection.modules else {}
+    own = {"imports": selection.imports} if selection.imports else {}
     config = Config.preset(selection.preset, **given, **own)
     stored, defaults = None, Options(preset=selection.preset, config=config)
     path = run_path(selection, config.env_id)

@@ -180,7 +180,7 @@ def test_each_set_has_its_own_limit_where_the_settings_leave_it(grey_play, monke
     monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
     for name, limit in (("one", 1), ("six", 6)):
         tt.register(name, (), base=tt.base_state(1), max_steps=limit)
-    tasks = dict.fromkeys(("one", "six"), evaluator.tasks["mine"])
+    tasks: dict[str, tt.State] = dict.fromkeys(("one", "six"), evaluator.tasks["mine"])
     config = Config(**{**TINY, "max_steps": None}, num_features=1)
     own = Evaluator(config, tasks)
     assert own.limits == {"one": 1, "six": 6}

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_policy import CONFIG, FOOD_BESIDE, SEEDS, random_params
+from test_policy import CONFIG, FOOD_BESIDE, SEEDS, STEPS, random_params
 
 import trap_tube_jax as tt
 from agents import Policy, evaluate, pretrained
@@ -33,7 +33,7 @@ def expected(tmp_path_factory):
         patch.setattr(registry, "_task_sets", dict(registry._task_sets))
         for name, cell in zip(NAMES, FOOD_BESIDE, strict=True):
             base = tt.base_state(1).replace(food=jnp.array(cell, jnp.int32))
-            tt.register(name, (), base=base, max_steps=CONFIG.max_steps)
+            tt.register(name, (), base=base, max_steps=STEPS)
         arguments = [str(folder / "mine.npz"), "--sets", *NAMES, "--no-cache"]
         evaluate.main([*arguments, "--json", str(folder / "table.json")])
         (table,) = json.loads((folder / "table.json").read_text())
