@@ -1,11 +1,11 @@
 """Sweeps: the grid, the processes, and the table of what came of it."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -22,22 +22,21 @@ from agents.runs.stopping import Stopped, StopSignals
 ROOT = Path(__file__).parent.parent
 SMALL = ("filters=[2,2]", "hidden=4", "embedding=2", "episodes=8", "minibatch=4", "max_steps=6")
 
-# In the place of training: says in which order and on which cores; stops when asked to.
+# In the place of training: ends at once, badly if its name says so, or waits to be stopped.
 FAKE = """
-import os, pathlib, signal, sys, time
-folder, others = pathlib.Path(sys.argv[1]), int(sys.argv[2])
-stopped = []
-signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
-(folder / "cores").write_text(str(sorted(os.sched_getaffinity(0))))
-running = lambda: len(list(folder.parent.glob("*/cores")))
-while running() < others and not stopped:
-    time.sleep(0.01)
+import pathlib, signal, sys
+folder = pathlib.Path(sys.argv[1])
+def stop(*_):
+    (folder / "ended").write_text("stopped")
+    sys.exit(143)
+signal.signal(signal.SIGTERM, stop)
+(folder / "begun").touch()
+if sys.argv[2] == "wait":
+    while True:
+        signal.pause()
 if folder.name.startswith("bad"):
     sys.exit("no such luck")
-while others > 2 and not stopped:
-    time.sleep(0.01)
-(folder / "ended").write_text(str(bool(stopped)))
-sys.exit(143 if stopped else 0)
+(folder / "ended").write_text("done")
 """
 
 
@@ -100,16 +99,15 @@ def planned(root, *names, seeds=1):
     return plan_runs(root, dict.fromkeys(names, Config(iterations=3)), "paper", range(seeds))
 
 
-def fake(monkeypatch, others):
-    """Runs that wait until so many have begun; beyond two, until they are stopped."""
-    command = lambda folder, *_: [sys.executable, "-c", FAKE, str(folder.path), str(others)]  # noqa: E731
+def fake(monkeypatch, how):
+    command = lambda folder, *_: [sys.executable, "-c", FAKE, str(folder.path), how]  # noqa: E731
     monkeypatch.setattr(workers, "_command", command)
     monkeypatch.setattr(workers, "POLL_SECONDS", 0.01)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores cannot be chosen")
 def test_runs_share_the_cores_and_failures_do_not_stop_the_others(tmp_path, monkeypatch):
-    fake(monkeypatch, 2)
+    fake(monkeypatch, "end")
     monkeypatch.setattr(workers, "_cores", lambda: cores)
     given = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, own: given.append(list(own)))
@@ -128,9 +126,9 @@ def test_runs_share_the_cores_and_failures_do_not_stop_the_others(tmp_path, monk
 
 
 def test_a_request_stops_all_and_starts_no_more(tmp_path, monkeypatch):
-    fake(monkeypatch, 3)
+    fake(monkeypatch, "wait")
     stop = StopSignals(lambda: None)
-    begun = lambda: len(list(tmp_path.glob("*/cores")))  # noqa: E731
+    begun = lambda: len(list(tmp_path.glob("*/begun")))  # noqa: E731
 
     def poll(worker, bars):
         if begun() == 3:
@@ -141,7 +139,7 @@ def test_a_request_stops_all_and_starts_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "_has_ended", poll)
     with pytest.raises(Stopped):
         workers.train_runs(planned(tmp_path, "a", seeds=5), 3, Console(quiet=True), stop)
-    assert [path.read_text() for path in tmp_path.glob("*/ended")] == ["True"] * 3
+    assert [path.read_text() for path in tmp_path.glob("*/ended")] == ["stopped"] * 3
     assert begun() == 3
 
 
@@ -223,24 +221,29 @@ def start(out, cache):
     )
 
 
+def test_runs_stop_when_their_sweep_is_gone():
+    program = "from agents.experiments import workers; workers._stop_with_parent()"
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, check=False)
+    assert done.returncode == -signal.SIGTERM
+
+
 @pytest.mark.slow
-def test_killed_sweeps_continue_to_the_same_result(tmp_path):
-    """The runs of a sweep that is killed stop by themselves, and have saved."""
+def test_stopped_sweeps_continue_to_the_same_result(tmp_path):
     cache, names = tmp_path / "cache", ("curiosity=e3b-seed0", "curiosity=none-seed0")
     assert start(tmp_path / "whole", cache).wait() == 0
-    process, root = start(tmp_path / "killed", cache), tmp_path / "killed" / "x"
+    process, root = start(tmp_path / "stopped", cache), tmp_path / "stopped" / "x"
     while not all(len(read_metrics(root / name / "metrics.csv")) > 3 for name in names):
-        assert process.poll() is None
-        time.sleep(0.1)
-    process.kill()
-    process.wait()
-    while not all("Stopped" in (root / name / "log.txt").read_text() for name in names):
-        time.sleep(0.1)
-    assert start(tmp_path / "killed", cache).wait() == 0
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            pytest.fail(f"ended with {process.wait(0.1)}")
+    process.terminate()
+    assert process.wait() == 128 + signal.SIGTERM
+    assert not (root / "table.md").exists()
+    assert start(tmp_path / "stopped", cache).wait() == 0
     for name in names:
         whole, again = (
             read_metrics(tmp_path / folder / "x" / name / "metrics.csv")
-            for folder in ("whole", "killed")
+            for folder in ("whole", "stopped")
         )
         timing = ("seconds", "transitions_per_second")
         untimed = [[{k: r[k] for k in r if k not in timing} for r in x] for x in (whole, again)]
