@@ -1,12 +1,14 @@
 """Agents that learn the trap-tube task: PPO with curiosity, end-to-end jitted."""
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from agents.acting.policy import Policy
 from agents.config import Config
 from agents.ppo.learner import Train, TrainState, make_train
 
-__all__ = ["Config", "Policy", "Train", "TrainState", "load", "make_train"]
+__all__ = ["Config", "Policy", "Train", "TrainState", "load", "make_train", "results"]
 
 
 def load(
@@ -30,3 +32,17 @@ def load(
     from agents.runs import loading  # noqa: PLC0415  training needs nothing of files
 
     return loading.load(source, seed=seed, iteration=iteration, greedy=greedy)
+
+
+def results(paths: str | Path | Iterable[str | Path]) -> list[dict[str, Any]]:
+    """One plain record per seed of all runs in folders; see `agents.runs.results.results`.
+
+    Args:
+      paths: a folder or several: of a run, or anything that holds runs, at any depth.
+
+    Raises:
+      ValueError: there is no run in one of the folders, or it cannot be read.
+    """
+    from agents.runs import results  # noqa: PLC0415  training needs nothing of files
+
+    return results.results(paths)

@@ -74,10 +74,12 @@ class Config:
 
       curiosity: source of the intrinsic reward. `icm`: the paper's, forward and inverse
         models over the policy's GRU outputs. `icm-detached`: an encoder of its own, trained
-        by the inverse loss alone. `rnd`: imitation of a random network. `counts`: how seldom
-        training has seen an observation. `effects`: how seldom something other than the agent
-        comes to a place, or the hand to a look, that is new to the episode. `none`: plain
-        PPO. Or a name that you registered.
+        by the inverse loss alone. `rnd`: imitation of a random network. `noveld`: where that
+        error rises. `ride`: how much a step changes features of the observation. `e3b`: how
+        unlike the episode's others they are. `counts`: how seldom training has seen an
+        observation. `effects`: how seldom something other than the agent comes to a place, or
+        the hand to a look, that is new to the episode. `none`: plain PPO. Or a name that you
+        registered.
       intrinsic_scale: weight of the normalised intrinsic reward, or of its advantage.
       intrinsic_start: its weight at first, which falls geometrically to `intrinsic_scale`; 0 for
         a weight that is the same throughout.

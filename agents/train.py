@@ -17,7 +17,7 @@ from agents.config import PRESETS, Config
 from agents.parallel import processes
 from agents.parallel.sharding import Placement
 from agents.runs import compilation_cache
-from agents.runs.folder import Run, RunFolder, write_json
+from agents.runs.folder import Run, RunFolder
 from agents.runs.session import Session
 from agents.runs.stopping import Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
@@ -152,7 +152,7 @@ def start(arguments: Sequence[str]) -> Session:
         placement=Placement.of(options.devices, run.config, run.seeds),
     )
     # More iterations, once the run has been taken up.
-    processes.from_first(lambda: write_json(folder.config, run.to_dict()))
+    processes.from_first(lambda: folder.note(run))
     return session
 
 

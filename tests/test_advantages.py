@@ -41,10 +41,10 @@ def test_a_stream_that_hardly_pays_is_not_blown_up():
 def test_the_intrinsic_weight_falls_geometrically():
     config = Config(intrinsic_start=8.0, intrinsic_scale=0.5, intrinsic_fall=0.4, iterations=10)
     weight = advantages.intrinsic_scale(config)
-    found = [float(weight(iteration)) for iteration in range(6)]
+    found = np.array([weight(iteration) for iteration in range(6)])
     np.testing.assert_allclose(found, [8, 4, 2, 1, 0.5, 0.5], rtol=1e-6)
     constant = advantages.intrinsic_scale(Config(intrinsic_scale=0.7))
-    assert [float(constant(iteration)) for iteration in (0, 9)] == [0.7, 0.7]
+    assert [constant(iteration) for iteration in (0, 9)] == [0.7, 0.7]
 
 
 def test_training_with_two_streams_replays_and_frames():

@@ -30,6 +30,7 @@ ROOMS = (
     ("experiments",),
     ("profiles",),
     ("profile",),
+    ("sweep", "examples"),
 )
 LEARNING = ("registry", "config", "parallel", "networks", "acting", "curiosity", "ppo")
 SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))

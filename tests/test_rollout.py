@@ -7,7 +7,7 @@ import pytest
 
 import trap_tube_jax as tt
 from agents import Config, make_train
-from agents.acting.identity import first_visits, layout_ids, observation_ids, position_id
+from agents.acting.identity import first_visits, layout_ids, observation_ids, position_id, visits
 from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.networks import chunks
 from agents.networks.agent import Agent
@@ -48,7 +48,7 @@ def test_episodes_follow_the_environment(played):
     env, _, _, initial, trajectory = played
     episodes = trajectory.episodes
     state, done = initial, np.zeros(CONFIG.episodes, bool)
-    for t in range(CONFIG.max_steps):
+    for t in range(env.max_steps):
         np.testing.assert_array_equal(episodes.mask[t], ~done)
         for name, index in (("agent", 0), ("tool", 1), ("food", 2)):
             np.testing.assert_array_equal(episodes.cells[t, :, index], getattr(state, name))
@@ -127,8 +127,9 @@ def test_observation_ids_are_equal_for_equal_observations_alone(played):
         assert len(set(first[ids == identity].tolist())) == 1
 
 
-def test_first_visits():
+def test_visits():
     ids = jnp.array([[0, 5], [1, 5], [0, 5], [2, 6]])
+    np.testing.assert_array_equal(visits(ids), [[1, 1], [1, 2], [2, 3], [1, 1]])
     np.testing.assert_array_equal(first_visits(ids), [[1, 1], [1, 0], [0, 0], [1, 1]])
 
 
@@ -139,7 +140,7 @@ def acted(train, params, trajectory: Trajectory) -> Trajectory:
     return trajectory._replace(features=features)
 
 
-@pytest.mark.parametrize("curiosity", ["icm", "icm-detached", "rnd", "none"])
+@pytest.mark.parametrize("curiosity", ["icm", "icm-detached", "rnd", "ride", "e3b", "none"])
 def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played, curiosity):
     trajectory = played[-1]
     train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity})).learner

@@ -32,12 +32,17 @@ def observation_ids(episodes: Episodes) -> jax.Array:
     return group(layout.reshape(-1), position.reshape(-1)).number.reshape(position.shape)
 
 
-def first_visits(observation_id: jax.Array) -> jax.Array:
-    """f32[T + 1, B]: 1 where an observation is new in its episode, 0 where it returns."""
+def visits(observation_id: jax.Array) -> jax.Array:
+    """f32[T + 1, B]: how often its episode has seen an observation so far, this time included."""
     time = jnp.arange(len(observation_id))
     same = observation_id[:, None] == observation_id[None]
-    earlier = (time[:, None] > time[None])[..., None]
-    return 1.0 - jnp.any(same & earlier, axis=1)
+    so_far = (time[:, None] >= time[None])[..., None]
+    return jnp.sum(same & so_far, axis=1, dtype=jnp.float32)
+
+
+def first_visits(observation_id: jax.Array) -> jax.Array:
+    """f32[T + 1, B]: 1 where an observation is new in its episode, 0 where it returns."""
+    return (visits(observation_id) == 1).astype(jnp.float32)
 
 
 def _layout_content(layout: State) -> jax.Array:

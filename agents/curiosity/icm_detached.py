@@ -8,55 +8,47 @@ Source: own; Burda et al. (2019a) discuss which features to predict.
 
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.curiosity.models import ForwardModel, InverseModel
+from agents.curiosity.models import ForwardModel, InverseFeatures
 from agents.networks.actions import ActionDistribution
-from agents.networks.encoder import Encoder
 from agents.networks.layers import init_module
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
-class Models(nn.Module):
+class Models(InverseFeatures):
     """An encoder, and the two models over its features.
 
     Attributes:
-      hidden: units of the inverse model.
-      filters: of the encoder.
+      detached: whether the forward model's error stops at the features.
     """
 
-    hidden: int
-    filters: tuple[int, int]
+    detached: bool = True
 
     def setup(self) -> None:
         """Declares the encoder and the two models."""
-        self.encoder = Encoder(self.filters)
+        super().setup()
         self.forward = ForwardModel()
-        self.inverse = InverseModel(self.hidden)
 
-    def __call__(
+    def __call__(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, observation: jax.Array, next_observation: jax.Array, action: jax.Array
     ) -> tuple[jax.Array, ActionDistribution]:
         """All of it on single steps: u8[M, 12, 12, N] twice and i32[M, 2]; see `compare`."""
         features = self.encode(observation), self.encode(next_observation)
         return self.compare(*features, action)
 
-    def encode(self, observation: jax.Array) -> jax.Array:
-        """Features f32[M, filters[1]] of u8[M, 12, 12, N]."""
-        return self.encoder(observation)
-
     def compare(
         self, features: jax.Array, next_features: jax.Array, action: jax.Array
     ) -> tuple[jax.Array, ActionDistribution]:
         """The squared errors f32[..., F] of the predicted features; the inferred action."""
         one_hot = jax.nn.one_hot(action, NUM_DIRECTIONS)
-        fixed, next_fixed = jax.lax.stop_gradient((features, next_features))
-        predicted = self.forward(fixed, one_hot.reshape(*action.shape[:-1], -1))
-        return jnp.square(predicted - next_fixed), self.inverse(features, next_features)
+        seen = features, next_features
+        here, there = jax.lax.stop_gradient(seen) if self.detached else seen
+        predicted = self.forward(here, one_hot.reshape(*action.shape[:-1], -1))
+        return jnp.square(predicted - there), self.inverse(features, next_features)
 
 
 class DetachedICM(Curiosity):

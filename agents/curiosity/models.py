@@ -1,4 +1,4 @@
-"""The two models of an intrinsic curiosity module.
+"""The two models of an intrinsic curiosity module, and features that they shape.
 
 Source: Pathak et al. (2017); agents/agent.md, "Network".
 """
@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from agents.networks.actions import ActionDistribution
+from agents.networks.encoder import Encoder
 from agents.networks.layers import dense, output_dense
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
@@ -33,3 +34,32 @@ class ForwardModel(nn.Module):
         """f32[..., H] and f32[..., E] to f32[..., H]."""
         x = jnp.concatenate([embedding, action], axis=-1)
         return embedding + output_dense(embedding.shape[-1])(x)
+
+
+class InverseFeatures(nn.Module):
+    """An encoder of its own and an inverse model over its features.
+
+    Attributes:
+      hidden: units of the inverse model.
+      filters: of the encoder.
+    """
+
+    hidden: int
+    filters: tuple[int, int]
+
+    def setup(self) -> None:
+        """Declares the encoder and the inverse model."""
+        self.encoder = Encoder(self.filters)
+        self.inverse = InverseModel(self.hidden)
+
+    def __call__(self, observation: jax.Array, next_observation: jax.Array) -> ActionDistribution:
+        """The inferred action between two observations u8[M, 12, 12, N]."""
+        return self.inverse(self.encode(observation), self.encode(next_observation))
+
+    def encode(self, observation: jax.Array) -> jax.Array:
+        """Features f32[M, filters[1]] of u8[M, 12, 12, N]."""
+        return self.encoder(observation)
+
+    def infer(self, features: jax.Array, next_features: jax.Array) -> ActionDistribution:
+        """The inferred action between two features f32[..., F]."""
+        return self.inverse(features, next_features)

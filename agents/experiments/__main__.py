@@ -45,9 +45,8 @@ class Options:
         they register.
       preset: the named settings; the paper's if absent.
       algorithms: ppo: the preset without curiosity and without imitation; ppo+icm,
-        ppo+icm-detached, ppo+rnd, ppo+counts: with that curiosity; each followed by
-        +imitation: with the preset's imitation too; preset: as it is. ppo and ppo+icm if
-        absent.
+        ppo+rnd and so on: with that curiosity; each followed by +imitation: with the
+        preset's imitation too; preset: as it is. ppo and ppo+icm if absent.
       seeds: how many seeds, from --seed on; 5 if absent.
       seed: the first seed; 0 if absent.
       iterations: of training; 250 in exp1 and 500 in exp2 if absent.

@@ -31,7 +31,7 @@ def save(record: Record, path: Path) -> None:
     curves = {
         entry["name"]: [row for run in entry["runs"] for row in rows_of(run)] for entry in entries
     }
-    draw = _save_rewards if record["experiment"] == "exp1" else _save_success
+    draw = save_rewards if record["experiment"] == "exp1" else _save_success
     draw(curves, path, tables.title(record), {DIGEST: digest(record)})
 
 
@@ -58,10 +58,12 @@ def drawn_from(path: Path) -> str | None:
         return picture.info.get(DIGEST)
 
 
-def _save_rewards(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:
-    """Experiment 1: training and evaluation reward over episodes, a thin line per seed."""
+def save_rewards(
+    curves: Curves, path: Path, title: str, metadata: Mapping[str, str] | None = None
+) -> None:
+    """As in experiment 1: training and evaluation reward over episodes, a thin line per seed."""
     panels = {"training reward": "success", "greedy evaluation reward": "evaluation"}
-    _save(curves, panels, path, title, metadata, columns=2, draw=_draw_seeds)
+    _save(curves, panels, path, title, metadata or {}, columns=2, draw=_draw_seeds)
 
 
 def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:

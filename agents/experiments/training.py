@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from rich.console import Console
 from agents.config import Config
 from agents.experiments.protocol import FIXED, LATER, Protocol
 from agents.parallel.sharding import Placement
-from agents.runs.folder import CONFIG_FILE, Run, RunFolder, read_json, write_json
+from agents.runs.folder import CONFIG_FILE, Run, RunFolder, is_done, read_json, write_json
 from agents.runs.machine import machine
 from agents.runs.metrics import Row, read_metrics
 from agents.runs.session import Session
@@ -124,7 +124,7 @@ def train_all(
             tracker=tracker,
             placement=Placement.of(resources.devices, run.config, run.seeds),
         )
-        write_json(folder.config, run.to_dict())  # more iterations, once it has been taken up
+        folder.note(run)  # more iterations, once it has been taken up
         try:
             session.train(stop)
             session.summarize()
@@ -132,42 +132,54 @@ def train_all(
             session.close()
 
 
-def plan(root: Path, protocol: Protocol, side_by_side: bool) -> Iterable[tuple[RunFolder, Run]]:
-    """The runs that hold the protocol's seeds, made where they are missing, by seed.
+def plan(root: Path, protocol: Protocol, side_by_side: bool) -> list[tuple[RunFolder, Run]]:
+    """The runs that hold the protocol's seeds; see `plan_runs`.
 
     Raises:
       ValueError: a run has other settings than the protocol.
     """
-    wanted = range(protocol.seed, protocol.seed + protocol.seeds)
+    configs = {name: protocol.config(name) for name in protocol.algorithms}
+    seeds = range(protocol.seed, protocol.seed + protocol.seeds)
+    return plan_runs(root, configs, protocol.preset, seeds, side_by_side=side_by_side)
+
+
+def plan_runs(
+    root: Path,
+    configs: Mapping[str, Config],
+    preset: str,
+    wanted: range,
+    *,
+    side_by_side: bool = False,
+) -> list[tuple[RunFolder, Run]]:
+    """The runs in a folder that hold these seeds, made where they are missing, by seed.
+
+    Args:
+      root: the folder.
+      configs: the settings of the runs, by the name that their folders begin with.
+      preset: the preset that they started from.
+      wanted: the seeds.
+      side_by_side: make one run of all missing seeds that follow each other.
+
+    Raises:
+      ValueError: a run has other settings.
+    """
     planned: list[tuple[RunFolder, Run]] = []
     there = find_runs(root)
-    for algorithm in protocol.algorithms:
-        config = protocol.config(algorithm)
+    for name, config in configs.items():
         seen: set[int] = set()
         for entry in there:
-            if entry.algorithm == algorithm and set(entry.run.seed_range) & set(wanted):
+            if entry.algorithm == name and set(entry.run.seed_range) & set(wanted):
                 seen |= set(entry.run.seed_range)
                 planned.append((entry.folder, _continued(entry, config)))
         missing = [range(seed, seed + 1) for seed in wanted if seed not in seen]
         for seeds in _joined(missing) if side_by_side else missing:
-            run = Run(config, protocol.preset, seeds[0], len(seeds))
-            planned.append((RunFolder(root / folder_name(algorithm, seeds)), run))
-    planned.sort(key=lambda entry: entry[1].seed)  # stable: algorithms in turn
+            run = Run(config, preset, seeds[0], len(seeds))
+            planned.append((RunFolder(root / folder_name(name, seeds)), run))
+    planned.sort(key=lambda entry: entry[1].seed)  # stable: the configs in turn
     for folder, run in planned:
         if not folder.config.is_file():
             RunFolder.create(folder.path, run)
     return planned
-
-
-def is_done(folder: RunFolder, run: Run) -> bool:
-    """Whether a run has been trained and summarised in full."""
-    summary = read_json(folder.summary)
-    if summary is None:
-        return False
-    solved = all(seed["first_solved"] for seed in summary["seeds"])
-    return summary["iterations"] >= run.config.iterations or (
-        run.config.stop_when_solved > 0 and solved
-    )
 
 
 def draw_tasks(

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.acting.scores import wilson_interval
 from agents.experiments.records import Record
 from agents.experiments.statistics import Spread
 from agents.profiles.mistakes import NEVER, SUBGOALS
 from agents.profiles.pushes import NO_PUSH
 from agents.profiles.tasks import BASE, GRADED, SWAPS
+from trap_tube_jax.scoring.scores import wilson_interval
 
 BIN = 5  # steps, of the lengths of shortest plans
 BEST, DETOUR, LOST, UNTOUCHED = "shortest way", "detour", "food lost", "tool not touched"

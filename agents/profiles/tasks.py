@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import fixed_tasks
 from trap_tube_jax.controls import CONTROLS, trap_and_exit_exchanged
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import OBJECT_NAMES, TOOL
+from trap_tube_jax.scoring.tasks import fixed_tasks
 from trap_tube_jax.state import State
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS, Transfer, swap_with_tool
 

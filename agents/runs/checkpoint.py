@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from trap_tube_jax._version import __version__
+
 Tree = TypeVar("Tree")
 Arrays = dict[str, np.ndarray]
 
@@ -134,8 +136,16 @@ class Checkpoints:
         try:
             return from_arrays(arrays, template), record
         except ValueError as error:
-            problem = f"does not fit the run's settings or this version ({error})"
-            raise self.refuse(record["iteration"], problem) from error
+            raise self.refuse_misfit(record, error) from error
+
+    def refuse_misfit(self, record: dict[str, Any], error: Exception) -> CheckpointError:
+        """The error of a checkpoint that has other arrays than are expected."""
+        wrote = record.get("version", "unknown")
+        problem = (
+            f"does not fit the run's settings or this version ({error}; version {wrote} wrote "
+            f"it, this is {__version__})"
+        )
+        return self.refuse(record["iteration"], problem)
 
     def refuse(self, iteration: int, problem: str) -> CheckpointError:
         """The error that says what to do about a checkpoint."""

@@ -7,11 +7,18 @@ from pathlib import Path
 from typing import Any, Self
 
 from agents.config import PRESETS, Config
+from trap_tube_jax._version import __version__
 
 CONFIG_FILE = "config.json"
 MAX_SEED = 2**31 - 1
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "stop_when_solved")
+FIRST_VERSION = "0.1.0"  # wrote settings without a version
+# Settings of that version that are gone; all but `method` counted with another method than PPO.
+GONE = (
+    *("method", "task_sets", "tasks", "walkers", "walk_rounds", "walk_steps", "agent_rounds"),
+    *("restarts", "advised", "advice", "dataset", "mirrored"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +93,7 @@ class Run:
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
-        """The inverse of `to_dict`.
+        """The inverse of `to_dict`; settings of PPO that are missing or gone since are the paper's.
 
         Raises:
           ValueError: a value is missing, unknown or not allowed.
@@ -96,7 +103,10 @@ class Run:
             raise ValueError(f"a run is described by {', '.join(names)}, got {values!r}")
         if not isinstance(values["config"], dict):
             raise ValueError(f"config must be a table of settings, got {values['config']!r}")
-        return cls(**{**values, "config": Config.from_dict(values["config"])})
+        config = values["config"]
+        if config.get("method") == "ppo":
+            config = {name: value for name, value in config.items() if name not in GONE}
+        return cls(**{**values, "config": Config.from_dict(config)})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,6 +146,11 @@ class RunFolder:
     def checkpoints(self) -> Path:
         """One folder per checkpoint, named after its iteration."""
         return self.path / "checkpoints"
+
+    @property
+    def log(self) -> Path:
+        """What its training showed, where it ran beside others."""
+        return self.path / "log.txt"
 
     @property
     def curves(self) -> Path:
@@ -182,7 +197,7 @@ class RunFolder:
         # or one that can be resumed.
         draft = path.parent / f".{path.name}.{os.getpid()}"
         draft.mkdir(parents=True)
-        write_json(draft / CONFIG_FILE, run.to_dict())
+        cls(draft).note(run)
         draft.rename(path)
         return cls(path)
 
@@ -199,10 +214,32 @@ class RunFolder:
             raise ValueError(
                 f"{path} holds no run; runs in {path.parent}: {', '.join(known) or 'none'}"
             )
+        version = __version__
         try:
-            return folder, Run.from_dict(json.loads(folder.config.read_text()))
+            values = json.loads(folder.config.read_text())
+            if isinstance(values, dict):
+                version = values.pop("version", FIRST_VERSION)
+            return folder, Run.from_dict(values)
         except ValueError as error:
-            raise ValueError(f"{folder.config} is not the settings of a run: {error}") from error
+            raise ValueError(
+                f"{folder.config} is not the settings of a run: {error}; version {version} wrote "
+                f"it, this is {__version__}"
+            ) from error
+
+    def note(self, run: Run) -> None:
+        """Writes the settings of a run, and which version does."""
+        write_json(self.config, {"version": __version__, **run.to_dict()})
+
+
+def is_done(folder: RunFolder, run: Run) -> bool:
+    """Whether a run has been trained and summarised in full."""
+    summary = read_json(folder.summary)
+    if summary is None:
+        return False
+    solved = all(seed["first_solved"] for seed in summary["seeds"])
+    return summary["iterations"] >= run.config.iterations or (
+        run.config.stop_when_solved > 0 and solved
+    )
 
 
 def write_json(path: Path, values: Any) -> None:

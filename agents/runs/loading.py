@@ -91,7 +91,7 @@ def load_run(path: Path, iteration: int | None = None) -> list[Policy]:
             seeds = [jax.tree.map(lambda x, i=i: x[i], params) for i in range(run.seeds)]
             checkpoint.from_arrays(checkpoint.to_arrays(seeds[0]), expected)
         except (ValueError, IndexError) as error:
-            raise checkpoints.refuse(record["iteration"], f"does not fit ({error})") from error
+            raise checkpoints.refuse_misfit(record, error) from error
     iterations = np.broadcast_to(arrays["iteration"], (run.seeds,))
     return [
         Policy(f"seed {seed}", run.config, policy, int(done))

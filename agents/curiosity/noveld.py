@@ -1,0 +1,30 @@
+"""NovelD: a step pays where it leads from what is known to what is new.
+
+Source: Zhang et al. (2021); novelty by Burda et al. (2019b).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from agents.acting.identity import first_visits
+from agents.curiosity.base import Experience, Params
+from agents.curiosity.rnd import RND
+
+ALPHA = 0.5  # of the paper
+
+
+class NovelD(RND):
+    """reward_t = max(n(o_{t+1}) - 0.5 n(o_t), 0), if o_{t+1} is new in its episode, else 0.
+
+    n is the novelty of `rnd`: the Euclidean norm of the error in imitating a random network.
+    The predictor's loss is that of `rnd`.
+    """
+
+    def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
+        """The rise of novelty, paid at first visits."""
+        del params
+        novelty = jnp.linalg.norm(experience.features, axis=-1)
+        rise = jnp.maximum(novelty[1:] - ALPHA * novelty[:-1], 0.0)
+        return rise * first_visits(experience.observation_id)[1:], memory

@@ -1,0 +1,1 @@
+"""Short programs, each on its own; tests run them."""

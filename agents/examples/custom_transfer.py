@@ -1,0 +1,42 @@
+"""A transfer of one's own, and what it takes from an agent that was trained without it.
+
+python -m agents.examples.custom_transfer
+"""
+
+import jax
+import jax.numpy as jnp
+
+import agents
+import trap_tube_jax as tt
+from trap_tube_jax.objects import BOARD_SIZE
+
+
+def mirrored(key: jax.Array, state: tt.State) -> tt.State:
+    """Turns left into right with probability 1/2. The shortest plan keeps its length."""
+    last = BOARD_SIZE - 1
+    image = state.replace(
+        board=state.board[:, ::-1],
+        agent=state.agent.at[1].set(last - state.agent[1]),
+        food=state.food.at[1].set(last - state.food[1]),
+        tool=state.tool.at[1].set(last - state.tool[1] - (state.tool_extent[1] - 1)),
+    )
+    turns = jax.random.bernoulli(key)
+    return jax.tree.map(lambda x, y: jnp.where(turns, x, y), image, state)
+
+
+tt.register("MirroredTrapTube-v0", (mirrored,), short="mirrored")
+
+
+def main(tasks: int = 100) -> tt.Scores:
+    """Scores the agent shipped as `base` on base and on its mirror image.
+
+    Args:
+      tasks: how many of the new set.
+    """
+    scores = tt.score(agents.load("base"), sets=["base", "mirrored"], tasks=tasks)
+    print(scores)
+    return scores
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Trains rejax's PPO and scores it; needs the extra `interop`.
+
+python -m agents.examples.rejax_agent
+"""
+
+from collections.abc import Callable
+
+import jax
+import rejax  # pyright: ignore[reportMissingImports]
+
+import trap_tube_jax as tt
+from agents.examples.near_food import NEAR_FOOD
+from trap_tube_jax.adapters import to_gymnax
+
+
+class Policy:
+    """An agent of rejax as `tt.score` plays it: two pure functions of many episodes.
+
+    Args:
+      act: from one observation u8[12, 12, N] and a key to 4 * grasp + move.
+    """
+
+    def __init__(self, act: Callable[[jax.Array, jax.Array], jax.Array]):
+        self._act = act
+
+    def initial(self, batch: int) -> tuple[()]:
+        """Nothing is remembered."""
+        del batch
+        return ()
+
+    def act(
+        self, observation: jax.Array, carry: tuple[()], key: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
+        """The actions i32[B, 2] for observations u8[B, 12, 12, N]."""
+        index = jax.vmap(self._act)(observation, jax.random.split(key, len(observation)))
+        return tt.action_from_index(index), carry
+
+
+def main(total_timesteps: int = 8_192) -> tt.Scores:
+    """Trains on the food nearby; scores there and, for what it has not learnt, on base.
+
+    Args:
+      total_timesteps: environment steps of training.
+    """
+    env, params = to_gymnax.make(NEAR_FOOD.id)
+    ppo = rejax.PPO.create(
+        env=env,
+        env_params=params,
+        total_timesteps=total_timesteps,
+        eval_freq=total_timesteps,
+        num_envs=32,
+        num_steps=32,
+        num_minibatches=4,
+        learning_rate=1e-3,
+        normalize_observations=True,
+    )
+    trained, _ = jax.jit(ppo.train)(jax.random.PRNGKey(0))
+    scores = tt.score(Policy(ppo.make_act(trained)), sets=[NEAR_FOOD.short, "base"])
+    print(scores)
+    return scores
+
+
+if __name__ == "__main__":
+    main()
