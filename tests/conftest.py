@@ -2,10 +2,13 @@
 
 import atexit
 import os
+import re
 import shutil
 import tempfile
+from pathlib import Path
 
 import jax
+import pytest
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 if "PYTEST_XDIST_WORKER" not in os.environ:
@@ -13,9 +16,6 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     # cache left by another version of the code must not decide what is tested.
     os.environ[FOLDER] = tempfile.mkdtemp(prefix="trap_tube_jax-tests-")
     atexit.register(shutil.rmtree, os.environ[FOLDER], ignore_errors=True)
-    # Tests compile for longer than they compute.
-    given = os.environ.get("XLA_FLAGS", "")
-    os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {given}".strip()
 
 SETTINGS = {
     "jax_compilation_cache_dir": os.environ[FOLDER],
@@ -24,6 +24,20 @@ SETTINGS = {
     # An accidental broadcast between ranks is a bug that a shape test may not see.
     "jax_numpy_rank_promotion": "raise",
 }
-for name, value in SETTINGS.items():
+
+
+def set_for_all_processes(name: str, value: object) -> None:
+    """Sets a configuration of JAX here and in the processes that tests start."""
     os.environ[name.upper()] = str(value)
     jax.config.update(name, value)
+
+
+for setting in SETTINGS.items():
+    set_for_all_processes(*setting)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _optimisation(request: pytest.FixtureRequest) -> None:
+    """Agents take longer to compile than to run here; the rules run in millions of states."""
+    is_of_agents = re.search(r"^(from|import) agents\b", Path(request.path).read_text(), re.M)
+    set_for_all_processes("jax_disable_most_optimizations", is_of_agents is not None)

@@ -1,6 +1,6 @@
 """The whole learner on environments that isolate one ability each."""
 
-from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,59 +30,70 @@ CONFIG = Config(
     iterations=ITERATIONS,
     cooldown=0.7,
 )
-Learner = Callable[[str], tuple[jax.Array, Trajectory]]
+# Kinds of probes, and whether the network has its recurrent state.
+CASES = [(kind, True) for kind in probes.KINDS] + [("memory", False), ("cue", False)]
 
 
-def make_learner() -> Learner:
-    """Trains on a kind of probe; returns the rewards' scale and 32 greedy episodes."""
+class Learnt(NamedTuple):
+    """The extrinsic reward as it enters the targets, and 32 greedy episodes."""
 
-    @jax.jit
-    def run(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajectory]:
-        env = probes.Probe(kind)
-        train = make_train(CONFIG, env)
-        init_key, reset_key = jax.random.split(key)
-        state, _ = jax.lax.scan(
-            lambda state, _: train.iterate(state), train.init(init_key), length=ITERATIONS
-        )
-        tasks, _ = jax.vmap(env.reset)(jax.random.split(reset_key, 32))
-        played = rollout(
-            train.agent, state.params, env, tasks, reset_key, choose=greedy_action, chunk=16
-        )
-        return 1 / state.extrinsic.deviation, played
-
-    return lambda kind: run(jnp.int32(probes.KINDS.index(kind)), jax.random.key(0))
+    reward: jax.Array
+    played: Trajectory
 
 
 @pytest.fixture(scope="module")
-def learn() -> Learner:
-    return make_learner()
+def learnt() -> dict[tuple[str, bool], Learnt]:
+    """All cases, trained side by side."""
+    advance = Core.advance
+
+    def run(kind: jax.Array, remembers: jax.Array) -> Learnt:
+        def maybe_forget(core: Core, state: jax.Array, inputs: jax.Array) -> jax.Array:
+            return advance(core, jnp.where(remembers, state, 0), inputs)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Core, "advance", maybe_forget)
+            return train_and_play(kind, jax.random.key(0))
+
+    kinds = jnp.array([probes.KINDS.index(kind) for kind, _ in CASES])
+    results = jax.jit(jax.vmap(run))(kinds, jnp.array([remembers for _, remembers in CASES]))
+    return {case: jax.tree.map(lambda x, i=i: x[i], results) for i, case in enumerate(CASES)}
 
 
-def test_value_of_a_certain_reward(learn):
-    reward, played = learn("value")
+def train_and_play(kind: jax.Array, key: jax.Array) -> Learnt:
+    env = probes.Probe(kind)
+    train = make_train(CONFIG, env)
+    init_key, reset_key = jax.random.split(key)
+    state, _ = jax.lax.scan(
+        lambda state, _: train.iterate(state), train.init(init_key), length=ITERATIONS
+    )
+    tasks, _ = jax.vmap(env.reset)(jax.random.split(reset_key, 32))
+    played = rollout(
+        train.agent, state.params, env, tasks, reset_key, choose=greedy_action, chunk=16
+    )
+    return Learnt(1 / state.extrinsic.deviation, played)
+
+
+def test_value_of_a_certain_reward(learnt):
+    reward, played = learnt["value", True]
     np.testing.assert_allclose(played.value[0, :, 0], reward, rtol=0.1)
     np.testing.assert_allclose(played.value[1:-1, :, 0] / reward, 0.0, atol=0.1)
 
 
-def test_value_is_discounted(learn):
-    reward, played = learn("discount")
+def test_value_is_discounted(learnt):
+    reward, played = learnt["discount", True]
     for time in range(probes.STEPS):
         expected = reward * DISCOUNT ** (probes.STEPS - 1 - time)
         np.testing.assert_allclose(played.value[time, :, 0], expected, rtol=0.1)
 
 
 @pytest.mark.parametrize("kind", ["policy", "cue", "credit", "memory"])
-def test_policy_earns_all_there_is(learn, kind):
-    _, played = learn(kind)
+def test_policy_earns_all_there_is(learnt, kind):
+    played = learnt[kind, True].played
     np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)
 
 
-def test_memory_needs_the_gru(monkeypatch):
+def test_memory_needs_the_gru(learnt):
     """Without a recurrent state the same learner cannot beat a guess, in sight it can."""
-    advance = Core.advance
-    monkeypatch.setattr(
-        Core, "advance", lambda core, state, inputs: advance(core, jnp.zeros_like(state), inputs)
-    )
-    learn = make_learner()
-    assert jnp.mean(jnp.sum(learn("memory")[1].episodes.reward, axis=0)) < 0.8
-    np.testing.assert_array_equal(jnp.sum(learn("cue")[1].episodes.reward, axis=0), 1)
+    without = {kind: learnt[kind, False].played.episodes for kind in ("memory", "cue")}
+    assert jnp.mean(jnp.sum(without["memory"].reward, axis=0)) < 0.8
+    np.testing.assert_array_equal(jnp.sum(without["cue"].reward, axis=0), 1)

@@ -12,6 +12,7 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting import encodings
+from agents.acting.episodes import Episodes
 from agents.acting.identity import first_visits, layout_ids, observation_ids, position_id
 from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.networks import chunks
@@ -154,7 +155,7 @@ def test_network_saw_the_episodes_in_order(played):
 def test_observation_ids_are_equal_for_equal_observations_alone(played):
     trajectory: Trajectory = played[-1]
     ids = np.asarray(jax.jit(observation_ids)(trajectory.episodes)).reshape(-1)
-    boards = jax.jit(lambda episodes: episodes.observations())(trajectory.episodes)
+    boards = jax.jit(Episodes.observations)(trajectory.episodes)
     boards = np.asarray(boards).reshape(len(ids), -1)
     _, first = np.unique(boards, axis=0, return_inverse=True)
     # Different ids may show one board: the agent over the food, say. Never the reverse.
