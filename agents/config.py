@@ -73,9 +73,12 @@ class Config:
         models over the policy's GRU outputs. `icm-detached`: an encoder of its own, trained
         by the inverse loss alone. `rnd`: imitation of a random network. `counts`: how seldom
         training has seen an observation. `effects`: how seldom something other than the agent
-        comes to a place that is new to the episode. `none`: plain PPO. Or a name that you
-        registered.
+        comes to a place, or the hand to a look, that is new to the episode. `none`: plain
+        PPO. Or a name that you registered.
       intrinsic_scale: weight of the normalised intrinsic reward, or of its advantage.
+      intrinsic_start: its weight at first, which falls geometrically to `intrinsic_scale`; 0 for
+        a weight that is the same throughout.
+      intrinsic_fall: share of the iterations, the first ones, over which it falls.
       curiosity_coef: weight of the curiosity's losses.
       rewards: what becomes of extrinsic and intrinsic reward. `summed`: both are divided by their
         deviation and added; there is one value. `apart`: each has a value of its own, and the
@@ -87,8 +90,9 @@ class Config:
       imitation_coef: weight of imitating the agent's own solved episodes; 0 for none.
       imitation_episodes: the newest solved episodes that are remembered and imitated.
 
-      replayed: share of the episodes that play tasks again that were failed.
-      failures: how many failed tasks, the newest, are kept for that.
+      replayed: shares of the episodes that play tasks again which were failed once, twice, and
+        so on; none for none.
+      failures: how many tasks of each kind, the newest, are kept for that.
 
       facing: whether the agent sees and acts in a frame in which the food lies ahead at first,
         one of the board's eight symmetries, instead of on the board as it is.
@@ -128,6 +132,8 @@ class Config:
     # Intrinsic reward.
     curiosity: str = _setting("icm")
     intrinsic_scale: float = _setting(0.1, 0, unused={"curiosity": ("none",)})
+    intrinsic_start: float = _setting(0.0, 0, unused={"curiosity": ("none",)})
+    intrinsic_fall: float = _setting(0.3, 0, 1, unused={"intrinsic_start": (0,)})
     curiosity_coef: float = _setting(10.0, 0, unused={"curiosity": ("none", "counts", "effects")})
     rewards: Literal["summed", "apart"] = _setting("summed", unused={"curiosity": ("none",)})
     episodic_novelty: bool = _setting(False, unused={"curiosity": ("none",)})
@@ -136,8 +142,8 @@ class Config:
     imitation_coef: float = _setting(0.0, 0)
     imitation_episodes: int = _setting(16, 1, unused={"imitation_coef": (0,)})
     # Failed tasks, played again.
-    replayed: float = _setting(0.0, 0, 1)
-    failures: int = _setting(1024, 1, unused={"replayed": (0,)})
+    replayed: tuple[float, ...] = _setting((), 0, 1)
+    failures: int = _setting(1024, 1, unused={"replayed": ((),)})
     # The network.
     facing: bool = _setting(False)
     encoder: Literal["paper", "objects"] = _setting("paper")
@@ -161,6 +167,13 @@ class Config:
             self._check_use(field)
         if self.rewards == "apart" and self.bootstrap != "value":
             raise ValueError(f"rewards='apart' needs bootstrap='value', got {self.bootstrap!r}")
+        if self.intrinsic_start and not self.intrinsic_scale:
+            raise ValueError("intrinsic_start > 0 needs intrinsic_scale > 0, to fall to; got 0")
+        if self.num_new < 1:
+            raise ValueError(
+                f"replayed must leave some of {self.episodes} episodes to new tasks, got shares "
+                f"{self.replayed}; allowed: a sum below 1"
+            )
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
             raise ValueError(
@@ -225,9 +238,14 @@ class Config:
         return 2 if self.rewards == "apart" else 1
 
     @property
-    def num_replayed(self) -> int:
-        """How many episodes of an iteration play a failed task again."""
-        return round(self.replayed * self.episodes)
+    def num_replayed(self) -> tuple[int, ...]:
+        """How many episodes of an iteration play tasks again that were failed once, twice, ..."""
+        return tuple(round(share * self.episodes) for share in self.replayed)
+
+    @property
+    def num_new(self) -> int:
+        """How many episodes of an iteration play a task for the first time."""
+        return self.episodes - sum(self.num_replayed)
 
     @property
     def gradient_steps(self) -> int:
@@ -263,12 +281,15 @@ PRESETS: dict[str, dict[str, Any]] = {
         "minibatch": 64,
         "discount": 0.995,
         "bootstrap": "value",
-        "value_coef": 0.1,
-        "entropy_coef": 3e-3,
+        "value_coef": 0.5,
+        "entropy_coef": 5e-3,
+        "cooldown": 0.3,
         "curiosity": "effects",
-        "intrinsic_scale": 0.5,
+        "intrinsic_scale": 0.1,
+        "intrinsic_start": 3.0,
+        "intrinsic_fall": 0.5,
         "rewards": "apart",
-        "replayed": 0.5,
+        "replayed": (0.125, 0.125, 0.5),
         "facing": True,
         "encoder": "objects",
         "filters": (64, 64),
@@ -285,15 +306,18 @@ def _check_type(field: dataclasses.Field, value: Any) -> None:
     elif isinstance(default, float):
         matches = isinstance(value, int | float)
     elif isinstance(default, tuple):
+        number = int if default else int | float
         matches = (
             isinstance(value, tuple)
-            and len(value) == len(default)
-            and all(isinstance(item, int) for item in value)
+            and (not default or len(value) == len(default))
+            and all(isinstance(item, number) and not isinstance(item, bool) for item in value)
         )
     else:
         matches = isinstance(value, type(default))
     if not matches:
-        wanted = "2 integers" if isinstance(default, tuple) else type(default).__name__
+        wanted = type(default).__name__
+        if isinstance(default, tuple):
+            wanted = "2 integers" if default else "numbers"
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
 
 

@@ -11,6 +11,7 @@ from agents.ppo import advantages
 TINY = {
     "env_id": "pstsy", "episodes": 8, "minibatch": 4, "epochs": 1, "filters": (4, 4),
     "hidden": 4, "embedding": 2, "max_steps": 6, "chunk": 8, "failures": 5,
+    "replayed": (0.25, 0.25),
 }  # fmt: skip
 
 
@@ -37,13 +38,22 @@ def test_a_stream_that_hardly_pays_is_not_blown_up():
     assert np.abs(joint).max() < 0.1
 
 
+def test_the_intrinsic_weight_falls_geometrically():
+    config = Config(intrinsic_start=8.0, intrinsic_scale=0.5, intrinsic_fall=0.4, iterations=10)
+    weight = advantages.intrinsic_scale(config)
+    found = [float(weight(iteration)) for iteration in range(6)]
+    np.testing.assert_allclose(found, [8, 4, 2, 1, 0.5, 0.5], rtol=1e-6)
+    constant = advantages.intrinsic_scale(Config(intrinsic_scale=0.7))
+    assert [float(constant(iteration)) for iteration in (0, 9)] == [0.7, 0.7]
+
+
 def test_training_with_two_streams_replays_and_frames():
     train = make_train(Config.preset("best", **TINY))
     state = train.init(jax.random.key(0))
     assert state.params["heads"]["params"]["value"]["kernel"].shape == (4, 2)
     after, metrics = jax.jit(train.iterate)(state)
     # Of the episodes that are new, those that were failed are remembered.
-    new = TINY["episodes"] - train.config.num_replayed
-    assert int(after.failures.next) == round(new * (1 - float(metrics["success"])))
+    failed = round(train.config.num_new * (1 - float(metrics["success"])))
+    assert int(after.failures.next[0]) == failed % TINY["failures"]
     assert 0 <= float(metrics["replayed_success"]) <= 1
     assert all(np.isfinite(float(value)) for value in metrics.values())

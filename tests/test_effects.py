@@ -9,7 +9,8 @@ import trap_tube_jax as tt
 from agents import Config
 from agents.acting.episodes import Episodes, cells_of
 from agents.curiosity import Experience
-from agents.curiosity.effects import Effects, new_effects
+from agents.curiosity.effects import Effects, new_effects, new_touches
+from trap_tube_jax.objects import DIRECTIONS, LEFT, UP
 
 STEPS, BATCH = 40, 48
 
@@ -38,8 +39,10 @@ def random_episodes(env: tt.Environment) -> Episodes:
     return jax.jit(play)(jax.random.key(0))
 
 
-def read_off(boards: np.ndarray, ground: np.ndarray, own: dict[str, np.ndarray]) -> np.ndarray:
-    """What is new, i64[2, T], by the boards u8[T + 1, 12, 12, N] of one episode alone.
+def read_off(
+    boards: np.ndarray, grasps: np.ndarray, ground: np.ndarray, own: dict[str, np.ndarray]
+) -> np.ndarray:
+    """What is new, i64[3, T], by the boards u8[T + 1, 12, 12, N] and grasps of one episode alone.
 
     The agent stands on ground wherever it is, and so does food outside its tube.
     """
@@ -54,7 +57,13 @@ def read_off(boards: np.ndarray, ground: np.ndarray, own: dict[str, np.ndarray])
             new.append(view.tobytes() not in seen)
             seen.add(view.tobytes())
         found.append(new[1:])
-    return np.array(found)
+    met, new = set(), []
+    for board, place, grasp in zip(boards, is_agent, grasps, strict=False):
+        hand = np.argwhere(place)[0] + DIRECTIONS[grasp]
+        look = board[tuple(hand)].tobytes() if np.all((hand >= 0) & (hand < 12)) else None
+        new.append(look is not None and look not in met)
+        met.add(look)
+    return np.array([*found, new])
 
 
 @pytest.mark.parametrize("short", ["base", "p", "psy", "pstsy"])
@@ -70,7 +79,8 @@ def test_effects_can_be_read_off_the_observations(short):
         if bool(episodes.solved[index]):
             length -= 1  # the agent stands where the food was
         ground = np.asarray(episodes.layout.palette[index, 0])
-        expected = read_off(boards[: length + 1, index], ground, own)
+        grasps = np.asarray(episodes.action[:length, index, 0])
+        expected = read_off(boards[: length + 1, index], grasps, ground, own)
         np.testing.assert_array_equal(found[:, :length, index], expected)
         checked += expected.sum()
     assert checked > 0
@@ -90,17 +100,31 @@ def by_hand() -> Episodes:
 
 
 def test_what_returns_to_where_it_was_is_not_new(by_hand):
-    food, tool = np.asarray(new_effects(by_hand) * by_hand.mask[None])
+    food, tool, _ = np.asarray(new_effects(by_hand) * by_hand.mask[None])
     np.testing.assert_array_equal(tool.T, [[1, 0, 0, 1], [0, 1, 0, 0]])
     np.testing.assert_array_equal(food.T, [[0, 0, 1, 0], [0, 1, 0, 0]])
+
+
+def test_the_hand_meets_every_look_once(by_hand):
+    state = tt.base_state()  # the tool above the agent, on ground
+    agent = jnp.array([[9, 1], [8, 1], [8, 1], [8, 1], [8, 1]])
+    things = jnp.broadcast_to(jnp.stack([state.tool, state.food]), (5, 2, 2))
+    cells = jnp.concatenate([agent[:, None], things], axis=1).astype(jnp.uint8)
+    grasp = jnp.array([UP, UP, UP, LEFT])
+    episodes = by_hand._replace(
+        cells=jnp.stack([cells, cells], axis=1),
+        action=jnp.zeros((4, 2, 2), jnp.int32).at[:, :, 0].set(grasp[:, None]),
+    )
+    np.testing.assert_array_equal(new_touches(episodes).T, [[1, 1, 0, 0]] * 2)
 
 
 def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
     curiosity = Effects(Config(reward_rate=0.75))
     experience = Experience(by_hand, jnp.zeros((5, 2), jnp.int32), jnp.zeros((5, 2, 0)))
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)
-    np.testing.assert_allclose(memory, [2 / 6, 3 / 6], rtol=1e-6)
+    np.testing.assert_allclose(memory, [2 / 6, 3 / 6, 0], rtol=1e-6)
     np.testing.assert_allclose(pay.T, [[2, 0, 3, 2], [0, 5, 0, 0]], rtol=1e-6)
     # Later the rates move slowly.
-    _, memory = curiosity.reward({}, jnp.array([0.5, 0.1]), experience)
-    np.testing.assert_allclose(memory, [0.75 * 0.5 + 0.25 / 3, 0.75 * 0.1 + 0.25 / 2], rtol=1e-6)
+    _, memory = curiosity.reward({}, jnp.array([0.5, 0.1, 0.2]), experience)
+    expected = [0.75 * 0.5 + 0.25 / 3, 0.75 * 0.1 + 0.25 / 2, 0.75 * 0.2]
+    np.testing.assert_allclose(memory, expected, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Effects: a step pays where something other than the agent comes to a place new to the episode.
+"""Effects: what the agent brings about, or meets, for the first time in an episode.
 
 Source: own. Relatives: visits counted within an episode, in NGU (Badia et al., 2020) and NovelD
 (Zhang et al., 2021); change as a reward, in C-BET (Parisi et al., 2021); the impact of actions,
@@ -12,19 +12,22 @@ from agents.acting.episodes import Episodes
 from agents.acting.identity import first_visits
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from trap_tube_jax.objects import BOARD_SIZE
+from agents.networks.grouping import hash_rows
+from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 
-NUM_KINDS = 2
+NUM_KINDS = 3
 LOWEST_RATE = 1e-4  # effects a step, below which an effect does not pay more
+AGENT, TOOL, FOOD = 0, 1, 2  # in `Episodes.cells`
 
 
 class Effects(Curiosity):
-    """reward_t = sum over kinds k of new_k(o_0, ..., o_{t+1}) / rate_k.
+    """reward_t = sum over kinds k of new_k(o_0, a_0, ..., a_t, o_{t+1}) / rate_k.
 
-    `new` is a function of one episode's observations (`new_effects`). There are two kinds of
-    effects: on the food, and on anything else but the agent's body. Each pays the inverse of
-    its rate, a moving mean of how often it happens in a step. So all kinds pay the same in total,
-    a rare one more each time, and one that the agent learns to bring about ever less.
+    `new` is a function of one episode's observations and actions (`new_effects`). There are three
+    kinds of effects: on the food, on anything else but the agent's body, and on the hand. Each
+    pays the inverse of its rate, a moving mean of how often it happens in a step. So all kinds
+    pay the same in total, a rare one more each time, and one that the agent learns to bring about
+    ever less.
 
     It assumes that the agent knows its own colour and the food's, which no transfer changes.
 
@@ -38,7 +41,7 @@ class Effects(Curiosity):
         self._keep = config.reward_rate
 
     def memory(self) -> jax.Array:
-        """The rates f32[2]; 0 before the first batch, which is taken as it is."""
+        """The rates f32[3]; 0 before the first batch, which is taken as it is."""
         return jnp.zeros(NUM_KINDS)
 
     def reward(
@@ -54,15 +57,28 @@ class Effects(Curiosity):
 
 
 def new_effects(episodes: Episodes) -> jax.Array:
-    """f32[2, T, B]: 1 where a step brings the food, or the tool, to a cell new to the episode.
+    """f32[3, T, B]: 1 where a step brings about something that is new to the episode.
 
-    The tool is all that moves beside agent and food. So its cell is new exactly where the board
-    without these two looks as it has not looked before in the episode. A tool that has the
-    colour of what it moves over is the exception: its moves pay and are not seen.
+    Food and tool: it comes to a cell where it has not been. The tool is all that moves beside
+    agent and food. So its cell is new exactly where the board without these two looks as it has
+    not looked before in the episode. A tool that has the colour of what it moves over is the
+    exception: its moves pay and are not seen.
+
+    Hand: the grasp is at something, or at ground, of a look that the hand has not met.
     """
     cell = episodes.cells.astype(jnp.int32)
     cell = cell[..., 0] * BOARD_SIZE + cell[..., 1]
-    return jnp.stack([first_visits(cell[..., thing])[1:] for thing in (FOOD, TOOL)])
+    moved = [first_visits(cell[..., thing])[1:] for thing in (FOOD, TOOL)]
+    return jnp.stack([*moved, new_touches(episodes)])
 
 
-TOOL, FOOD = 1, 2  # in `Episodes.cells`
+def new_touches(episodes: Episodes) -> jax.Array:
+    """f32[T, B]: 1 where the cell that is grasped at shows a look new to the episode's grasps."""
+    hand = episodes.cells[:-1, :, AGENT].astype(jnp.int32)
+    hand = hand + jnp.asarray(DIRECTIONS)[episodes.action[..., 0]]
+    on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
+    hand = jnp.clip(hand, 0, BOARD_SIZE - 1)
+    time, episode = jnp.indices(hand.shape[:2])
+    look = episodes.observations()[time, episode, hand[..., 0], hand[..., 1]]
+    look = hash_rows(look.reshape(-1, look.shape[-1])).reshape(on_board.shape)
+    return first_visits(jnp.where(on_board, look, 0)) * on_board

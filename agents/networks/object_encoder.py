@@ -67,70 +67,101 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
       bool[M, 6]: whether there is such an object. f32[M, 94]: row and column of
       the agent, 12 + 12, of the food, 12 + 12, and of the food as seen from the agent, 23 + 23.
     """
-    count, _, _, num_features = observation.shape
+    num_features = observation.shape[-1]
     weights = np.random.default_rng(0).integers(1, 2**32, num_features, np.uint32)
     color = _hash_colors(observation, weights)
     own_colors = _hash_colors(base_state(num_features).palette, weights)
     anchors = [color == own_colors[thing] for thing in (AGENT, FOOD)]
 
-    left = ~(anchors[0] | anchors[1])
-    masks = []
-    for _ in range(MAX_OBJECTS):
-        first = jnp.argmax(left.reshape(count, -1), axis=1)
-        its_color = jnp.take_along_axis(color.reshape(count, -1), first[:, None], axis=1)
-        mask = left & (color == its_color[..., None])
-        left = left & ~mask
-        masks.append(mask)
-    mask = jnp.stack(masks, axis=1)
-
-    agent, food = ((jnp.any(anchor, axis=2), jnp.any(anchor, axis=1)) for anchor in anchors)
-    offsets = [
-        _seen_from(place[:, None], origin)[:, 0] for place, origin in zip(food, agent, strict=True)
-    ]
-    places = jnp.concatenate([*agent, *food, *offsets], axis=1)
-    rows, columns = jnp.any(mask, axis=3), jnp.any(mask, axis=2)
-    size = jnp.sum(mask, axis=(2, 3))
-    parts = [rows, columns]
-    for row, column in (agent, food):
-        parts += [_seen_from(rows, row), _seen_from(columns, column), _around(mask, row, column)]
-    parts += [size[..., None] == jnp.arange(NAMED_SIZES + 1)[None, None]]
-    sizes = jnp.stack([size / 20, jnp.log1p(size) / 3], axis=-1)
-    parts = [part.astype(jnp.float32) for part in [*parts, sizes]]
-    return jnp.concatenate(parts, axis=-1), size > 0, places.astype(jnp.float32)
+    lines = _objects(color, left=~(anchors[0] | anchors[1]))
+    rows, columns = _shadows(lines)
+    agent, food = (_shadows(_pack(anchor)) for anchor in anchors)
+    places = [_unpack(shadow, BOARD_SIZE) for shadow in (*agent, *food)]
+    places += [_seen_from(*both) for both in zip(food, agent, strict=True)]
+    parts = [_unpack(rows, BOARD_SIZE), _unpack(columns, BOARD_SIZE)]
+    for anchor in (agent, food):
+        row, column = (shadow[:, None] for shadow in anchor)
+        parts += [_seen_from(rows, row), _seen_from(columns, column), _around(lines, row, column)]
+    size = jnp.sum(jax.lax.population_count(lines), axis=-1)
+    parts += [size[..., None] == jnp.arange(NAMED_SIZES + 1, dtype=size.dtype)[None, None]]
+    parts += [jnp.stack([size / 20, jnp.log1p(size) / 3], axis=-1)]
+    features, places = (
+        jnp.concatenate([x.astype(jnp.float32) for x in flags], axis=-1)
+        for flags in (parts, places)
+    )
+    return features, size > 0, places
 
 
-def _seen_from(flags: jax.Array, anchor: jax.Array) -> jax.Array:
-    """Shifts flags bool[M, K, 12] so that the first place of anchor bool[M, 12] is in the middle.
+# Sets of places in a row are the bits of one integer: they shift, join and count fast, where
+# arrays of flags take gathers and reductions, which do not vectorise.
+
+
+def _objects(color: jax.Array, left: jax.Array) -> jax.Array:
+    """The cells of up to six colours u32[M, 12, 12], of those that are left, bool[M, 12, 12].
 
     Returns:
-      bool[M, K, 23]; all false where there is no anchor.
+      u32[M, 6, 12], the columns of each of them in every row.
+    """
+    count = len(color)
+    color, left = color.reshape(count, -1), left.reshape(count, -1)
+    cells = np.arange(color.shape[1])[None]
+    objects = []
+    for _ in range(MAX_OBJECTS):
+        first = jnp.min(jnp.where(left, cells, color.shape[1] - 1), axis=1, keepdims=True)
+        is_same = left & (color == jnp.take_along_axis(color, first, axis=1))
+        left = left & ~is_same
+        objects.append(_pack(is_same.reshape(count, BOARD_SIZE, BOARD_SIZE)))
+    return jnp.stack(objects, axis=1)
+
+
+def _shadows(lines: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The rows and the columns u32[...] in which u32[..., 12] has cells."""
+    columns = jax.lax.reduce(lines, np.uint32(0), jax.lax.bitwise_or, (lines.ndim - 1,))
+    return _pack(lines != 0), columns
+
+
+def _seen_from(places: jax.Array, origin: jax.Array) -> jax.Array:
+    """`places` u32[...] as seen from the first of `origin` u32[...], which is in the middle.
+
+    Returns:
+      bool[..., 23]; all false where there is no origin.
     """
     reach = BOARD_SIZE - 1
-    there = jnp.any(anchor, axis=1)[:, None, None]
-    padded = jnp.pad(flags & there, ((0, 0), (0, 0), (reach, reach)))
-    shape = (flags.shape[1], 2 * reach + 1)
-
-    def around(padded: jax.Array, place: jax.Array) -> jax.Array:
-        return jax.lax.dynamic_slice(padded, (0, place), shape)
-
-    return jax.vmap(around)(padded, jnp.argmax(anchor, axis=1))
+    seen = (places << reach) >> _first(origin)
+    return _unpack(jnp.where(origin != 0, seen, 0), 2 * reach + 1)
 
 
-def _around(mask: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
-    """The cells of masks bool[M, K, 12, 12] near the one at row and column, bool[M, 12] each.
+def _around(lines: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
+    """The cells of u32[M, K, 12] near the first row and column of u32[M, 1] each.
 
     Returns:
       bool[M, K, 25], the 5x5 cells around it; all false where there is none, and off the board.
     """
-    there = jnp.any(row, axis=1)[:, None, None, None]
-    padded = jnp.pad(mask & there, ((0, 0), (0, 0), (NEAR, NEAR), (NEAR, NEAR)))
     width = 2 * NEAR + 1
-    shape = (mask.shape[1], width, width)
+    offset = np.arange(BOARD_SIZE)[None] - _first(row).astype(jnp.int32) + NEAR
+    is_near = offset[:, None] == np.arange(width)[None, :, None]
+    near = jnp.where(is_near[:, None], lines[:, :, None], 0)
+    near = jnp.sum(near, axis=-1, dtype=jnp.uint32)
+    cells = (near << NEAR) >> _first(column)[..., None]
+    cells = _unpack(jnp.where(row[..., None] != 0, cells, 0), width)
+    return cells.reshape(*cells.shape[:2], -1)
 
-    def cut(padded: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
-        return jax.lax.dynamic_slice(padded, (0, row, column), shape).reshape(shape[0], -1)
 
-    return jax.vmap(cut)(padded, jnp.argmax(row, axis=1), jnp.argmax(column, axis=1))
+def _first(places: jax.Array) -> jax.Array:
+    """The lowest place u32[...] of `places` u32[...]; at most 31."""
+    return jnp.minimum(jax.lax.population_count((places & -places) - 1), 31)
+
+
+def _pack(flags: jax.Array) -> jax.Array:
+    """Flags bool[..., 12] as the bits of u32[...]."""
+    weights = (1 << np.arange(BOARD_SIZE, dtype=np.uint32)).reshape((1,) * (flags.ndim - 1) + (-1,))
+    return jnp.sum(jnp.where(flags, weights, 0), axis=-1, dtype=jnp.uint32)
+
+
+def _unpack(bits: jax.Array, count: int) -> jax.Array:
+    """The lowest bits of u32[...] as flags bool[..., count]."""
+    places = np.arange(count, dtype=np.uint32).reshape((1,) * bits.ndim + (-1,))
+    return (bits[..., None] >> places) & 1 == 1
 
 
 def _hash_colors(colors: jax.Array, weights: np.ndarray) -> jax.Array:

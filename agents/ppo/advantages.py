@@ -9,10 +9,15 @@ agents/agent.md, "PPO".
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from agents.acting.episodes import Episodes
 from agents.config import Config
 from agents.ppo import returns
+
+# Of the curiosity's returns, once scaled: like that of the task's, which lie in [0, 1], so that
+# one weight of the value's error suits both.
+RETURN_DEVIATION = 0.3
 
 # Added to the variance of advantages, so that a stream that hardly pays is not blown up.
 VARIANCE_FLOOR = 4e-4
@@ -26,10 +31,20 @@ generalized_advantages = jax.vmap(
 RewardMoments = tuple[returns.Moments, returns.Moments]
 
 
+def intrinsic_scale(config: Config) -> optax.Schedule:
+    """The weight of the intrinsic reward, by iterations: constant, or falling geometrically."""
+    start, end = config.intrinsic_start, config.intrinsic_scale
+    falling = round(config.intrinsic_fall * config.iterations)
+    if not start or not falling:
+        return optax.constant_schedule(end)
+    return optax.exponential_decay(start, falling, end / start, end_value=end)
+
+
 def of_sum(
     config: Config,
     episodes: Episodes,
     novelty: jax.Array,
+    scale: jax.typing.ArrayLike,
     value: jax.Array,
     moments: RewardMoments,
 ) -> tuple[jax.Array, jax.Array, RewardMoments]:
@@ -39,6 +54,7 @@ def of_sum(
       config: the settings.
       episodes: the episodes.
       novelty: f32[T, B], the intrinsic reward, 0 after an episode's end.
+      scale: weight of the intrinsic reward.
       value: f32[T + 1, B, 1], of every observation.
       moments: of extrinsic and intrinsic reward so far.
 
@@ -48,7 +64,7 @@ def of_sum(
     extrinsic = moments[0].update(episodes.reward, episodes.mask, config.reward_rate)
     intrinsic = moments[1].update(novelty, episodes.mask, config.reward_rate)
     reward = episodes.reward / extrinsic.deviation
-    reward = reward + config.intrinsic_scale * novelty / intrinsic.deviation
+    reward = reward + scale * novelty / intrinsic.deviation
     advantage, target = advantages_and_targets(config, reward, episodes, value[..., 0])
     return advantage, target[..., None], (extrinsic, intrinsic)
 
@@ -57,6 +73,7 @@ def of_streams(
     config: Config,
     episodes: Episodes,
     novelty: jax.Array,
+    scale: jax.typing.ArrayLike,
     value: jax.Array,
     moments: RewardMoments,
 ) -> tuple[jax.Array, jax.Array, RewardMoments]:
@@ -65,13 +82,14 @@ def of_streams(
     Added up as rewards, the louder one decides: once easy tasks pay, what the agent still has to
     find out is lost in their variance (Burda et al., 2019b).
 
-    The task's reward, at most 1 an episode, is taken as it is; the curiosity's is divided by the
-    deviation of its returns.
+    The task's reward, at most 1 an episode, is taken as it is; the curiosity's is scaled so that
+    its returns deviate by `RETURN_DEVIATION`.
 
     Args:
       config: the settings.
       episodes: the episodes.
       novelty: f32[T, B], the intrinsic reward, 0 after an episode's end.
+      scale: weight of the intrinsic reward.
       value: f32[T + 1, B, 2], of every observation: the task's and the curiosity's.
       moments: of the extrinsic reward and of the intrinsic returns so far.
 
@@ -84,10 +102,10 @@ def of_streams(
     task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
     own = continuing_value(value[..., 1], mask)
     discount = jnp.full_like(novelty, gamma)
-    reward = novelty / intrinsic.deviation
+    reward = RETURN_DEVIATION * novelty / intrinsic.deviation
     curiosity = generalized_advantages(reward, discount, own, mask, lambda_)
     target = jnp.stack([task_target, curiosity + own[:-1]], axis=-1)
-    advantage = joint_advantage(task, curiosity, config.intrinsic_scale, mask)
+    advantage = joint_advantage(task, curiosity, scale, mask)
     return advantage, target, (moments[0], intrinsic)
 
 
@@ -135,7 +153,7 @@ def continuing_value(value: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def joint_advantage(
-    task: jax.Array, curiosity: jax.Array, scale: float, mask: jax.Array
+    task: jax.Array, curiosity: jax.Array, scale: jax.typing.ArrayLike, mask: jax.Array
 ) -> jax.Array:
     """Both advantages f32[T, B], normalised apart; the task's plus `scale` times the other."""
     task = returns.normalize(task, mask, VARIANCE_FLOOR)

@@ -120,7 +120,9 @@ class Learner:
             replay=replay.empty(
                 self.env.base, self.config.imitation_episodes, self.config.max_steps
             ),
-            failures=Failures.untried(failures_key, self.config.failures),
+            failures=Failures.untried(
+                failures_key, len(self.config.replayed), self.config.failures
+            ),
             key=key,
             iteration=zero,
             episodes=zero,
@@ -152,20 +154,20 @@ class Learner:
         return state, {**play_metrics, **loss_metrics}
 
     def draw_tasks(self, failures: Failures, key: jax.Array) -> jax.Array:
-        """The reset keys [B] of an iteration's tasks: first those failed before, then new ones."""
-        again = self.config.num_replayed
-        if not again:
-            return jax.random.split(key, self.config.episodes)
+        """The reset keys [B] of an iteration's tasks: first new ones, then those failed before."""
+        config = self.config
+        if not config.replayed:
+            return jax.random.split(key, config.episodes)
         failures_key, key = jax.random.split(key)
-        new = jax.random.split(key, self.config.episodes - again)
-        return jnp.concatenate([failures.draw(failures_key, again), new])
+        new = jax.random.split(key, config.num_new)
+        return jnp.concatenate([new, failures.draw(failures_key, config.num_replayed)])
 
     def note_failures(
         self, failures: Failures, reset_keys: jax.Array, solved: jax.Array
     ) -> Failures:
         """The failures after tasks [B] were played, as `draw_tasks` gave them, bool[B] solved."""
         again = self.config.num_replayed
-        return failures.remember(reset_keys[again:], ~solved[again:]) if again else failures
+        return failures.remember(reset_keys, ~solved, again) if again else failures
 
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays this device's share of an iteration's episodes."""
@@ -202,7 +204,8 @@ class Learner:
             novelty = novelty * first_visits(observation_id)[1:]
         join = advantages.of_sum if config.rewards == "summed" else advantages.of_streams
         moments = (state.extrinsic, state.intrinsic)
-        advantage, target, moments = join(config, episodes, novelty, value, moments)
+        scale = advantages.intrinsic_scale(config)(state.iteration)
+        advantage, target, moments = join(config, episodes, novelty, scale, value, moments)
         batch = Batch(
             episodes=episodes,
             observation_id=observation_id,
@@ -211,13 +214,13 @@ class Learner:
             value_target=target,
         )
         metrics = {
-            "success": jnp.mean(episodes.solved[config.num_replayed :].astype(jnp.float32)),
+            "success": jnp.mean(episodes.solved[: config.num_new].astype(jnp.float32)),
             "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
             "intrinsic_reward": jnp.sum(novelty) / jnp.sum(episodes.mask),
             "distinct_observations": jnp.max(observation_id) + 1,
         }
         if config.num_replayed:
-            solved = episodes.solved[: config.num_replayed]
+            solved = episodes.solved[config.num_new :]
             metrics["replayed_success"] = jnp.mean(solved.astype(jnp.float32))
         state = state._replace(
             extrinsic=moments[0],

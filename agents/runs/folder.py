@@ -70,12 +70,13 @@ class Run:
                     f"the run has {name}={value}, not {new[name]}; only "
                     f"{' and '.join(EXTENDABLE)} may change"
                 )
-        if before.config.cooldown > 0 and new["iterations"] != old["iterations"]:
-            raise ValueError(
-                f"the run has cooldown={before.config.cooldown} and iterations="
-                f"{old['iterations']}, not {new['iterations']}: the step size falls towards the "
-                "last iteration, so another number of them is another run; begin a new one"
-            )
+        for name in ("cooldown", "intrinsic_start"):
+            if old[name] > 0 and new["iterations"] != old["iterations"]:
+                raise ValueError(
+                    f"the run has {name}={old[name]} and iterations={old['iterations']}, not "
+                    f"{new['iterations']}: its schedule depends on their number, so another "
+                    "number of them is another run; begin a new one"
+                )
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:

@@ -92,7 +92,7 @@ def transfers(own: tt.TaskSet, percent: float, others: Sequence[float]) -> str:
 def next_command(folder: RunFolder, run: Run, percent: float) -> str:
     """The command to try after a run that solves so many percent of its own tasks."""
     config = run.config
-    if percent < MUCH and not config.cooldown:
+    if percent < MUCH and not (config.cooldown or config.intrinsic_start):
         out = "" if str(folder.path.parent) == "runs" else f" --out {folder.path.parent}"
         return (
             f"train longer with python -m agents.train --resume --name {folder.path.name}{out} "
