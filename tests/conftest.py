@@ -38,6 +38,10 @@ for setting in SETTINGS.items():
 
 @pytest.fixture(scope="module", autouse=True)
 def _optimisation(request: pytest.FixtureRequest) -> None:
-    """Agents take longer to compile than to run here; the rules run in millions of states."""
+    """Agents take longer to compile than to run here; the rules run in millions of states.
+
+    A module of agents that run for long says OPTIMISED.
+    """
     is_of_agents = re.search(r"^(from|import) agents\b", Path(request.path).read_text(), re.M)
-    set_for_all_processes("jax_disable_most_optimizations", is_of_agents is not None)
+    optimised = is_of_agents is None or hasattr(request.module, "OPTIMISED")
+    set_for_all_processes("jax_disable_most_optimizations", not optimised)

@@ -1,6 +1,6 @@
 """The whole learner on environments that isolate one ability each."""
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -30,36 +30,30 @@ CONFIG = Config(
     iterations=ITERATIONS,
     cooldown=0.7,
 )
-# Kinds of probes, and whether the network has its recurrent state.
-CASES = [(kind, True) for kind in probes.KINDS] + [("memory", False), ("cue", False)]
-
-
-class Learnt(NamedTuple):
-    """The extrinsic reward as it enters the targets, and 32 greedy episodes."""
-
-    reward: jax.Array
-    played: Trajectory
+OPTIMISED = True  # they train for long
+Learner = Callable[..., tuple[jax.Array, Trajectory]]
 
 
 @pytest.fixture(scope="module")
-def learnt() -> dict[tuple[str, bool], Learnt]:
-    """All cases, trained side by side."""
+def learn() -> Learner:
+    """Trains on a kind of probe; returns the rewards' scale and 32 greedy episodes."""
     advance = Core.advance
 
-    def run(kind: jax.Array, remembers: jax.Array) -> Learnt:
+    @jax.jit
+    def run(kind: jax.Array, remembers: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajectory]:
         def maybe_forget(core: Core, state: jax.Array, inputs: jax.Array) -> jax.Array:
             return advance(core, jnp.where(remembers, state, 0), inputs)
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Core, "advance", maybe_forget)
-            return train_and_play(kind, jax.random.key(0))
+            return train_and_play(kind, key)
 
-    kinds = jnp.array([probes.KINDS.index(kind) for kind, _ in CASES])
-    results = jax.jit(jax.vmap(run))(kinds, jnp.array([remembers for _, remembers in CASES]))
-    return {case: jax.tree.map(lambda x, i=i: x[i], results) for i, case in enumerate(CASES)}
+    return lambda kind, remembers=True: run(
+        jnp.int32(probes.KINDS.index(kind)), jnp.array(remembers), jax.random.key(0)
+    )
 
 
-def train_and_play(kind: jax.Array, key: jax.Array) -> Learnt:
+def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajectory]:
     env = probes.Probe(kind)
     train = make_train(CONFIG, env)
     init_key, reset_key = jax.random.split(key)
@@ -70,30 +64,31 @@ def train_and_play(kind: jax.Array, key: jax.Array) -> Learnt:
     played = rollout(
         train.agent, state.params, env, tasks, reset_key, choose=greedy_action, chunk=16
     )
-    return Learnt(1 / state.extrinsic.deviation, played)
+    return 1 / state.extrinsic.deviation, played
 
 
-def test_value_of_a_certain_reward(learnt):
-    reward, played = learnt["value", True]
+def test_value_of_a_certain_reward(learn):
+    reward, played = learn("value")
     np.testing.assert_allclose(played.value[0, :, 0], reward, rtol=0.1)
     np.testing.assert_allclose(played.value[1:-1, :, 0] / reward, 0.0, atol=0.1)
 
 
-def test_value_is_discounted(learnt):
-    reward, played = learnt["discount", True]
+def test_value_is_discounted(learn):
+    reward, played = learn("discount")
     for time in range(probes.STEPS):
         expected = reward * DISCOUNT ** (probes.STEPS - 1 - time)
         np.testing.assert_allclose(played.value[time, :, 0], expected, rtol=0.1)
 
 
 @pytest.mark.parametrize("kind", ["policy", "cue", "credit", "memory"])
-def test_policy_earns_all_there_is(learnt, kind):
-    played = learnt[kind, True].played
+def test_policy_earns_all_there_is(learn, kind):
+    _, played = learn(kind)
     np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)
 
 
-def test_memory_needs_the_gru(learnt):
+def test_memory_needs_the_gru(learn):
     """Without a recurrent state the same learner cannot beat a guess, in sight it can."""
-    without = {kind: learnt[kind, False].played.episodes for kind in ("memory", "cue")}
-    assert jnp.mean(jnp.sum(without["memory"].reward, axis=0)) < 0.8
-    np.testing.assert_array_equal(jnp.sum(without["cue"].reward, axis=0), 1)
+    _, played = learn("memory", remembers=False)
+    assert jnp.mean(jnp.sum(played.episodes.reward, axis=0)) < 0.8
+    _, played = learn("cue", remembers=False)
+    np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)

@@ -66,20 +66,20 @@ data.episodes.forEach((each, index) => chosen.add(new Option(each.title, index))
 function show() {
   const each = data.episodes[chosen.value];
   if (!each) { caption.textContent = "There are none."; return; }
-  const now = Number(step.value), last = each.frames.length - 1;
+  const last = each.frames.length - 1, now = Math.min(Number(step.value), last);
   board.src = picture(each.frames[now]);
   const next = now < last
     ? "; next: " + each.actions[now] + "; value " + each.values[now].toFixed(3)
     : each.solved ? "; solved" : "; not solved";
   caption.textContent = "The agent: step " + now + " of " + last + next;
-  const length = each.plan.actions.length, then = Math.min(now, length);
+  const length = each.plan.actions.length, then = Math.min(Number(step.value), length);
   ideal.src = picture(each.plan.frames[then]);
   hint.textContent = !length ? "No plan solves this task." : "The shortest plan: step " + then +
     " of " + length + (then < length ? "; next: " + each.plan.actions[then] : "; solved");
 }
 function choose() {
   const each = data.episodes[chosen.value];
-  step.max = each ? each.frames.length - 1 : 0;
+  step.max = each ? Math.max(each.actions.length, each.plan.actions.length) : 0;
   step.value = 0;
   show();
 }
