@@ -121,7 +121,10 @@ class Learner:
                 self.env.base, self.config.imitation_episodes, self.config.max_steps
             ),
             failures=Failures.untried(
-                failures_key, len(self.config.replayed), self.config.failures
+                # One list where nothing is replayed: a checkpoint holds no empty arrays.
+                failures_key,
+                max(1, len(self.config.replayed)),
+                self.config.failures,
             ),
             key=key,
             iteration=zero,
