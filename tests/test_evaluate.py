@@ -144,14 +144,14 @@ def test_keys_of_tasks_are_never_drawn_in_training(monkeypatch):
 
 def test_outcomes_are_those_of_the_recorded_actions(grey_play):
     evaluator, _, played = grey_play
-    env = tt.Environment(base=tt.base_state(1), max_steps=6)
+    step = jax.jit(tt.Environment(base=tt.base_state(1), max_steps=6).step)
     for name, tasks in evaluator.tasks.items():
         for index, solved in enumerate(played[name].solved):
             state = jax.tree.map(lambda x, index=index: x[index], tasks)
             actions = played[name].action[index, : played[name].length[index]]
             for action in actions:
                 assert not state.terminated
-                state, _ = env.step(state, jnp.asarray(action))
+                state, _ = step(state, jnp.asarray(action))
             assert state.terminated == solved
             assert state.terminated | state.truncated
 
