@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from agents import Config, make_train, registry
+from agents.acting.episodes import Episodes
 from agents.curiosity import Curiosity, register
 from agents.curiosity.counts import observation_slots, visit_bonus
 
@@ -26,21 +27,28 @@ class Corners(Curiosity):
         return jnp.all(agent % 11 == 0, axis=-1).astype(jnp.float32), memory + 1
 
 
+@pytest.fixture(scope="module")
+def trajectory():
+    """Random episodes of {Sy}, 40 of 4 steps."""
+    learner = make_train(Config.from_dict({**TINY, "episodes": 40})).learner
+    params = jax.jit(learner.init_params)(jax.random.key(0))
+    reset_keys = jax.random.split(jax.random.key(1), 40)
+    return jax.jit(learner.play)(params, reset_keys, jax.random.key(2))
+
+
 @pytest.fixture(autouse=True)
 def own_table(monkeypatch):
     monkeypatch.setattr(registry.curiosities, "_factories", dict(registry.curiosities._factories))
 
 
-def test_a_curiosity_of_ones_own_is_trained_with():
+def test_a_curiosity_of_ones_own_is_trained_with(trajectory):
     register("corners", lambda config, env: Corners())
     train = make_train(Config.from_dict({**TINY, "curiosity": "corners"})).learner
-    start = train.init(jax.random.key(0))
-    reset_keys = jax.random.split(jax.random.key(1), train.config.episodes)
-    trajectory = jax.jit(train.play)(start.params, reset_keys, jax.random.key(2))
+    start = jax.jit(train.init)(jax.random.key(0))
     episodes = trajectory.episodes
     cells = episodes.cells.at[1, 0, 0].set(jnp.array([11, 0], jnp.uint8))
     trajectory = trajectory._replace(episodes=episodes._replace(cells=cells))
-    reward, memory = train.intrinsic_reward(start, trajectory)
+    reward, memory = jax.jit(train.intrinsic_reward)(start, trajectory)
     corner = np.isin(np.asarray(cells[1:, :, 0]), [0, 11]).all(-1)
     np.testing.assert_array_equal(reward, corner)
     assert reward[0, 0] == 1
@@ -73,26 +81,18 @@ def test_visits_are_counted_and_pay_by_their_root():
     np.testing.assert_array_equal(visits, [0, 0, 0, 2, 0, 4, 0, 0])
 
 
-@pytest.fixture(scope="module")
-def episodes():
-    """Random episodes of {Sy}, 40 of 4 steps."""
-    settings = {**TINY, "curiosity": "counts", "episodes": 40}
-    learner = make_train(Config.from_dict(settings)).learner
-    params = learner.init_params(jax.random.key(0))
-    reset_keys = jax.random.split(jax.random.key(1), 40)
-    return jax.jit(learner.play)(params, reset_keys, jax.random.key(2)).episodes
-
-
-def test_few_observations_share_a_slot(episodes):
+def test_few_observations_share_a_slot(trajectory):
     """No more of the positions on layouts of {Sy} than chance would have it, here 1 %."""
     cells = jax.random.randint(jax.random.key(2), (500, 40, 3, 2), 0, 12).astype(jnp.uint8)
-    slot = np.asarray(observation_slots(episodes._replace(cells=cells)))
+    slot = jax.jit(observation_slots)(trajectory.episodes._replace(cells=cells))
+    slot = np.asarray(slot)
     assert len(np.unique(slot)) > 0.98 * slot.size
 
 
-def test_every_observation_keeps_its_slot(episodes):
-    slot = np.asarray(observation_slots(episodes))
-    boards = np.asarray(episodes.observations()).reshape(slot.size, -1)
+def test_every_observation_keeps_its_slot(trajectory):
+    episodes = trajectory.episodes
+    slot = np.asarray(jax.jit(observation_slots)(episodes))
+    boards = np.asarray(jax.jit(Episodes.observations)(episodes)).reshape(slot.size, -1)
     cells = np.asarray(episodes.cells).reshape(slot.size, -1)
     _, same = np.unique(np.concatenate([boards, cells], axis=1), axis=0, return_inverse=True)
     assert same.max() + 1 < slot.size

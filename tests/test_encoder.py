@@ -1,5 +1,6 @@
 """The paper's encoder by distinct windows against the plain one."""
 
+import functools
 from typing import Any
 
 import jax
@@ -34,37 +35,58 @@ def boards(env_id: str, num_features: int) -> jax.Array:
     return observations.reshape(-1, *observations.shape[2:])
 
 
-@pytest.fixture(scope="module", params=[("base", 3), ("pstsy", 3), ("pstsy", 1), ("pst", 5)])
+SETS = [
+    ("base", 3),
+    ("pstsy", 3),
+    ("pst", 5),
+    pytest.param(("pstsy", 1), marks=pytest.mark.slow),
+]
+
+
+@pytest.fixture(scope="module", params=SETS)
 def observation(request: pytest.FixtureRequest) -> jax.Array:
     return jax.jit(boards, static_argnums=(0, 1))(*request.param)
 
 
-def parameters(observation: jax.Array) -> dict:
+@jax.jit
+def parameters(observation: jax.Array) -> Any:
     deviations = encoder.init(jax.random.key(0), observation[:1])
     # Biases too: what lies beyond the edge is zero only because nothing is added to it.
     deviations = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else leaf + 0.1, deviations)
     return draw(jax.random.key(3), deviations)
 
 
-@pytest.mark.parametrize("remembered_bytes", [0, 2**20])
+def features_and_gradient(function: Any) -> Any:
+    """Those of a function of (parameters, observations); the gradient of its sine's sum."""
+
+    def total(params: Any, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        features = function(params, observation)
+        return jnp.sum(jnp.sin(features)), features
+
+    return jax.jit(jax.grad(total, has_aux=True))
+
+
+plain = features_and_gradient(encoder.apply)
+
+
+def by_windows(params: Any, observation: jax.Array) -> Any:
+    return chunks.map_rows(encode_by_windows, 4, params, observation, jnp.int32(len(observation)))
+
+
+# Nothing is remembered for the derivative, or all; compiled once for all task sets.
+BY_WINDOWS = {size: features_and_gradient(functools.partial(by_windows)) for size in (0, 2**20)}
+
+
+@pytest.mark.parametrize("remembered_bytes", BY_WINDOWS)
 def test_windows_give_the_plain_features_and_gradient(observation, remembered_bytes, monkeypatch):
     monkeypatch.setattr(chunks, "REMEMBERED_BYTES", remembered_bytes)
     params = parameters(observation)
-    count = jnp.int32(len(observation))
-
-    def by_windows(params):
-        return jnp.sin(chunks.map_rows(encode_by_windows, 4, params, observation, count))
-
-    def plain(params: Any) -> Any:
-        features: Any = encoder.apply(params, observation)
-        return jnp.sin(features)
-
-    def gradient(function):
-        return jax.jit(jax.grad(lambda params: jnp.sum(function(params))))(params)
-
-    np.testing.assert_allclose(by_windows(params), plain(params), rtol=1e-5, atol=1e-5)
-    got, want = gradient(by_windows), gradient(plain)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), got, want)
+    gradient, features = BY_WINDOWS[remembered_bytes](params, observation)
+    want, expected = plain(params, observation)
+    np.testing.assert_allclose(features, expected, rtol=1e-5, atol=1e-5)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), gradient, want
+    )
     assert all(np.abs(leaf).max() > 1e-2 for leaf in jax.tree.leaves(want))
 
 
@@ -87,10 +109,13 @@ def test_convolution_and_its_derivatives_are_those_of_jax(size):
             precision="highest",
         )
 
-    got, pullback = jax.vjp(convolve, x, kernel)
-    want, reference_pullback = jax.vjp(reference, x, kernel)
+    def derived(function: Any) -> Any:
+        value, pullback = jax.vjp(function, x, kernel)
+        return value, pullback(cotangent)
+
+    (got, pulled), (want, expected) = jax.jit(lambda: (derived(convolve), derived(reference)))()
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
-    for ours, theirs in zip(pullback(cotangent), reference_pullback(cotangent), strict=True):
+    for ours, theirs in zip(pulled, expected, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
 
 

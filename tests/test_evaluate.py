@@ -1,7 +1,10 @@
 import base64
+import html
 import io
 import json
 import re
+import shutil
+import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +18,7 @@ from agents.acting import evaluation
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.config import Config
 from agents.networks.agent import Agent
+from agents.ppo.learner import Learner
 from agents.runs import report, report_page
 from trap_tube_jax import registry
 from trap_tube_jax.registry import PAPER_TASK_SETS
@@ -105,9 +109,11 @@ def test_keys_differ_within_and_between_sets_and_purposes():
     assert len(np.unique(np.concatenate(keys), axis=0)) == 64 * len(keys)
 
 
-def test_keys_of_tasks_are_never_drawn_in_training():
-    """Training with recorded keys: what a transfer gets is fixed by what `reset` gets."""
+def test_keys_of_tasks_are_never_drawn_in_training(monkeypatch):
+    """Playing with recorded keys: what a transfer gets is fixed by what `reset` gets."""
     seen = []
+    nothing_learnt = lambda learner, state, *_: (state.params, state.opt_state, {})  # noqa: E731
+    monkeypatch.setattr(Learner, "optimize", nothing_learnt)
 
     def record(key, state):
         data = jax.random.key_data(key)
@@ -140,14 +146,14 @@ def test_keys_of_tasks_are_never_drawn_in_training():
 
 def test_outcomes_are_those_of_the_recorded_actions(grey_play):
     evaluator, _, played = grey_play
-    env = tt.Environment(base=tt.base_state(1), max_steps=6)
+    step = jax.jit(tt.Environment(base=tt.base_state(1), max_steps=6).step)
     for name, tasks in evaluator.tasks.items():
         for index, solved in enumerate(played[name].solved):
             state = jax.tree.map(lambda x, index=index: x[index], tasks)
             actions = played[name].action[index, : played[name].length[index]]
             for action in actions:
                 assert not state.terminated
-                state, _ = env.step(state, jnp.asarray(action))
+                state, _ = step(state, jnp.asarray(action))
             assert state.terminated == solved
             assert state.terminated | state.truncated
 
@@ -213,28 +219,37 @@ def test_no_solved_episode_leaves_no_gif(grey_play, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_page_shows_solved_and_unsolved_episodes(grey_play, tmp_path):
+@pytest.fixture(scope="module")
+def page(grey_play, tmp_path_factory):
+    """The page of a run, and the data that its script reads."""
     evaluator, _, played = grey_play
-    Image.new("RGB", (4, 4)).save(tmp_path / "curves.png")
-    path = tmp_path / "report.html"
+    folder = tmp_path_factory.mktemp("page")
+    Image.new("RGB", (4, 4)).save(folder / "curves.png")
+    path = folder / "report.html"
     report_page.save(
         path,
         title="<mine>",
         sentences=["It does not transfer."],
         settings={"hidden": 4},
         scores={"seed 0": evaluation.scores(played, evaluator.tasks, evaluator.limits)},
-        curves=tmp_path / "curves.png",
+        curves=folder / "curves.png",
         evaluator=evaluator,
         played=played,
     )
-    text = path.read_text()
+    start, end = '<script type="application/json" id="data">', "</script>"
+    return path, json.loads(path.read_text().partition(start)[2].partition(end)[0])
+
+
+def test_a_page_needs_no_network_and_holds_the_settings(page):
+    text = page[0].read_text()
     assert "<h1>&lt;mine&gt;</h1>" in text
     assert "<td>hidden</td><td>4</td>" in text
     assert "<td>{P}</td><td>2</td>" in text
     assert not re.search(r"https?:|(src|href)=\"(?!data:)", text)
-    start, end = '<script type="application/json" id="data">', "</script>"
-    data = json.loads(text.partition(start)[2].partition(end)[0])
-    outcome = played["mine"]
+
+
+def test_a_page_shows_solved_and_unsolved_episodes(grey_play, page):
+    outcome, data = grey_play[2]["mine"], page[1]
     solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
     mine = [each for each in data["episodes"] if each["title"].startswith("mine")]
     assert [each["title"] for each in mine] == [
@@ -249,6 +264,35 @@ def test_a_page_shows_solved_and_unsolved_episodes(grey_play, tmp_path):
         for number in each["frames"]:
             with Image.open(io.BytesIO(base64.b64decode(data["pictures"][number]))) as picture:
                 assert picture.size == (192, 192)
+
+
+def test_a_page_shows_shortest_plans(page):
+    """From the same board as the episode, and with as many steps as are needed."""
+    for each in page[1]["episodes"]:
+        steps = {"base": 11, "mine": 1}.get(each["title"].partition(",")[0])
+        plan = each["plan"]
+        assert plan["frames"][0] == each["frames"][0] or plan["actions"][0] != each["actions"][0]
+        assert len(plan["frames"]) == len(plan["actions"]) + 1
+        if steps is not None:
+            assert len(plan["actions"]) == steps
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)}")
+def test_a_browser_shows_a_page(page, tmp_path):
+    """The page's script has run: it has filled in the episodes and the boards."""
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}"]
+    command = [str(BROWSER), *options, "--dump-dom", page[0].as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    for each in page[1]["episodes"]:
+        assert f">{html.escape(each['title'])}</option>" in shown
+    assert re.search(r'<img id="board" [^>]*src="data:image/png', shown)
+    assert "The agent: step 0 of " in shown
+    assert "The shortest plan: step 0 of 11; next: grasp " in shown
 
 
 def test_shortest_lengths_of_the_base_task():

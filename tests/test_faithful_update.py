@@ -26,7 +26,7 @@ def recording() -> Recording:
 @pytest.fixture(scope="module")
 def ours(recording: Recording) -> dict[str, Any]:
     train = make_train(CONFIG).learner
-    params = recording.params("param", train.init_params(jax.random.key(0)))
+    params = recording.params("param", jax.jit(train.init_params)(jax.random.key(0)))
 
     @jax.jit
     def run(params):
@@ -57,7 +57,7 @@ def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
         params = optax.apply_updates(params, step)
         return params, opt_state, clipped, {**terms, "gradient_norm": optax.tree.norm(gradient)}
 
-    params, opt_state, done = ours["params"], train.optimizer.init(ours["params"]), []
+    params, opt_state, done = ours["params"], jax.jit(train.optimizer.init)(ours["params"]), []
     for _ in range(5):
         params, opt_state, clipped, terms = update(params, opt_state)
         done.append({"params": params, "clipped": clipped, "terms": terms})

@@ -30,32 +30,41 @@ CONFIG = Config(
     iterations=ITERATIONS,
     cooldown=0.7,
 )
-Learner = Callable[[str], tuple[jax.Array, Trajectory]]
-
-
-def make_learner() -> Learner:
-    """Trains on a kind of probe; returns the rewards' scale and 32 greedy episodes."""
-
-    @jax.jit
-    def run(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajectory]:
-        env = probes.Probe(kind)
-        train = make_train(CONFIG, env)
-        init_key, reset_key = jax.random.split(key)
-        state, _ = jax.lax.scan(
-            lambda state, _: train.iterate(state), train.init(init_key), length=ITERATIONS
-        )
-        tasks, _ = jax.vmap(env.reset)(jax.random.split(reset_key, 32))
-        played = rollout(
-            train.agent, state.params, env, tasks, reset_key, choose=greedy_action, chunk=16
-        )
-        return 1 / state.extrinsic.deviation, played
-
-    return lambda kind: run(jnp.int32(probes.KINDS.index(kind)), jax.random.key(0))
+OPTIMISED = True  # they train for long
+Learner = Callable[..., tuple[jax.Array, Trajectory]]
 
 
 @pytest.fixture(scope="module")
 def learn() -> Learner:
-    return make_learner()
+    """Trains on a kind of probe; returns the rewards' scale and 32 greedy episodes."""
+    advance = Core.advance
+
+    @jax.jit
+    def run(kind: jax.Array, remembers: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajectory]:
+        def maybe_forget(core: Core, state: jax.Array, inputs: jax.Array) -> jax.Array:
+            return advance(core, jnp.where(remembers, state, 0), inputs)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Core, "advance", maybe_forget)
+            return train_and_play(kind, key)
+
+    return lambda kind, remembers=True: run(
+        jnp.int32(probes.KINDS.index(kind)), jnp.array(remembers), jax.random.key(0)
+    )
+
+
+def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajectory]:
+    env = probes.Probe(kind)
+    train = make_train(CONFIG, env)
+    init_key, reset_key = jax.random.split(key)
+    state, _ = jax.lax.scan(
+        lambda state, _: train.iterate(state), train.init(init_key), length=ITERATIONS
+    )
+    tasks, _ = jax.vmap(env.reset)(jax.random.split(reset_key, 32))
+    played = rollout(
+        train.agent, state.params, env, tasks, reset_key, choose=greedy_action, chunk=16
+    )
+    return 1 / state.extrinsic.deviation, played
 
 
 def test_value_of_a_certain_reward(learn):
@@ -77,12 +86,9 @@ def test_policy_earns_all_there_is(learn, kind):
     np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)
 
 
-def test_memory_needs_the_gru(monkeypatch):
+def test_memory_needs_the_gru(learn):
     """Without a recurrent state the same learner cannot beat a guess, in sight it can."""
-    advance = Core.advance
-    monkeypatch.setattr(
-        Core, "advance", lambda core, state, inputs: advance(core, jnp.zeros_like(state), inputs)
-    )
-    learn = make_learner()
-    assert jnp.mean(jnp.sum(learn("memory")[1].episodes.reward, axis=0)) < 0.8
-    np.testing.assert_array_equal(jnp.sum(learn("cue")[1].episodes.reward, axis=0), 1)
+    _, played = learn("memory", remembers=False)
+    assert jnp.mean(jnp.sum(played.episodes.reward, axis=0)) < 0.8
+    _, played = learn("cue", remembers=False)
+    np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)

@@ -1,5 +1,7 @@
 """The memory of solved episodes, and the loss that imitates them."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,11 +65,18 @@ def test_more_successes_than_places(empty):
     assert len(remembered(memory)) == CAPACITY
 
 
-def test_imitation_loss_is_the_weighted_log_likelihood(empty):
+@pytest.fixture(scope="module")
+def learner() -> Any:
+    """A learner, parameters, and the imitation's loss and gradient."""
     train = make_train(CONFIG).learner
-    params = train.init_params(jax.random.key(0))
+    params = jax.jit(train.init_params)(jax.random.key(0))
+    return train, params, jax.jit(jax.value_and_grad(train.imitation_loss))
+
+
+def test_imitation_loss_is_the_weighted_log_likelihood(empty, learner):
+    train, params, imitate = learner
     memory = replay.remember(empty, played([3, 1], [True, False]))
-    loss = jax.jit(lambda params: train.imitation_loss(params, memory))(params)
+    loss, _ = imitate(params, memory)
 
     boards = jax.vmap(lambda cells: tt.observe(place(tt.base_state(), cells)))(memory.cells[:, 0])
 
@@ -83,10 +92,8 @@ def test_imitation_loss_is_the_weighted_log_likelihood(empty):
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
-def test_nothing_remembered_nothing_imitated(empty):
-    train = make_train(CONFIG).learner
-    params = train.init_params(jax.random.key(0))
-    imitate = jax.jit(lambda params: train.imitation_loss(params, empty))
-    loss, gradient = imitate(params), jax.jit(jax.grad(imitate))(params)
+def test_nothing_remembered_nothing_imitated(empty, learner):
+    _, params, imitate = learner
+    loss, gradient = imitate(params, empty)
     assert loss == 0
     assert all(bool(jnp.all(leaf == 0)) for leaf in jax.tree.leaves(gradient))

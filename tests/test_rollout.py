@@ -1,5 +1,9 @@
 """Episodes of the scan against a plain loop that encodes every observation."""
 
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +11,8 @@ import pytest
 
 import trap_tube_jax as tt
 from agents import Config, make_train
+from agents.acting import encodings
+from agents.acting.episodes import Episodes
 from agents.acting.identity import first_visits, layout_ids, observation_ids, position_id, visits
 from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.networks import chunks
@@ -19,40 +25,76 @@ CONFIG = Config(
 )  # fmt: skip
 
 
+counts: list[int] = []  # distinct observations that `play` encoded, step by step
+
+
+def choose(key, actions):
+    return sample_action(key, actions).at[0].set(jnp.array([0, 3]))
+
+
 @pytest.fixture(scope="module")
-def played():
+def make_play():
+    """Compiles the scan anew, from parameters and B states to episodes; it fills `counts`."""
     env = tt.make(CONFIG.env_id, max_steps=CONFIG.max_steps)
     agent = Agent(CONFIG)
-    params = agent.init(jax.random.key(0))
+    map_rows = chunks.map_rows
+
+    def counting(fn, chunk, params, rows, count):
+        if not isinstance(rows, tuple):  # as windows are
+            jax.debug.callback(lambda count: counts.append(int(count)), count)
+        return map_rows(fn, chunk, params, rows, count)
+
+    def play(params, initial):
+        key = jax.random.key(2)
+        return rollout(agent, params, env, initial, key, choose=choose, chunk=CONFIG.chunk)
+
+    def make(params, initial):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(chunks, "map_rows", counting)
+            # A partial of its own, because JAX remembers what it traced by function.
+            return jax.jit(functools.partial(play)).lower(params, initial).compile()
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def played(make_play):
+    env = tt.make(CONFIG.env_id, max_steps=CONFIG.max_steps)
+    agent = Agent(CONFIG)
+    params = jax.jit(agent.init)(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), CONFIG.episodes)
-    initial, _ = jax.vmap(env.reset)(keys)
+    initial, _ = jax.jit(jax.vmap(env.reset))(keys)
     # One episode is solved by its first move, so that an early end is among them.
     initial = initial.replace(
         agent=initial.agent.at[0].set(jnp.array([11, 4])),
         food=initial.food.at[0].set(jnp.array([11, 5])),
         tool=initial.tool.at[0].set(jnp.array([0, 0])),
     )
+    play = make_play(params, initial)
+    return env, agent, params, initial, play, play(params, initial)
 
-    def choose(key, actions):
-        return sample_action(key, actions).at[0].set(jnp.array([0, 3]))
 
-    run = jax.jit(
-        lambda params: rollout(
-            agent, params, env, initial, jax.random.key(2), choose=choose, chunk=CONFIG.chunk
+@functools.cache
+def encoding():
+    """The plain encoding of all observations, u8[T + 1, B, 12, 12, N]."""
+    agent = Agent(CONFIG)
+    return jax.jit(
+        lambda params, episodes: jax.vmap(lambda rows: agent.encode(params, rows))(
+            episodes.observations()
         )
     )
-    return env, agent, params, initial, run(params)
 
 
 def test_episodes_follow_the_environment(played):
-    env, _, _, initial, trajectory = played
+    env, _, _, initial, _, trajectory = played
     episodes = trajectory.episodes
+    step = jax.jit(jax.vmap(env.step))
     state, done = initial, np.zeros(CONFIG.episodes, bool)
     for t in range(env.max_steps):
         np.testing.assert_array_equal(episodes.mask[t], ~done)
         for name, index in (("agent", 0), ("tool", 1), ("food", 2)):
             np.testing.assert_array_equal(episodes.cells[t, :, index], getattr(state, name))
-        state, timestep = jax.vmap(env.step)(state, episodes.action[t])
+        state, timestep = step(state, episodes.action[t])
         np.testing.assert_array_equal(episodes.reward[t], timestep.reward)
         np.testing.assert_array_equal(episodes.discount[t], timestep.discount)
         done = np.asarray(timestep.done)
@@ -63,64 +105,58 @@ def test_episodes_follow_the_environment(played):
 
 
 def test_every_observation_has_its_own_features(played):
-    _, agent, params, _, trajectory = played
-    observations = trajectory.episodes.observations()
-    plain = jax.vmap(lambda rows: agent.encode(params, rows))(observations)
+    _, _, params, _, _, trajectory = played
+    plain = encoding()(params, trajectory.episodes)
     np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("env_id", ["base", "st"])
 @pytest.mark.parametrize("bits", [0, 20])
-def test_every_observation_is_encoded_once(env_id, bits, monkeypatch):
+def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch):
     """Across episodes and times; where hashes collide it may be more often, to the same result."""
-    counts: list[int] = []
-    map_rows = chunks.map_rows
-
-    def counting(fn, chunk, params, rows, count):
-        if not isinstance(rows, tuple):  # as windows are
-            jax.debug.callback(lambda count: counts.append(int(count)), count)
-        return map_rows(fn, chunk, params, rows, count)
-
-    monkeypatch.setattr(chunks, "map_rows", counting)
-    monkeypatch.setattr("agents.acting.encodings.SLOT_BITS", bits)
-    config = Config.from_dict({**CONFIG.to_dict(), "env_id": env_id, "max_steps": 20})
-    env, agent = tt.make(env_id, max_steps=config.max_steps), Agent(config)
-    params = agent.init(jax.random.key(0))
-    layouts, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 3))
-    # Two episodes of each layout, which meet again what the other has met before.
-    initial = jax.tree.map(lambda x: jnp.concatenate([x, x]), layouts)
-    trajectory = rollout(
-        agent, params, env, initial, jax.random.key(2), choose=sample_action, chunk=config.chunk
-    )
-    jax.effects_barrier()
-    plain = jax.vmap(lambda rows: agent.encode(params, rows))(trajectory.episodes.observations())
-    np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
-    ids = observation_ids(trajectory.episodes)
-    if bits:
-        assert sum(counts) == int(ids.max()) + 1
-    else:
-        assert sum(counts) > int(ids.max()) + 1
+    _, _, params, initial, play, _ = played
+    if bits != encodings.SLOT_BITS:
+        monkeypatch.setattr(encodings, "SLOT_BITS", bits)
+        play = make_play(params, initial)
+    for env_id in ("base", "st"):
+        # Several episodes of each layout, which meet again what the others have met before.
+        keys = jnp.repeat(jax.random.split(jax.random.key(1), 3), CONFIG.episodes // 3)
+        layouts, _ = jax.jit(jax.vmap(tt.make(env_id).reset))(keys)
+        jax.effects_barrier()
+        counts.clear()
+        trajectory = play(params, layouts)
+        jax.effects_barrier()
+        plain = encoding()(params, trajectory.episodes)
+        np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
+        distinct = int(jax.jit(observation_ids)(trajectory.episodes).max()) + 1
+        assert len(counts) == len(trajectory.episodes.cells)
+        assert sum(counts) == distinct if bits else sum(counts) > distinct
 
 
 def test_network_saw_the_episodes_in_order(played):
     """Values are of all observations, the last one included."""
-    _, agent, params, _, trajectory = played
-    episodes = trajectory.episodes
-    shown = jnp.concatenate([trajectory.features, trajectory.features[-1:]])
-    action = jnp.concatenate([episodes.action, episodes.action[-1:]])
-    reward = jnp.concatenate([episodes.reward, episodes.reward[-1:]])
-    embedding = agent.unroll(params, shown, action, reward)
-    np.testing.assert_allclose(trajectory.embedding, embedding[:-1], rtol=1e-4, atol=1e-5)
-    actions, value = agent.act(params, embedding)
+    _, agent, params, _, _, trajectory = played
+
+    @jax.jit
+    def expected(params, trajectory):
+        episodes = trajectory.episodes
+        shown = jnp.concatenate([trajectory.features, trajectory.features[-1:]])
+        action = jnp.concatenate([episodes.action, episodes.action[-1:]])
+        reward = jnp.concatenate([episodes.reward, episodes.reward[-1:]])
+        embedding = agent.unroll(params, shown, action, reward)
+        actions, value = agent.act(params, embedding)
+        return embedding[:-1], value, actions.log_prob(action)[:-1]
+
+    embedding, value, log_prob = expected(params, trajectory)
+    np.testing.assert_allclose(trajectory.embedding, embedding, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(trajectory.value, value, rtol=1e-4, atol=1e-4)
-    log_prob = actions.log_prob(action)[:-1]
     np.testing.assert_allclose(trajectory.log_prob, log_prob, rtol=1e-4, atol=1e-4)
 
 
 def test_observation_ids_are_equal_for_equal_observations_alone(played):
     trajectory: Trajectory = played[-1]
-    ids = np.asarray(observation_ids(trajectory.episodes)).reshape(-1)
-    boards = np.asarray(trajectory.episodes.observations()).reshape(len(ids), -1)
+    ids = np.asarray(jax.jit(observation_ids)(trajectory.episodes)).reshape(-1)
+    boards = jax.jit(Episodes.observations)(trajectory.episodes)
+    boards = np.asarray(boards).reshape(len(ids), -1)
     _, first = np.unique(boards, axis=0, return_inverse=True)
     # Different ids may show one board: the agent over the food, say. Never the reverse.
     for identity in set(ids.tolist()):
@@ -133,19 +169,53 @@ def test_visits():
     np.testing.assert_array_equal(first_visits(ids), [[1, 1], [1, 0], [0, 0], [1, 1]])
 
 
-def acted(train, params, trajectory: Trajectory) -> Trajectory:
-    """The same episodes with the features of these parameters."""
-    boards = trajectory.episodes.observations()
-    features = jax.vmap(lambda rows: train.agent.encode(params, rows))(boards)
-    return trajectory._replace(features=features)
+class Problem(NamedTuple):
+    """A loss and its value and gradient at some parameters."""
+
+    total: Callable
+    params: dict
+    value: jax.Array
+    gradient: dict
 
 
-@pytest.mark.parametrize("curiosity", ["icm", "icm-detached", "rnd", "ride", "e3b", "none"])
-def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played, curiosity):
-    trajectory = played[-1]
+@functools.cache
+def prepared(curiosity):
+    """A learner with fresh parameters, and the batch that it makes of episodes."""
     train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity})).learner
-    state = train.init(jax.random.key(4))
-    batch, _, _ = train.prepare(state, acted(train, state.params, trajectory))
+
+    @jax.jit
+    def prepare(trajectory):
+        state = train.init(jax.random.key(4))
+        # The same episodes with the features of these parameters.
+        boards = trajectory.episodes.observations()
+        features = jax.vmap(lambda rows: train.agent.encode(state.params, rows))(boards)
+        batch, _, _ = train.prepare(state, trajectory._replace(features=features))
+        return state, batch
+
+    return train, prepare
+
+
+def problem(curiosity, trajectory) -> Problem:
+    """Traced anew each time, for `encode_episodes` may be replaced in between."""
+    train, prepare = prepared(curiosity)
+    state, batch = prepare(trajectory)
+    total = jax.jit(jax.value_and_grad(lambda p: train.loss(p, batch, state.replay)[0]))
+    return Problem(total, state.params, *total(state.params))
+
+
+@pytest.mark.parametrize(
+    "curiosity",
+    [
+        "icm",
+        "icm-detached",
+        pytest.param("rnd", marks=pytest.mark.slow),
+        pytest.param("ride", marks=pytest.mark.slow),
+        pytest.param("e3b", marks=pytest.mark.slow),
+        pytest.param("none", marks=pytest.mark.slow),
+    ],
+)
+def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played, curiosity):
+    train, _ = prepared(curiosity)
 
     def plain_encoding(encode_rows, params, episodes, observation_id, *, chunk):
         del observation_id, chunk
@@ -158,30 +228,30 @@ def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played
             [features, jax.vmap(lambda rows: train.curiosity.encode(own, rows))(rows)], axis=-1
         )
 
-    def gradient():
-        # Traced anew each time, for `encode_episodes` is replaced in between.
-        return jax.jit(jax.grad(lambda p: train.loss(p, batch, state.replay)[0]))(state.params)
-
-    fast = gradient()
+    fast = problem(curiosity, played[-1])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learner, "encode_episodes", plain_encoding)
-        plain = gradient()
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), fast, plain)
+        plain = problem(curiosity, played[-1])
+    pairs = (fast.value, fast.gradient), (plain.value, plain.gradient)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), *pairs)
+    if curiosity == "icm":
+        check_by_finite_differences(fast)
 
 
-def test_gradient_of_the_whole_loss_by_finite_differences(played):
-    """Along the gradient, with the paper's curiosity, whose losses stop no gradient."""
-    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": "icm"})).learner
-    state = train.init(jax.random.key(4))
-    params = state.params
-    batch, _, _ = train.prepare(state, acted(train, params, played[-1]))
-    total = jax.jit(lambda params: train.loss(params, batch, state.replay)[0])
-    gradient = jax.jit(jax.grad(total))(params)
-    norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+def check_by_finite_differences(loss: Problem) -> None:
+    """The gradient of the whole loss, along itself; the paper's curiosity stops no gradient."""
+    norm = float(np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(loss.gradient))))
     step = 1e-2 / norm
-    ahead = total(jax.tree.map(lambda p, g: p + step * g, params, gradient))
-    behind = total(jax.tree.map(lambda p, g: p - step * g, params, gradient))
-    np.testing.assert_allclose((ahead - behind) / (2 * step), norm**2, rtol=2e-2)
+
+    def at(sign):
+        moved = jax.tree.map(
+            lambda p, g: np.asarray(p) + np.float32(sign * step) * np.asarray(g),
+            loss.params,
+            loss.gradient,
+        )
+        return loss.total(moved)[0]
+
+    np.testing.assert_allclose((at(1) - at(-1)) / (2 * step), norm**2, rtol=2e-2)
 
 
 def test_layouts_share_an_id_only_if_equal():
@@ -207,7 +277,7 @@ def test_equal_hashes_do_not_merge_layouts(monkeypatch):
             return np.zeros(size, dtype)
 
     monkeypatch.setattr(np.random, "default_rng", lambda seed: Zeros())
-    states, _ = jax.vmap(tt.make("st").reset)(jax.random.split(jax.random.key(1), 6))
+    states, _ = jax.jit(jax.vmap(tt.make("st").reset))(jax.random.split(jax.random.key(1), 6))
     assert len(set(np.asarray(layout_ids(states)).tolist())) == 6
 
 

@@ -20,6 +20,7 @@ from trap_tube_jax.solver.survey import draw_tasks, survey
 from trap_tube_jax.transfers import swap_with_tool
 
 NUM_ROOMS = 30
+NUM_DRAWN = 16  # tasks of a set
 
 # The agent must push the food out of its cell through the exit.
 WORKSHOP = """
@@ -141,10 +142,10 @@ def test_lengths_of_the_symbolic_tasks(code, length):
 def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
     name, mean, standard_deviation
 ):
-    states = draw_tasks(tt.task_set(name), tasks=40, seed=0)
+    states = draw_tasks(tt.task_set(name), tasks=NUM_DRAWN, seed=0)
     plans = tt.solve_batch(states)
     assert plans.solvable.all()
-    assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(40)
+    assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(NUM_DRAWN)
     assert plans.length.max() <= MAX_STEPS
     assert_paid_exactly_at_the_end(states, plans)
 

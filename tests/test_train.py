@@ -43,9 +43,7 @@ def start(module, *arguments, cache, cwd=ROOT):
             **os.environ,
             "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
             "XDG_CACHE_HOME": str(cache),
-            "JAX_NUMPY_RANK_PROMOTION": "raise",
             "JAX_PLATFORMS": "cpu",
-            "XLA_FLAGS": "--xla_backend_optimization_level=0",  # compiles in half the time
         },
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -59,7 +59,11 @@ def as_numpy(tree):
 
 @pytest.mark.parametrize(
     ("task_set", "num_features", "chunk_size"),
-    [("pstsy", 3, 3), ("st", 9, 64), ("base", 1, 1)],
+    [
+        ("pstsy", 3, 3),
+        ("base", 1, 64),
+        pytest.param("st", 9, 1, marks=pytest.mark.slow),
+    ],
 )
 def test_equals_the_plain_reference_in_every_bit(task_set, num_features, chunk_size):
     env = tt.make(task_set, num_features=num_features, max_steps=MAX_STEPS)
@@ -74,7 +78,7 @@ def test_equals_the_plain_reference_in_every_bit(task_set, num_features, chunk_s
 def test_a_success_starts_over_with_its_reward_and_last_observation():
     base = tt.State.from_ascii(["AF.........T"] + ["............"] * 11)
     fast = VectorEnvironment(tt.Environment((tt.structural,), base=base))
-    state, first = fast.reset(jax.random.split(jax.random.key(0), 2))
+    state, first = jax.jit(fast.reset)(jax.random.split(jax.random.key(0), 2))
     actions = jnp.array([[0, 3], [0, 1]])  # the first steps right onto the food
     state, timestep = jax.jit(fast.step)(state, actions)
     np.testing.assert_array_equal(timestep.reward, [1, 0])

@@ -84,11 +84,10 @@ def rollout(
       choose: `sample_action` or `greedy_action`.
       chunk: distinct observations encoded at once.
     """
-    see = functools.partial(_see, agent, params, chunk)
 
     def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[_Carry, dict]:
         time, step_key = inputs
-        carry, outputs = see(carry, time)
+        carry, outputs = _see(agent, params, chunk, carry, time)
         action = choose(step_key, outputs.actions)
         before = carry.state
         state, timestep = jax.vmap(env.step)(before, action)
@@ -104,24 +103,22 @@ def rollout(
         }
         return carry._replace(state=state, action_tm1=action, reward_tm1=timestep.reward), record
 
-    times, keys = jnp.arange(env.max_steps), jax.random.split(key, env.max_steps)
+    # Once more than there are steps, for the last observation; by then no state changes any more.
+    times = jnp.arange(env.max_steps + 1)
+    keys = jax.random.split(key, len(times))
     end, record = jax.lax.scan(step, _first(agent, params, env, initial), (times, keys))
-    end, outputs = see(end, env.max_steps)
+    taken = {name: record[name][:-1] for name in ("action", "reward", "discount", "mask")}
     return Trajectory(
-        episodes=Episodes(
-            layout=initial,
-            cells=jnp.concatenate([record["cells"], cells_of(end.state)[None]]),
-            **{name: record[name] for name in ("action", "reward", "discount", "mask")},
-        ),
+        episodes=Episodes(layout=initial, cells=record["cells"], **taken),
         features=end.cache.features,
-        embedding=record["embedding"],
-        log_prob=record["log_prob"],
-        value=jnp.concatenate([record["value"], outputs.value[None]]),
+        embedding=record["embedding"][:-1],
+        log_prob=record["log_prob"][:-1],
+        value=record["value"],
     )
 
 
 def _see(
-    agent: Agent, params: Params, chunk: int, carry: _Carry, time: jax.Array | int
+    agent: Agent, params: Params, chunk: int, carry: _Carry, time: jax.Array
 ) -> tuple[_Carry, Outputs]:
     """The network's step: encodes the observation, updates the GRU, asks the heads."""
     encode = functools.partial(encode_rows, agent.encoder)

@@ -391,7 +391,7 @@ class Learner:
 
 
 class Train(NamedTuple):
-    """Training as two pure functions; jit them, and vmap them over seeds.
+    """Training as two pure functions; jit `iterate`, and vmap both over seeds.
 
     Attributes:
       init: PRNG key to the first state.
@@ -445,7 +445,7 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             )
     curiosity = curiosities.make(config, env)
     learner = Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
-    return Train(learner.init, learner.iterate, learner)
+    return Train(jax.jit(learner.init), learner.iterate, learner)
 
 
 def _encode_both(

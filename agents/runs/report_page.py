@@ -14,12 +14,15 @@ import numpy as np
 
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.runs.report import FEW_LAYOUTS, NOTHING
+from trap_tube_jax import solver
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
 from trap_tube_jax.rendering import episode_frames
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import label
+from trap_tube_jax.state import State
 
 CELL_SIZE = 16  # pixels
+NO_DIRECTION = -1
 MAX_PICTURES = 600  # of all episodes, of at most two kilobytes each
 
 PAGE = string.Template("""<!doctype html>
@@ -34,7 +37,8 @@ table { border-collapse: collapse; margin: 1rem 0 }
 th, td { padding: .2rem .7rem; text-align: right; border-bottom: 1px solid #ddd }
 th:first-child, td:first-child { text-align: left }
 img { max-width: 100% }
-#board { image-rendering: pixelated; width: 24rem }
+figure { display: inline-block; margin: 0 1rem 0 0; width: min(24rem, 100%) }
+figure img { image-rendering: pixelated; width: 100% }
 </style>
 </head>
 <body>
@@ -47,8 +51,8 @@ $scores
 <p><select id="episode" aria-label="episode"></select>
 <button id="back">Back</button> <button id="on">On</button>
 <input id="step" type="range" min="0" value="0" aria-label="step"></p>
-<p id="caption"></p>
-<img id="board" alt="the board">
+<figure><img id="board" alt="the agent's board"><figcaption id="caption"></figcaption></figure>
+<figure><img id="ideal" alt="the shortest plan's board"><figcaption id="hint"></figcaption></figure>
 <h2>Learning curves</h2>
 <p><img src="data:image/png;base64,$curves" alt="learning curves"></p>
 <h2>Settings</h2>
@@ -56,22 +60,27 @@ $settings
 <script type="application/json" id="data">$data</script>
 <script>
 const data = JSON.parse(document.getElementById("data").textContent);
-const [chosen, step, board, caption] =
-  ["episode", "step", "board", "caption"].map(id => document.getElementById(id));
+const [chosen, step, board, caption, ideal, hint] =
+  ["episode", "step", "board", "caption", "ideal", "hint"].map(id => document.getElementById(id));
+const picture = number => "data:image/png;base64," + data.pictures[number];
 data.episodes.forEach((each, index) => chosen.add(new Option(each.title, index)));
 function show() {
   const each = data.episodes[chosen.value];
   if (!each) { caption.textContent = "There are none."; return; }
-  const now = Number(step.value), last = each.frames.length - 1;
-  board.src = "data:image/png;base64," + data.pictures[each.frames[now]];
+  const last = each.frames.length - 1, now = Math.min(Number(step.value), last);
+  board.src = picture(each.frames[now]);
   const next = now < last
     ? "; next: " + each.actions[now] + "; value " + each.values[now].toFixed(3)
     : each.solved ? "; solved" : "; not solved";
-  caption.textContent = "step " + now + " of " + last + next;
+  caption.textContent = "The agent: step " + now + " of " + last + next;
+  const length = each.plan.actions.length, then = Math.min(Number(step.value), length);
+  ideal.src = picture(each.plan.frames[then]);
+  hint.textContent = !length ? "No plan solves this task." : "The shortest plan: step " + then +
+    " of " + length + (then < length ? "; next: " + each.plan.actions[then] : "; solved");
 }
 function choose() {
   const each = data.episodes[chosen.value];
-  step.max = each ? each.frames.length - 1 : 0;
+  step.max = each ? Math.max(each.actions.length, each.plan.actions.length) : 0;
   step.value = 0;
   show();
 }
@@ -87,15 +96,40 @@ choose();
 """)
 
 
+class Replay(NamedTuple):
+    """What actions do in a task.
+
+    Attributes:
+      frames: before each step and after the last, the number of a picture.
+      actions: of each step, in words.
+    """
+
+    frames: list[int]
+    actions: list[str]
+
+    @classmethod
+    def of(cls, state: State, actions: np.ndarray, pictures: dict[bytes, int]) -> "Replay":
+        """The replay of actions i32[T, 2], padded with -1; adds its pictures to `pictures`."""
+        taken = actions[(actions >= 0).all(axis=1)]
+        frames = episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]
+        return cls(
+            frames=[pictures.setdefault(frame.tobytes(), len(pictures)) for frame in frames],
+            actions=[
+                f"grasp {DIRECTION_NAMES[grasp]}, move {DIRECTION_NAMES[move]}"
+                for grasp, move in taken.tolist()
+            ],
+        )
+
+
 class Episode(NamedTuple):
     """An episode of greedy play.
 
     Attributes:
       title: what to call it.
       solved: whether it was.
-      frames: before each step and after the last, the number of a picture.
-      actions: of each step, in words.
+      frames: as in `Replay`; likewise `actions`.
       values: f32 of each step, what the network expects.
+      plan: the oracle's shortest plan; no action if there is none.
     """
 
     title: str
@@ -103,6 +137,7 @@ class Episode(NamedTuple):
     frames: list[int]
     actions: list[str]
     values: list[float]
+    plan: dict[str, Any]
 
 
 def save(
@@ -173,44 +208,43 @@ def _episodes(
 
     Sets are left out once there are too many pictures.
     """
+    shown = [
+        (name, int(found[0]))
+        for name, outcome in played.items()
+        for solved in (True, False)
+        if len(found := np.flatnonzero(np.asarray(outcome.solved) == solved))
+    ]
+    states = [jax.tree.map(lambda x, i=i: x[i], evaluator.tasks[name]) for name, i in shown]
+    plans = solver.solve_batch(jax.tree.map(lambda *x: np.stack(x), *states)).actions
     episodes: list[Episode] = []
     pictures: dict[bytes, int] = {}
-    for name, outcome in played.items():
-        for solved in (True, False):
-            found = np.flatnonzero(np.asarray(outcome.solved) == solved)
-            if not len(found) or len(pictures) > MAX_PICTURES:
-                continue
-            index = int(found[0])
-            how = "solved" if solved else "not solved"
-            title = f"{label(name)}, task {index}: {how}"
-            episodes.append(_episode(title, evaluator, name, outcome, index, pictures))
+    for (name, index), state, plan in zip(shown, states, plans, strict=True):
+        if len(pictures) <= MAX_PICTURES:
+            episodes.append(_episode(name, index, played[name], state, plan, pictures))
     return episodes, [base64.b64encode(_png(picture)).decode() for picture in pictures]
 
 
 def _episode(
-    title: str,
-    evaluator: Evaluator,
     name: str,
-    outcome: Evaluation,
     index: int,
+    outcome: Evaluation,
+    state: State,
+    plan: np.ndarray,
     pictures: dict[bytes, int],
 ) -> Episode:
-    """One episode; its pictures are added to those of the page."""
-    state = jax.tree.map(lambda x: x[index], evaluator.tasks[name])
-    length = int(outcome.length[index])
-    actions = np.array(outcome.action[index])
-    # No direction, which changes nothing: all episodes are as long, and compile as one.
-    actions[length:] = -1
-    frames = episode_frames(state, actions, CELL_SIZE)[: length + 1]
+    """One episode and the plan i32[L, 2] for its task."""
+    solved, length = bool(outcome.solved[index]), int(outcome.length[index])
+    # Without a direction nothing changes: all episodes and plans are as long, and compile as one.
+    longest = max(outcome.action.shape[1], len(plan))
+    taken, ideal = np.full((2, longest, 2), NO_DIRECTION)
+    taken[:length] = outcome.action[index, :length]
+    ideal[: len(plan)] = plan
     return Episode(
-        title=title,
-        solved=bool(outcome.solved[index]),
-        frames=[pictures.setdefault(frame.tobytes(), len(pictures)) for frame in frames],
-        actions=[
-            f"grasp {DIRECTION_NAMES[grasp]}, move {DIRECTION_NAMES[move]}"
-            for grasp, move in actions[:length].tolist()
-        ],
+        f"{label(name)}, task {index}: {'solved' if solved else 'not solved'}",
+        solved,
+        *Replay.of(state, taken, pictures),
         values=[round(float(value), 4) for value in outcome.value[index, :length]],
+        plan=Replay.of(state, ideal, pictures)._asdict(),
     )
 
 
