@@ -299,7 +299,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "bootstrap": "value",
         "value_coef": 0.5,
         "entropy_coef": 5e-3,
-        "cooldown": 0.3,
+        "cooldown": 1.0,
         "curiosity": "effects",
         "intrinsic_scale": 0.3,
         "intrinsic_start": 3.0,
