@@ -325,6 +325,7 @@ def test_command_line_shows_a_plan(tmp_path, capsys):
         assert image.format == "GIF"
 
 
+@pytest.mark.slow
 def test_command_line_draws_distances(tmp_path, capsys):
     picture = tmp_path / "distances.png"
     main(["--distances", "base", "--output", str(picture)])
