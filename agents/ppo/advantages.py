@@ -85,16 +85,9 @@ def of_streams(
     The task's reward, at most 1 an episode, is taken as it is; the curiosity's is scaled so that
     its returns deviate by `RETURN_DEVIATION`.
 
-    Args:
-      config: the settings.
-      episodes: the episodes.
-      novelty: f32[T, B], the intrinsic reward, 0 after an episode's end.
-      scale: weight of the intrinsic reward.
-      value: f32[T + 1, B, 2], of every observation: the task's and the curiosity's.
-      moments: of the extrinsic reward and of the intrinsic returns so far.
-
-    Returns:
-      Advantages f32[T, B], the values' targets f32[T, B, 2], and the new moments.
+    Arguments and results are those of `of_sum`, but for two streams, the task's and the
+    curiosity's: values f32[T + 1, B, 2], their targets f32[T, B, 2], and the second moments are
+    those of the intrinsic returns.
     """
     gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
     mask = episodes.mask
