@@ -19,10 +19,10 @@ from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
 from trap_tube_jax.rendering import episode_frames
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import label
+from trap_tube_jax.solver.search import NO_DIRECTION
 from trap_tube_jax.state import State
 
 CELL_SIZE = 16  # pixels
-NO_DIRECTION = -1
 MAX_PICTURES = 600  # of all episodes, of at most two kilobytes each
 
 PAGE = string.Template("""<!doctype html>
