@@ -21,6 +21,7 @@ from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
 from agents.runs import report, report_page
 from trap_tube_jax import registry
+from trap_tube_jax.dynamics import step
 from trap_tube_jax.registry import PAPER_TASK_SETS
 from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, wilson_interval
 from trap_tube_jax.scoring.tasks import (
@@ -235,6 +236,7 @@ def page(grey_play, tmp_path_factory):
         curves=folder / "curves.png",
         evaluator=evaluator,
         played=played,
+        pay=lambda tasks: jnp.broadcast_to(jnp.arange(50.0), (len(tasks.time), 50)),
     )
     start, end = '<script type="application/json" id="data">', "</script>"
     return path, json.loads(path.read_text().partition(start)[2].partition(end)[0])
@@ -261,6 +263,7 @@ def test_a_page_shows_solved_and_unsolved_episodes(grey_play, page):
         assert len(each["frames"]) == length + 1
         assert len(each["actions"]) == length
         np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
+        assert each["novelty"] == list(range(length))
         for number in each["frames"]:
             with Image.open(io.BytesIO(base64.b64decode(data["pictures"][number]))) as picture:
                 assert picture.size == (192, 192)
@@ -275,6 +278,27 @@ def test_a_page_shows_shortest_plans(page):
         assert len(plan["frames"]) == len(plan["actions"]) + 1
         if steps is not None:
             assert len(plan["actions"]) == steps
+
+
+def test_a_page_shows_what_the_curiosity_pays():
+    """Counts of this play alone: the same task twice, paid where an episode meets news."""
+    config = Config(**TINY, curiosity="counts", episodic_novelty=True)
+    trained = jax.jit(make_train(config).init)(jax.random.key(0))
+    evaluator = Evaluator.of_sets(config, ["base"], 1)
+    pay = report_page.compile_pay(config, trained, evaluator)
+    novelty = np.asarray(pay(trained, stack([tt.base_state()] * 2)))
+    outcome = evaluator(trained.params)["base"]
+
+    state, advance = tt.base_state(), jax.jit(step)
+    seen = [np.asarray(tt.observe(state)).tobytes()]
+    for action in outcome.action[0, : outcome.length[0]]:
+        state = advance(state, action)
+        seen.append(np.asarray(tt.observe(state)).tobytes())
+    expected = [
+        0.0 if board in seen[: time + 1] else (2 * seen[1:].count(board)) ** -0.5
+        for time, board in enumerate(seen[1:])
+    ]
+    np.testing.assert_allclose(novelty, [expected] * 2, rtol=1e-6)
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,10 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting.episodes import Episodes, place
+from agents.acting.identity import observation_ids
+from agents.parallel.sharding import ALONE
 from agents.ppo import replay
+from agents.ppo.learner import Batch
 
 STEPS, CAPACITY = 4, 3
 CONFIG = Config(
@@ -67,29 +71,39 @@ def test_more_successes_than_places(empty):
 
 @pytest.fixture(scope="module")
 def learner() -> Any:
-    """A learner, parameters, and the imitation's loss and gradient."""
+    """A learner, parameters, and the imitation's loss and gradient beside a minibatch."""
     train = make_train(CONFIG).learner
     params = jax.jit(train.init_params)(jax.random.key(0))
-    return train, params, jax.jit(jax.value_and_grad(train.imitation_loss))
+    others = played([0, 2], [False, True])
+    nothing = jnp.zeros((STEPS, 2))
+    batch = Batch(others, observation_ids(others), nothing, nothing, nothing[..., None])
+
+    def loss(params, memory):
+        imitated = replay.Imitated.of(memory, CONFIG.discount, ALONE)
+        return train.loss(params, batch, imitated)[1]["imitation_loss"]
+
+    return train, params, jax.jit(jax.value_and_grad(loss))
 
 
 def test_imitation_loss_is_the_weighted_log_likelihood(empty, learner):
     train, params, imitate = learner
     memory = replay.remember(empty, played([3, 1], [True, False]))
-    loss, _ = imitate(params, memory)
+    loss, gradient = imitate(params, memory)
 
     boards = jax.vmap(lambda cells: tt.observe(place(tt.base_state(), cells)))(memory.cells[:, 0])
 
     @jax.jit
-    def log_probs(params):
+    @jax.value_and_grad
+    def expected(params):
         agent = train.agent
         features = agent.encode(params, boards)[:, None]
         embedding = agent.unroll(params, features, memory.action[:, :1], memory.reward[:, :1])
-        return agent.act(params, embedding).actions.log_prob(memory.action[:, :1])[:, 0]
+        log_prob = agent.act(params, embedding).actions.log_prob(memory.action[:, :1])[:, 0]
+        return -2.0 * (0.5 * log_prob[0] + 1.0 * log_prob[1]) / 2
 
-    log_prob = log_probs(params)
-    expected = -2.0 * (0.5 * log_prob[0] + 1.0 * log_prob[1]) / 2
-    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+    plain_loss, plain_gradient = expected(params)
+    np.testing.assert_allclose(loss, plain_loss, rtol=1e-5)
+    chex.assert_trees_all_close(gradient, plain_gradient, rtol=1e-4, atol=1e-6)
 
 
 def test_nothing_remembered_nothing_imitated(empty, learner):

@@ -199,7 +199,7 @@ def problem(curiosity, trajectory) -> Problem:
     """Traced anew each time, for `encode_episodes` may be replaced in between."""
     train, prepare = prepared(curiosity)
     state, batch = prepare(trajectory)
-    total = jax.jit(jax.value_and_grad(lambda p: train.loss(p, batch, state.replay)[0]))
+    total = jax.jit(jax.value_and_grad(lambda p: train.loss(p, batch)[0]))
     return Problem(total, state.params, *total(state.params))
 
 

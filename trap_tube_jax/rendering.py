@@ -109,13 +109,9 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
       actions: i32[T, 2], (grasp, move) pairs; T may be 0.
       cell_size: s >= 1, pixels per cell and side.
     """
-
-    def body(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-        return step(state, action), render(state, cell_size, grasp=action[0])
-
+    _check_cell_size(cell_size)
     actions = np.asarray(actions, np.int32).reshape(-1, 2)
-    last, frames = jax.lax.scan(body, state, actions)
-    return np.concatenate([frames, render(last, cell_size)[None]])
+    return np.asarray(_episode_frames(state, actions, cell_size=int(cell_size)))
 
 
 def save_gif(
@@ -167,6 +163,15 @@ def _indexed(pictures: np.ndarray) -> list[Any]:
         image.putpalette(palette.astype(np.uint8).tobytes())
         images.append(image)
     return images
+
+
+@functools.partial(jax.jit, static_argnames="cell_size")
+def _episode_frames(state: State, actions: jax.Array, *, cell_size: int) -> jax.Array:
+    def body(state: State, action: jax.Array) -> tuple[State, jax.Array]:
+        return step(state, action), render(state, cell_size, grasp=action[0])
+
+    last, frames = jax.lax.scan(body, state, actions)
+    return jnp.concatenate([frames, render(last, cell_size)[None]])
 
 
 @functools.partial(jax.jit, static_argnames=("cell_size", "grid"))

@@ -70,6 +70,11 @@ def take(record: Record, places: jax.Array) -> Record:
     return along_episodes(lambda axis, x: x[places] if axis == 0 else x[:, places], record)
 
 
+def beside(*records: Record) -> Record:
+    """The episodes of several records of the same structure as one; see `along_episodes`."""
+    return along_episodes(lambda axis, *x: jnp.concatenate(x, axis), *records)
+
+
 def place(layout: State, cells: jax.Array) -> State:
     """The state with agent, tool and food at `cells` u8[3, 2]."""
     agent, tool, food = cells.astype(jnp.int32)

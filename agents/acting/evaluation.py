@@ -9,7 +9,7 @@ import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.frames import Frame
-from agents.acting.rollout import greedy_action, rollout
+from agents.acting.rollout import Trajectory, greedy_action, rollout
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from agents.parallel.sharding import ALONE, DEFAULT_DEVICE, Placement, Shards
@@ -59,18 +59,27 @@ def evaluate(
     num_tasks = tasks.time.shape[0]
     if shards.count > 1:
         tasks = _rows(tasks, shards.places(num_tasks)[0])
-    chunk = min(chunk, tasks.time.shape[0])
-    frame = jax.vmap(Frame.facing_food if agent.facing else Frame.of_board)(
-        jax.vmap(tt.observe)(tasks)
-    )
-    seen = jax.vmap(Frame.state)(frame, tasks)
-    unused_key = jax.random.key(0)
-    played = rollout(agent, params, env, seen, unused_key, choose=greedy_action, chunk=chunk)
+    frame, played = play_greedily(agent, params, env, tasks, chunk)
     episodes = played.episodes
     action = jax.vmap(Frame.original_action)(frame, episodes.action.swapaxes(0, 1))
     value = played.value[:-1, :, 0].swapaxes(0, 1)
     outcome = Evaluation(episodes.solved, episodes.length, action, value)
     return outcome if shards.count == 1 else _rows(shards.whole(outcome), slice(num_tasks))
+
+
+def play_greedily(
+    agent: Agent, params: Params, env: Environment, tasks: State, chunk: int
+) -> tuple[Frame, Trajectory]:
+    """The frame in which the agent sees each task, and the episodes in these frames.
+
+    Arguments are those of `evaluate`.
+    """
+    frame = jax.vmap(Frame.facing_food if agent.facing else Frame.of_board)(
+        jax.vmap(tt.observe)(tasks)
+    )
+    seen = jax.vmap(Frame.state)(frame, tasks)
+    chunk, unused_key = min(chunk, len(tasks.time)), jax.random.key(0)
+    return frame, rollout(agent, params, env, seen, unused_key, choose=greedy_action, chunk=chunk)
 
 
 class Evaluator:

@@ -30,7 +30,8 @@ class Failures(NamedTuple):
 
     @staticmethod
     def untried(key: jax.Array, lists: int, capacity: int) -> "Failures":
-        """Lists of tasks that nobody has tried yet."""
+        """Lists of tasks that nobody has tried yet; one list, unused, in place of none."""
+        lists = max(lists, 1)  # checkpoints hold no empty arrays
         keys = jax.random.key_data(jax.random.split(key, (lists, capacity)))
         return Failures(keys, jnp.zeros(lists, jnp.int32))
 

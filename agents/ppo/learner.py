@@ -17,7 +17,7 @@ import optax
 
 from agents import curiosity as curiosities
 from agents.acting.encodings import encode_episodes
-from agents.acting.episodes import Episodes, along_episodes, take
+from agents.acting.episodes import Episodes, along_episodes, beside, take
 from agents.acting.frames import Frame
 from agents.acting.identity import first_visits, observation_ids
 from agents.acting.rollout import Trajectory, rollout, sample_action
@@ -119,10 +119,7 @@ class Learner:
             memory=self.curiosity.memory(),
             replay=replay.empty(self.env.base, self.config.imitation_episodes, self.env.max_steps),
             failures=Failures.untried(
-                # One list where nothing is replayed: a checkpoint holds no empty arrays.
-                failures_key,
-                max(1, len(self.config.replayed)),
-                self.config.failures,
+                failures_key, len(self.config.replayed), self.config.failures
             ),
             key=key,
             iteration=zero,
@@ -199,17 +196,13 @@ class Learner:
         novelty, memory = self.intrinsic_reward(state, trajectory)
         episodes = self._whole(trajectory.episodes)
         log_prob, value = self.shards.whole((trajectory.log_prob, trajectory.value), axis=1)
-        observation_id = observation_ids(episodes)
-        novelty = novelty * episodes.mask
-        if config.episodic_novelty:
-            novelty = novelty * first_visits(observation_id)[1:]
         join = advantages.of_sum if config.rewards == "summed" else advantages.of_streams
         moments = (state.extrinsic, state.intrinsic)
         scale = advantages.intrinsic_scale(config)(state.iteration)
         advantage, target, moments = join(config, episodes, novelty, scale, value, moments)
         batch = Batch(
             episodes=episodes,
-            observation_id=observation_id,
+            observation_id=observation_ids(episodes),
             log_prob=log_prob,
             advantage=returns.normalize(advantage, episodes.mask),
             value_target=target,
@@ -218,7 +211,7 @@ class Learner:
             "success": jnp.mean(episodes.solved[: config.num_new].astype(jnp.float32)),
             "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
             "intrinsic_reward": jnp.sum(novelty) / jnp.sum(episodes.mask),
-            "distinct_observations": jnp.max(observation_id) + 1,
+            "distinct_observations": jnp.max(batch.observation_id) + 1,
         }
         if config.num_replayed:
             solved = episodes.solved[config.num_new :]
@@ -234,7 +227,10 @@ class Learner:
         return batch, state, metrics
 
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
-        """The curiosity's reward f32[T, B] of all devices' episodes, and its new memory."""
+        """The intrinsic reward f32[T, B] of all devices' episodes, and the curiosity's new memory.
+
+        It is 0 after an episode's end, and with `episodic_novelty` where an observation returns.
+        """
         experience = self.acting_experience(state.params, trajectory)
         if self.curiosity.needs_all_episodes:
             experience = self._whole(experience)
@@ -243,6 +239,9 @@ class Learner:
             experience = experience._replace(observation_id=everyones)
         own = state.params.get("curiosity", {})
         reward, memory = self.curiosity.reward(own, state.memory, experience)
+        reward = reward * experience.episodes.mask
+        if self.config.episodic_novelty:
+            reward = reward * first_visits(experience.observation_id)[1:]
         if not self.curiosity.needs_all_episodes:
             reward = self.shards.whole(reward, axis=1)
         return reward, memory
@@ -276,13 +275,15 @@ class Learner:
 
         Every device differentiates its part of each minibatch; the mean is everyone's gradient.
         """
-        config = self.config
+        config, imitated = self.config, None
+        if config.imitation_coef:
+            imitated = replay.Imitated.of(state.replay, config.discount, self.shards)
 
         def update(carry: tuple[Params, Any], places: jax.Array) -> tuple[Any, Metrics]:
             params, opt_state = carry
             own = take(batch, self.shards.part(places))
             gradient, metrics = self.shards.mean(
-                jax.grad(self.loss, has_aux=True)(params, own, state.replay)
+                jax.grad(self.loss, has_aux=True)(params, own, imitated)
             )
             updates, opt_state = self.optimizer.update(gradient, opt_state, params)
             metrics["gradient_norm"] = optax.tree.norm(gradient)
@@ -299,21 +300,25 @@ class Learner:
         )
         return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
-    def loss(self, params: Params, batch: Batch, solved: Episodes) -> tuple[jax.Array, Metrics]:
+    def loss(
+        self, params: Params, batch: Batch, imitated: replay.Imitated | None = None
+    ) -> tuple[jax.Array, Metrics]:
         """The total loss f32[] and its terms, weighted as they enter it; means over devices.
 
-          L = policy + value - entropy + curiosity_coef * curiosity's losses + imitation
+          L = policy + value - entropy + curiosity_coef * curiosity's losses
+              - imitation_coef * sum_t G_t log pi(a_t | o_t) / steps, of remembered successes
 
         Beside the terms: the sums of the entropy over `steps`, and of those.
 
         Args:
           params: the parameters to differentiate by.
           batch: this device's part of a minibatch.
-          solved: the episodes to imitate, of all devices.
+          imitated: its part of the episodes to imitate, if any are.
         """
         config, mask = self.config, batch.episodes.mask
-        embedding, experience = self.learning_experience(params, batch)
-        actions, value = self.agent.act(params, embedding)
+        embedding, experience = self.learning_experience(params, batch, imitated)
+        played, remembered = jnp.split(embedding, [mask.shape[1]], axis=1)
+        actions, value = self.agent.act(params, played)
         log_prob = actions.log_prob(batch.episodes.action)
         surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
         value_error = jnp.sum(losses.squared_error(value, batch.value_target), axis=-1)
@@ -326,56 +331,42 @@ class Learner:
         own = self.curiosity.losses(params.get("curiosity", {}), experience)
         for name, term in own.items():
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
-        if config.imitation_coef:
-            terms["imitation_loss"] = self.imitation_loss(params, solved)
+        if imitated is not None:
+            log_prob = self.agent.act(params, remembered).actions.log_prob(imitated.episodes.action)
+            terms["imitation_loss"] = config.imitation_coef * imitated.loss(log_prob)
         total = sum(terms.values(), jnp.zeros(()))
         sums = {"entropy": jnp.sum(entropy * mask), "steps": jnp.sum(mask)}
         return total, {**terms, "loss": total, **sums}
 
-    def learning_experience(self, params: Params, batch: Batch) -> tuple[jax.Array, Experience]:
-        """The GRU's outputs f32[T, B, hidden] on a batch, and what the curiosity sees of it."""
-        episodes, observation_id = batch.episodes, batch.observation_id
+    def learning_experience(
+        self, params: Params, batch: Batch, imitated: replay.Imitated | None
+    ) -> tuple[jax.Array, Experience]:
+        """What the network makes of a minibatch, and of the episodes to imitate beside it.
+
+        Returns:
+          The GRU's outputs f32[T, B + K, hidden], and what the curiosity sees of the minibatch.
+        """
+        both, observation_id = batch.episodes, batch.observation_id
+        if imitated is not None:
+            # In one pass, because each costs its own compilation.
+            both = beside(both, imitated.episodes)
+            other_id = jnp.max(observation_id) + 1 + imitated.observation_id
+            observation_id = jnp.concatenate([observation_id, other_id], axis=1)
         read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
         encode = functools.partial(_encode_both, self.agent, self.curiosity)
-        features = encode_episodes(encode, read, episodes, observation_id, chunk=self.config.chunk)
-        width = features.shape[-1] - self._curiosity_width
-        features, own = features[..., :width], features[..., width:]
-        experience = Experience(episodes, observation_id, own)
-        given = (params, features, episodes.action, episodes.reward)
+        features = encode_episodes(encode, read, both, observation_id, chunk=self.config.chunk)
+        width, size = features.shape[-1] - self._curiosity_width, batch.log_prob.shape[1]
+        features, own = features[..., :width], features[:, :size, width:]
+        experience = Experience(batch.episodes, batch.observation_id, own)
+        given = (params, features, both.action, both.reward)
         if not self.curiosity.needs_embeddings:
             return self.agent.unroll(*given), experience
         embedding, after = self.agent.unroll_both(*given)
         return embedding, experience._replace(
-            embedding=embedding,
-            next_embedding=after,
-            action_embedding=self.agent.embed_action(params, episodes.action),
+            embedding=embedding[:, :size],
+            next_embedding=after[:, :size],
+            action_embedding=self.agent.embed_action(params, batch.episodes.action),
         )
-
-    def imitation_loss(self, params: Params, solved: Episodes) -> jax.Array:
-        """Minus the log-likelihood of remembered successes, each step weighted by its return.
-
-          imitation_coef * mean over steps of -G_t log pi(a_t | o_t)
-
-        Returns:
-          f32[], this device's share, of which the mean over devices is the loss; 0 while
-          nothing is remembered.
-        """
-        config, shards = self.config, self.shards
-        steps = jnp.maximum(jnp.sum(solved.mask), 1.0) / shards.count
-        if shards.count > 1:
-            places, is_own = shards.places(solved.mask.shape[1])
-            solved = take(solved, places)
-            solved = solved._replace(mask=solved.mask * is_own[None])
-        encode = functools.partial(encode_rows, self.agent.encoder)
-        features = encode_episodes(
-            encode, params["encoder"], solved, observation_ids(solved), chunk=config.chunk
-        )
-        embedding = self.agent.unroll(params, features, solved.action, solved.reward)
-        log_prob = self.agent.act(params, embedding).actions.log_prob(solved.action)
-        weight = (
-            advantages.discounted_returns(solved.reward, jnp.float32(config.discount)) * solved.mask
-        )
-        return -config.imitation_coef * jnp.sum(weight * log_prob) / steps
 
     @functools.cached_property
     def _curiosity_width(self) -> int:

@@ -5,14 +5,17 @@ import html
 import io
 import json
 import string
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from agents.acting.evaluation import Evaluation, Evaluator
+import trap_tube_jax as tt
+from agents.acting.evaluation import Evaluation, Evaluator, play_greedily
+from agents.config import Config
+from agents.ppo.learner import TrainState, make_train
 from agents.runs.report import FEW_LAYOUTS, NOTHING
 from trap_tube_jax import solver
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
@@ -24,6 +27,11 @@ from trap_tube_jax.state import State
 
 CELL_SIZE = 16  # pixels
 MAX_PICTURES = 600  # of all episodes, of at most two kilobytes each
+
+EPISODES_OF_A_SET = 2  # the first solved one and the first unsolved one
+
+# From the state of training and M tasks to the intrinsic reward f32[M, T] of its greedy play.
+Pay = Callable[[TrainState, State], jax.Array]
 
 PAGE = string.Template("""<!doctype html>
 <html lang="en">
@@ -70,7 +78,8 @@ function show() {
   const last = each.frames.length - 1, now = Math.min(Number(step.value), last);
   board.src = picture(each.frames[now]);
   const next = now < last
-    ? "; next: " + each.actions[now] + "; value " + each.values[now].toFixed(3)
+    ? "; next: " + each.actions[now] + "; value " + each.values[now].toFixed(3) +
+      ", intrinsic reward " + each.novelty[now].toFixed(3)
     : each.solved ? "; solved" : "; not solved";
   caption.textContent = "The agent: step " + now + " of " + last + next;
   const length = each.plan.actions.length, then = Math.min(Number(step.value), length);
@@ -129,6 +138,7 @@ class Episode(NamedTuple):
       solved: whether it was.
       frames: as in `Replay`; likewise `actions`.
       values: f32 of each step, what the network expects.
+      novelty: f32 of each step, the intrinsic reward before scaling.
       plan: the oracle's shortest plan; no action if there is none.
     """
 
@@ -137,6 +147,7 @@ class Episode(NamedTuple):
     frames: list[int]
     actions: list[str]
     values: list[float]
+    novelty: list[float]
     plan: dict[str, Any]
 
 
@@ -150,6 +161,7 @@ def save(
     curves: Path,
     evaluator: Evaluator,
     played: Mapping[str, Evaluation],
+    pay: Callable[[State], jax.Array],
 ) -> None:
     """Writes the page.
 
@@ -162,8 +174,9 @@ def save(
       curves: the PNG of the learning curves.
       evaluator: what played.
       played: what it returned of one policy, whose episodes are shown.
+      pay: from tasks to the intrinsic reward of this policy's play; see `compile_pay`.
     """
-    episodes, pictures = _episodes(evaluator, played)
+    episodes, pictures = _episodes(evaluator, played, pay)
     data = json.dumps({"episodes": [each._asdict() for each in episodes], "pictures": pictures})
     page = PAGE.substitute(
         title=html.escape(title),
@@ -201,8 +214,29 @@ def _table(heads: Sequence[Any], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(["<table>", line(heads, "th"), *(line(row, "td") for row in rows), "</table>"])
 
 
+def compile_pay(config: Config, state: TrainState, evaluator: Evaluator) -> Pay:
+    """What the curiosity pays for greedy play of tasks, were it to be played next.
+
+    Args:
+      config: the settings.
+      state: the state of training of one seed, or its shapes.
+      evaluator: that of the page, for the number of tasks and the step limit.
+    """
+    learner = make_train(config).learner
+    longest = max(evaluator.limits.values())
+    env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
+
+    def paid(state: TrainState, tasks: State) -> jax.Array:
+        _, trajectory = play_greedily(learner.agent, state.params, env, tasks, config.chunk)
+        return learner.intrinsic_reward(state, trajectory)[0].swapaxes(0, 1)
+
+    shown = EPISODES_OF_A_SET * len(evaluator.tasks)
+    tasks = jax.tree.map(lambda x: jax.ShapeDtypeStruct((shown, *x.shape), x.dtype), env.base)
+    return jax.jit(paid).lower(state, tasks).compile()
+
+
 def _episodes(
-    evaluator: Evaluator, played: Mapping[str, Evaluation]
+    evaluator: Evaluator, played: Mapping[str, Evaluation], pay: Callable[[State], jax.Array]
 ) -> tuple[list[Episode], list[str]]:
     """The first solved and the first unsolved episode of each set, and their pictures as PNG.
 
@@ -216,11 +250,14 @@ def _episodes(
     ]
     states = [jax.tree.map(lambda x, i=i: x[i], evaluator.tasks[name]) for name, i in shown]
     plans = solver.solve_batch(jax.tree.map(lambda *x: np.stack(x), *states)).actions
+    # Always as many, so that what plays them is compiled in time.
+    unused = [states[0]] * (EPISODES_OF_A_SET * len(evaluator.tasks) - len(states))
+    novelty = np.asarray(pay(jax.tree.map(lambda *x: np.stack(x), *states, *unused)))
     episodes: list[Episode] = []
     pictures: dict[bytes, int] = {}
-    for (name, index), state, plan in zip(shown, states, plans, strict=True):
+    for (name, index), state, plan, paid in zip(shown, states, plans, novelty, strict=False):
         if len(pictures) <= MAX_PICTURES:
-            episodes.append(_episode(name, index, played[name], state, plan, pictures))
+            episodes.append(_episode(name, index, played[name], state, plan, paid, pictures))
     return episodes, [base64.b64encode(_png(picture)).decode() for picture in pictures]
 
 
@@ -230,9 +267,10 @@ def _episode(
     outcome: Evaluation,
     state: State,
     plan: np.ndarray,
+    novelty: np.ndarray,
     pictures: dict[bytes, int],
 ) -> Episode:
-    """One episode and the plan i32[L, 2] for its task."""
+    """One episode, the plan i32[L, 2] for its task, and the intrinsic reward f32[T] it earned."""
     solved, length = bool(outcome.solved[index]), int(outcome.length[index])
     # Without a direction nothing changes: all episodes and plans are as long, and compile as one.
     longest = max(outcome.action.shape[1], len(plan))
@@ -244,6 +282,7 @@ def _episode(
         solved,
         *Replay.of(state, taken, pictures),
         values=[round(float(value), 4) for value in outcome.value[index, :length]],
+        novelty=[round(float(reward), 4) for reward in novelty[:length]],
         plan=Replay.of(state, ideal, pictures)._asdict(),
     )
 

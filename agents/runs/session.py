@@ -1,6 +1,7 @@
 """A run from its start or newest checkpoint to its results: training, saving, reporting."""
 
 import dataclasses
+import functools
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +30,7 @@ from agents.runs.story import Story
 from agents.runs.tracking import Tracker
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
+from trap_tube_jax.state import State
 
 POLL_SECONDS = 0.005
 
@@ -66,7 +68,7 @@ class Session:
         """
         self.folder, self.run, self.console = folder, run, console
         self._every, self._tracker, self._placement = checkpoint_every, tracker, placement
-        self._results: futures.Future[Evaluator] | None = None
+        self._results: futures.Future[tuple[Evaluator, report_page.Pay]] | None = None
         self._introduce()
         self._train = make_train(run.config, shards=placement.episodes)
         # Files are the first process's alone.
@@ -122,7 +124,8 @@ class Session:
         """Evaluates on all task sets, writes the results and says what they show."""
         run, folder = self.run, self.folder
         self.console.print("Evaluating on all task sets ...")
-        evaluator = self._make_evaluator() if self._results is None else self._results.result()
+        evaluator, pay = self._ready() if self._results is None else self._results.result()
+        state = jax.tree.map(lambda x: x[0], self._placement.local(self._state))
         policies = self._policies()
         played = {policy.name: evaluator(policy.params) for policy in policies}
         self.summarize()
@@ -138,7 +141,7 @@ class Session:
         report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
         solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
         story = Story.of(folder, run, results.values(), list(solved.values()))
-        self._save_page(story, evaluator, played, results)
+        self._save_page(story, evaluator, played, results, functools.partial(pay, state))
         self._say(story.before)
         for name, result in results.items():
             self.console.print(report.evaluation_table(result, f"{folder.path.name}, {name}"))
@@ -152,6 +155,7 @@ class Session:
         evaluator: Evaluator,
         played: Mapping[str, Mapping[str, Evaluation]],
         results: Mapping[str, Sequence[Score]],
+        pay: Callable[[State], jax.Array],
     ) -> None:
         """Writes the page, with episodes of the first seed."""
         if not self.folder.curves.exists():
@@ -165,6 +169,7 @@ class Session:
             curves=self.folder.curves,
             evaluator=evaluator,
             played=next(iter(played.values())),
+            pay=pay,
         )
 
     def summarize(self) -> None:
@@ -216,23 +221,19 @@ class Session:
         """Compiles in the background what `finish` needs, unless there are several devices."""
         if self._placement.mesh is not None:
             return
-        params = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._state.params
-        )
-
-        def compiled() -> Evaluator:
-            evaluator = self._make_evaluator()
-            evaluator.compile(params)
-            return evaluator
-
         worker = futures.ThreadPoolExecutor(1)
-        self._results = worker.submit(compiled)
+        self._results = worker.submit(self._ready)
         worker.shutdown(wait=False)
 
-    def _make_evaluator(self) -> Evaluator:
+    def _ready(self) -> tuple[Evaluator, report_page.Pay]:
+        """What plays the tasks of all sets, and what the curiosity pays for it, compiled."""
         config = self.run.config
         sets = own_and_paper_sets(config)
-        return Evaluator.of_sets(config, sets, config.eval_episodes, self._placement)
+        evaluator = Evaluator.of_sets(config, sets, config.eval_episodes, self._placement)
+        state = jax.eval_shape(self._train.init, jax.random.key(0))
+        if self._placement.mesh is None:
+            evaluator.compile(state.params)
+        return evaluator, report_page.compile_pay(config, state, evaluator)
 
     def _iterate(self, advance: Advance) -> list[Row]:
         config, progress = self.run.config, self._progress
