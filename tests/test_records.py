@@ -1,0 +1,241 @@
+"""Records of experiments: how they are kept, summed up, drawn."""
+
+import dataclasses
+import re
+import subprocess
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from agents.experiments import figures, records, statistics, tables, training
+from agents.experiments.protocol import PROTOCOLS, Protocol
+from agents.runs import machine
+from agents.runs.folder import Run, RunFolder
+from benchmarks import readme_tables
+
+
+def rows(seed, greedy, iterations=None):
+    return [
+        {
+            "seed": seed,
+            "iteration": index + 1,
+            "episodes": 1024 * (index + 1),
+            "transitions": 1000 * (index + 1),
+            "evaluation": greedy[index],
+            "success": greedy[index] / 2,
+            "greedy_p": float("nan") if index % 2 else greedy[index],
+            "greedy_overall": float("nan") if index % 2 else greedy[index],
+            "seconds": 2.0 * (index + 1),
+        }
+        for index in range(len(greedy) if iterations is None else iterations)
+    ]
+
+
+MACHINE = {
+    "processor": "any",
+    "cores": 2,
+    "device": "cpu",
+    "devices": 1,
+    "jax": "0",
+    "commit": "abc",
+}
+
+
+def example_record(tmp_path, greedy, iterations):
+    """Runs with these evaluations; in test tasks they take 10 * seed, 20 and 0 steps."""
+    entries = []
+    for seed, values in enumerate(greedy):
+        config = Protocol(iterations=iterations).config("ppo+icm")
+        made = Run(config, seed=seed)
+        folder = RunFolder.create(tmp_path / f"ppo+icm-seed{seed}", made)
+        entries.append(training.AlgorithmRun("ppo+icm", folder, made, rows(seed, values)))
+    machines = [MACHINE]
+    runs = [
+        records.seed_record(
+            entry,
+            entry.run.seed,
+            machines=machines,
+            evaluate_every=1,
+            steps={"base": [11], "p": [10 * entry.run.seed, 20, 0]},
+        )
+        for entry in entries
+    ]
+    config = entries[0].run.config.to_dict()
+    about = {"max_steps": 50, "equal_to_base": 25.0, "layout": None, "shortest": [5, 10, -1]}
+    return {
+        "schema": records.SCHEMA,
+        "experiment": "exp2",
+        "command": "x",
+        "protocol": dataclasses.asdict(Protocol(train_set="pstsy", iterations=iterations)),
+        "ranked": ["p"],
+        "machines": machines,
+        "sets": {"base": {**about, "layout": [0], "shortest": [11]}, "p": about},
+        "algorithms": [{"name": "ppo+icm", "config": config, "runs": runs}],
+    }
+
+
+@pytest.fixture
+def example(tmp_path):
+    return example_record(tmp_path, [[0, 0, 0], [0, 1, 0], [0, 0, 0, 1]], iterations=4)
+
+
+def test_tables_hold_means_deviations_and_intervals(example):
+    (entry,) = example["algorithms"]
+    # 2,048 and 4,096 episodes; solved 1, 2 and 2 of 3 tasks, of which one is unsolvable.
+    episodes = statistics.Spread.of(statistics.episodes_to_solve(entry))
+    assert episodes == pytest.approx((3072, 1448.15, 12.7062 * 1024), abs=0.1)
+    p = statistics.by_set(example, entry)["p"]
+    half_width = 4.3027 * 19.245 / 3**0.5
+    assert p.percent == pytest.approx((500 / 9, 19.245, half_width), abs=1e-3)
+    assert p.percent_of_solvable == pytest.approx((250 / 3, 28.868, 71.712), abs=1e-3)
+    assert p.optimality is not None
+    assert p.optimality.mean == pytest.approx((0.5 + 0.5 + 0.375) / 3)
+    assert p.worst == 0.25
+    text = tables.markdown(example)
+    assert "| {P} | 55.6 ± 19.2 [7.7, 100.0] | 0.0 | 2.0 ± 3.0 |" in text
+    assert "| mean of the sets apart from base | 55.6 ± 19.2 [7.7, 100.0] | – | – |" in text
+    assert "| base | 1.0 of 1 |" in text
+    assert "| {P} | 3 | 83.3 ± 28.9 [11.6, 100.0] | 0.458 ± 0.072 [0.279, 0.638] | 0.250 |" in text
+    assert "Unfinished: ppo+icm, seed 0, 3 of 4 iterations." in text
+    assert "Unfinished: ppo+icm, seed 1, 3 of 4 iterations." in text
+    assert "seed 2" not in text
+    example["experiment"] = "exp1"
+    row = ("PPO + ICM", "2 / 3", "3,072 ± 1,448 [0, 16,083]")
+    assert tables.solved_table(example).rows[0] == row
+    assert tables.percent_table(example).rows[1] == ("{P}", "55.6 ± 19.2 [7.7, 100.0]", "25.0")
+    assert tables.cost_table(example).rows == (("PPO + ICM", "3", "3–4", "3,333", "0:07"),)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 9, 30, 31, 100])
+def test_student_t(degrees):
+    assert statistics.student_t(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), abs=6e-5)
+
+
+def test_one_seed_has_neither_deviation_nor_interval():
+    assert statistics.Spread.of([3.0, None]) == (3.0, None, None)
+    assert statistics.Spread.of([None]) is None
+    with pytest.raises(ValueError, match="degrees must be >= 1, got 0"):
+        statistics.student_t(0)
+
+
+def test_records_come_back_as_they_were_written(example, tmp_path):
+    path = tmp_path / "new" / "x.json"
+    records.write_record(path, example)
+    assert tables.markdown(records.read_record(path)) == tables.markdown(example)
+    assert figures.digest(records.read_record(path)) == figures.digest(example)
+    assert '"shortest": [5, 10, -1]' in path.read_text()
+    records.write_record(path, {**example, "schema": "trap-tube-jax experiment 0"})
+    with pytest.raises(ValueError, match="schema 'trap-tube-jax experiment 0'; allowed: 'trap-"):
+        records.read_record(path)
+    path.write_text("[]")
+    with pytest.raises(ValueError, match="is no record of an experiment"):
+        records.read_record(path)
+
+
+def test_records_are_of_committed_code(example, monkeypatch):
+    def check(commit, own, given=None):
+        monkeypatch.setattr(records, "machine", lambda: {"commit": own})
+        records.check_clean({**example, "machines": [{**MACHINE, "commit": commit}]}, given)
+
+    check("abc", "def")
+    check("abc", None, given="def")
+    for commit, own in (("abc-dirty", "def"), ("abc", "def-dirty")):
+        with pytest.raises(ValueError, match=r"committed code, this one of .*-dirty; commit the"):
+            check(commit, own)
+    for commit, own in ((None, "def"), ("abc", None)):
+        with pytest.raises(ValueError, match="which git does not tell; give --commit"):
+            check(commit, own)
+
+
+def test_curves_are_thinned_at_the_same_points_for_all_seeds():
+    long, short = (rows(0, [0.5] * n) for n in (1000, 333))
+    for row in (*long, *short):
+        row["greedy_p"] = row["greedy_overall"] = 0.123456 if row["iteration"] % 3 == 0 else np.nan
+    found = [records.curves(each, 1000, 3) for each in (long, short)]
+    assert found[0]["training"]["iteration"] == list(range(5, 1001, 5))
+    assert found[1]["training"]["iteration"] == [*range(5, 333, 5), 333]
+    assert found[0]["greedy"]["iteration"] == [*range(6, 1000, 6), 999]
+    assert found[0]["greedy"]["greedy_p"][0] == 0.1235
+    back = records.rows_of({"seed": 7, "curves": found[0]})
+    assert len(back) == len(found[0]["training"]["iteration"]) + len(
+        found[0]["greedy"]["iteration"]
+    )
+    assert {row["seed"] for row in back} == {7}
+
+
+def test_a_commit_is_dirty_where_code_changed(tmp_path, monkeypatch):
+    def git(*arguments):
+        given = ["git", "-c", "user.name=x", "-c", "user.email=x@x", *arguments]
+        subprocess.run(given, cwd=tmp_path, check=True, capture_output=True)
+
+    (tmp_path / "agents").mkdir()
+    (tmp_path / "agents" / "a.py").write_text("1\n")
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "x")
+    monkeypatch.setattr(machine, "ROOT", tmp_path)
+    clean = machine.machine()["commit"]
+    assert re.fullmatch(r"[0-9a-f]{12}", clean)
+    (tmp_path / "record.json").write_text("{}")
+    assert machine.machine()["commit"] == clean
+    (tmp_path / "agents" / "a.py").write_text("2\n")
+    assert machine.machine()["commit"] == f"{clean}-dirty"
+
+
+def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
+    some = [*rows(0, [0.0, 0.5, 1.0]), *rows(1, [0.25])]
+    episodes, values = figures.by_iteration(some, "greedy_p")
+    assert episodes.tolist() == [1024, 3072]
+    np.testing.assert_array_equal(values, [[0, 1], [0.25, np.nan]])
+    for experiment in PROTOCOLS:
+        example["experiment"] = experiment
+        figures.save(example, tmp_path / "x.png")
+        assert figures.drawn_from(tmp_path / "x.png") == figures.digest(example)
+    assert figures.drawn_from(tmp_path / "none.png") is None
+
+
+def test_pages_and_figures_are_those_of_the_records():
+    found = readme_tables.read_records(readme_tables.Arguments().results)
+    assert not readme_tables.stale(readme_tables.ROOT, found)
+    page = readme_tables.Arguments().results / "fast_preset.md"
+    assert readme_tables.BLOCK.search(page.read_text())
+
+
+def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
+    folder = tmp_path / "benchmarks" / "results"
+    records.write_record(folder / "mine.json", example)
+    (folder / "other.json").write_text("{}")
+    block = "a\n<!-- table: {} -->\nold\n<!-- end -->\nb\n"
+    (tmp_path / "README.md").write_text(block.format("mine"))
+    (folder / "page.md").write_text(block.format("mine"))
+    (folder / "absent.md").write_text(block.format("absent"))
+    check, write = (readme_tables.Arguments(root=tmp_path, write=write) for write in (False, True))
+    with pytest.raises(SystemExit):
+        readme_tables.main(check)
+    readme_tables.main(write)
+    for page in (tmp_path / "README.md", folder / "page.md"):
+        assert "PPO + ICM, paper" in page.read_text()
+        assert "old" not in page.read_text()
+    assert (folder / "absent.md").read_text() == block.format("absent")
+    readme_tables.main(check)
+    example["algorithms"][0]["runs"][0]["curves"]["training"]["success"][0] = 0.5
+    records.write_record(folder / "mine.json", example)
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        readme_tables.main(check)
+    assert "out of date: " + str(folder / "figures" / "mine.png") in capsys.readouterr().out
+    with pytest.raises(ValueError, match="--write and --check exclude each other"):
+        readme_tables.Arguments(write=True, check=True)
+
+
+@pytest.mark.parametrize("experiment", PROTOCOLS)
+def test_the_papers_numbers_stand_beside_its_own_sets_only(example, experiment):
+    example["experiment"] = experiment
+    example["protocol"]["train_set"] = PROTOCOLS[experiment].train_set
+    assert "PPO + ICM, paper" in tables.markdown(example)
+    assert tables.title(example).startswith("Experiment ")
+    example["protocol"]["train_set"] = "sy"
+    assert ", paper" not in tables.markdown(example)
+    assert tables.title(example) == "Train on {Sy}, preset paper"
+    assert ("{Sy} solved; " in tables.markdown(example)) == (experiment == "exp1")
