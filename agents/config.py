@@ -107,6 +107,8 @@ class Config:
         of `objects`.
       hidden: units of the GRU, of the layer before it and of the inverse model.
       embedding: units of each action embedding and of the reward's.
+      recurrent: whether the GRU's state lasts. Without, the agent remembers its previous action
+        and reward and no more.
       chunk: distinct observations that are encoded at once; changes speed, not results.
     """
 
@@ -156,6 +158,7 @@ class Config:
     filters: tuple[int, int] = _setting((32, 64), 1, 4096)
     hidden: int = _setting(64, 1, 65_536)
     embedding: int = _setting(8, 1, 65_536)
+    recurrent: bool = _setting(True)
     chunk: int = _setting(64, 1)
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ class Agent:
 
     def __init__(self, config: Config):
         self.encoder = encoders.factory(config.encoder)(config)
-        self.core = Core(config.hidden, config.embedding)
+        self.core = Core(config.hidden, config.embedding, config.recurrent)
         self.heads = Heads(config.streams)
         self.facing = config.facing
         self._hidden = config.hidden

@@ -40,10 +40,12 @@ class Core(nn.Module):
     Attributes:
       hidden: units of the GRU and of the layer before it.
       embedding: units of each action embedding and of the reward's.
+      recurrent: whether the state lasts; without, every step begins with the first one.
     """
 
     hidden: int
     embedding: int
+    recurrent: bool = True
 
     def setup(self) -> None:
         """Declares the parameters."""
@@ -95,6 +97,8 @@ class Core(nn.Module):
 
     def advance(self, state: jax.Array, inputs: jax.Array) -> jax.Array:
         """One step of the GRU: f32[..., hidden], f32[..., 3 * hidden] -> f32[..., hidden]."""
+        if not self.recurrent:
+            state = self.initial_state(*state.shape[:-1])
         recurrent = state @ self.state_kernel + as_row(self.bias[1], state.ndim)
         update_x, reset_x, candidate_x = jnp.split(inputs, 3, axis=-1)
         update_h, reset_h, candidate_h = jnp.split(recurrent, 3, axis=-1)
