@@ -10,15 +10,15 @@ from pathlib import Path
 import jax
 import pytest
 
-FOLDER = "JAX_COMPILATION_CACHE_DIR"
 if "PYTEST_XDIST_WORKER" not in os.environ:
-    # Equal programs compile once for all workers, and for the processes that tests start. A
+    # Equal programs compile once for all workers, and for the command lines that tests start. A
     # cache left by another version of the code must not decide what is tested.
-    os.environ[FOLDER] = tempfile.mkdtemp(prefix="trap_tube_jax-tests-")
-    atexit.register(shutil.rmtree, os.environ[FOLDER], ignore_errors=True)
+    os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="trap_tube_jax-tests-")
+    atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 
 SETTINGS = {
-    "jax_compilation_cache_dir": os.environ[FOLDER],
+    # Where the command lines keep theirs.
+    "jax_compilation_cache_dir": str(Path(os.environ["XDG_CACHE_HOME"], "trap_tube_jax", "jax")),
     "jax_persistent_cache_min_compile_time_secs": 0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
     # An accidental broadcast between ranks is a bug that a shape test may not see.
@@ -40,8 +40,8 @@ for setting in SETTINGS.items():
 def _optimisation(request: pytest.FixtureRequest) -> None:
     """Agents take longer to compile than to run here; the rules run in millions of states.
 
-    A module of agents that run for long says OPTIMISED.
+    A module for which it is otherwise says so by OPTIMISED.
     """
     is_of_agents = re.search(r"^(from|import) agents\b", Path(request.path).read_text(), re.M)
-    optimised = is_of_agents is None or hasattr(request.module, "OPTIMISED")
+    optimised = getattr(request.module, "OPTIMISED", is_of_agents is None)
     set_for_all_processes("jax_disable_most_optimizations", not optimised)

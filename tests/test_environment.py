@@ -12,6 +12,7 @@ from refusal import assert_refused
 
 import trap_tube_jax as tt
 
+OPTIMISED = False  # few steps
 # What pairs of transfers do, each of them and all three show already.
 IDS = [
     pytest.param(entry.id, marks=[pytest.mark.slow] * (len(entry.transfers) == 2))

@@ -55,7 +55,7 @@ def command(line, *arguments, folder):
     """A line of the page, as a process in the folder, with these arguments besides."""
     python, dash_m, module, *rest = shlex.split(line)
     assert (python, dash_m) == ("python", "-m")
-    return run(module, *rest, *arguments, cache=folder / "cache", cwd=folder)
+    return run(module, *rest, *arguments, cwd=folder)
 
 
 @pytest.fixture(scope="module")

@@ -207,7 +207,7 @@ def problem(curiosity, trajectory) -> Problem:
     "curiosity",
     [
         "icm",
-        "icm-detached",
+        pytest.param("icm-detached", marks=pytest.mark.slow),
         pytest.param("rnd", marks=pytest.mark.slow),
         pytest.param("ride", marks=pytest.mark.slow),
         pytest.param("e3b", marks=pytest.mark.slow),

@@ -31,14 +31,13 @@ SETTINGS = [
 ]
 
 
-def start(*command, cache, devices=1):
+def start(*command, devices=1):
     return subprocess.Popen(
         [sys.executable, "-W", "error", *map(str, command)],
         cwd=ROOT,
         env={
             **os.environ,
             "PYTHONPATH": str(ROOT),
-            "XDG_CACHE_HOME": str(cache),
             "JAX_PLATFORMS": "cpu",
             "JAX_NUM_CPU_DEVICES": str(devices),
         },
@@ -52,7 +51,7 @@ def start(*command, cache, devices=1):
 def eight(tmp_path_factory):
     """What `sharded_training` found on eight devices."""
     folder = tmp_path_factory.mktemp("eight")
-    process = start(ROOT / "tests" / "sharded_training.py", folder, cache=folder, devices=8)
+    process = start(ROOT / "tests" / "sharded_training.py", folder, devices=8)
     output, errors = process.communicate()
     assert process.returncode == 0, errors
     return json.loads(output)
@@ -82,19 +81,18 @@ def test_checkpoints_move_between_numbers_of_devices(eight):
 
 @pytest.fixture(scope="module")
 def joint(tmp_path_factory):
-    """The folder and cache of a run of two processes."""
-    return tmp_path_factory.mktemp("joint") / "run", tmp_path_factory.mktemp("cache")
+    """The folder of a run of two processes."""
+    return tmp_path_factory.mktemp("joint") / "run"
 
 
-def start_two(joint, *arguments):
-    folder, cache = joint
+def start_two(folder, *arguments):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     command = ["-m", "agents.train", "--name", folder.name, *arguments, "--checkpoint-every", 1]
     command += ["--keep", 1, "--coordinator", address, "--processes", 2]
     return [
-        start(*command, "--process-id", number, "--out", out, cache=cache)
+        start(*command, "--process-id", number, "--out", out)
         for number, out in enumerate((folder.parent, folder.parent / "unseen"))
     ]
 
@@ -124,12 +122,12 @@ def test_two_processes_stop_together(joint):
     (output, errors), (silence, complaints) = first.communicate(), second.communicate()
     assert (first.returncode, second.returncode) == (143, 143), errors + complaints
     assert without_transport(silence + errors + complaints) == ""
-    assert not (joint[0].parent / "unseen").exists()
+    assert not (joint.parent / "unseen").exists()
     match = re.search(r"Stopped at iteration (\d+)\. Continue with: ", output)
     assert match
     iteration = int(match[1])
-    assert checkpoint(joint[0]) == iteration >= 2
-    rows = read_metrics(joint[0] / "metrics.csv")
+    assert checkpoint(joint) == iteration >= 2
+    rows = read_metrics(joint / "metrics.csv")
     assert [row["iteration"] for row in rows] == list(range(1, iteration + 1))
     assert [row["episodes"] for row in rows] == list(range(8, 8 * iteration + 1, 8))
 
@@ -137,7 +135,7 @@ def test_two_processes_stop_together(joint):
 @pytest.mark.slow
 def test_a_killed_process_ends_the_other(joint):
     """In the run that the test above has left: two processes take it up."""
-    before = checkpoint(joint[0])
+    before = checkpoint(joint)
     first, second = start_two(joint, "--resume")
     wait_for_iterations(first, 2)
     second.kill()
@@ -146,7 +144,7 @@ def test_a_killed_process_ends_the_other(joint):
     assert first.returncode not in (0, None)
     assert "another process" in errors or "another task died" in errors
     assert "Traceback" not in errors
-    assert checkpoint(joint[0]) >= before + 1
+    assert checkpoint(joint) >= before + 1
 
 
 def refused(capsys, arguments):

@@ -207,7 +207,7 @@ def test_a_sweep_ends_in_a_table_and_a_figure(finished):
     assert "clip=1" in console.export_text()
 
 
-def start(out, cache):
+def start(out):
     command = [
         *(sys.executable, "-m", "agents.sweep", "--preset", "paper", "--settings"),
         *(*SMALL, "iterations=40", "eval_episodes=2", "epochs=1", "curiosity=e3b,none"),
@@ -217,7 +217,7 @@ def start(out, cache):
     return subprocess.Popen(
         [str(part) for part in command],
         cwd=ROOT,
-        env={**os.environ, "XDG_CACHE_HOME": str(cache), "XLA_FLAGS": flags},
+        env={**os.environ, "XLA_FLAGS": flags},
     )
 
 
@@ -230,16 +230,16 @@ def test_runs_stop_when_their_sweep_is_gone():
 
 @pytest.mark.slow
 def test_stopped_sweeps_continue_to_the_same_result(tmp_path):
-    cache, names = tmp_path / "cache", ("curiosity=e3b-seed0", "curiosity=none-seed0")
-    assert start(tmp_path / "whole", cache).wait() == 0
-    process, root = start(tmp_path / "stopped", cache), tmp_path / "stopped" / "x"
+    names = ("curiosity=e3b-seed0", "curiosity=none-seed0")
+    assert start(tmp_path / "whole").wait() == 0
+    process, root = start(tmp_path / "stopped"), tmp_path / "stopped" / "x"
     while not all(len(read_metrics(root / name / "metrics.csv")) > 3 for name in names):
         with contextlib.suppress(subprocess.TimeoutExpired):
             pytest.fail(f"ended with {process.wait(0.1)}")
     process.terminate()
     assert process.wait() == 128 + signal.SIGTERM
     assert not (root / "table.md").exists()
-    assert start(tmp_path / "stopped", cache).wait() == 0
+    assert start(tmp_path / "stopped").wait() == 0
     for name in names:
         whole, again = (
             read_metrics(tmp_path / folder / "x" / name / "metrics.csv")

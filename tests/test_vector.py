@@ -8,6 +8,7 @@ import pytest
 import trap_tube_jax as tt
 from trap_tube_jax.vector import VectorEnvironment, draw_movable, draw_static
 
+OPTIMISED = False  # few environments, few steps
 NUM_ENVS = 24
 NUM_STEPS = 16
 MAX_STEPS = 5
