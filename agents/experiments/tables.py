@@ -186,7 +186,7 @@ def quality_table(record: Record, entry: Record) -> Table:
             summary.label,
             str(len(record["sets"][summary.name]["shortest"] or ())),
             _percent(summary.percent_of_solvable),
-            _spread(summary.optimality, ".3f"),
+            _spread(summary.optimality, ".3f", high=1.0),
             _number(summary.worst, ".3f"),
         )
         for summary in statistics.by_set(record, entry).values()
@@ -261,7 +261,8 @@ def _selection(record: Record) -> str:
 
 
 def _machine(machine: Record) -> str:
-    where = f"{machine['cores']} cores of {machine['processor']}"
+    cores = machine["cores"]
+    where = f"{cores} core{'s' * (cores != 1)} of {machine['processor']}"
     if machine["device"].lower() != "cpu":
         where = f"{machine['devices']} {machine['device']}, {where}"
     commit = machine["commit"] or "unknown"
