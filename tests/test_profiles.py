@@ -233,16 +233,26 @@ def test_counts_of_a_record_made_by_hand():
     assert "| detours, begun after: tool moved | 1 |" in table
 
 
-@pytest.fixture(scope="module")
-def tiny():
+def profile_at_random(**settings):
     """The record of a random policy."""
-    config = Config(**TINY)
+    config = Config(**{**TINY, **settings.pop("config", {})})
     shapes = jax.eval_shape(Agent(config).init, jax.random.key(0))
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), shapes)
     policies = {"mine": Policy("mine", config, params, 7)}
-    settings = measure.Settings(strengths=(1.0,), tasks=2, episodes=2)
-    return measure.profile(policies, settings, Console(file=io.StringIO()), command="x")
+    chosen = measure.Settings(strengths=(1.0,), tasks=2, **settings)
+    return measure.profile(policies, chosen, Console(file=io.StringIO()), command="x")
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return profile_at_random(episodes=2)
+
+
+def test_a_policy_without_a_step_limit_plays_as_long_as_the_base_task():
+    record = profile_at_random(config={"max_steps": None}, parts=("colours",), episodes=0)
+    assert record["policies"][0]["config"]["max_steps"] == 50
+    assert set(record["policies"][0]["steps"]) == {"base", "colours 1"}
 
 
 def test_a_profile_from_end_to_end(tiny, tmp_path, capsys):

@@ -30,7 +30,7 @@ from agents.experiments.records import Record
 from agents.profiles.mistakes import SUBGOALS, Turns, subgoals, turns
 from agents.profiles.oracle import Oracle, replayed
 from agents.profiles.pushes import Push, first_push
-from agents.profiles.tasks import PAIRS, PARTS, STRENGTHS, SWAPS, points
+from agents.profiles.tasks import BASE, PAIRS, PARTS, STRENGTHS, SWAPS, points
 from agents.runs.machine import machine
 from trap_tube_jax.state import State
 
@@ -90,6 +90,7 @@ def profile(
       ValueError: a setting is not allowed, or there is no policy, or they differ in channels.
     """
     here = machine()  # first: the code may be changed while this runs
+    policies = {name: _limited(policy) for name, policy in policies.items()}
     channels = {policy.config.num_features for policy in policies.values()}
     if len(channels) != 1:
         raise ValueError(
@@ -123,6 +124,12 @@ def profile(
         "pairs": {name: list(pair) for name, pair in pairs.items()},
         "policies": measured,
     }
+
+
+def _limited(policy: Policy) -> Policy:
+    """With the step limit of the base task, for points are no sets with a limit of their own."""
+    limit = policy.config.step_limit(BASE)
+    return policy._replace(config=dataclasses.replace(policy.config, max_steps=limit))
 
 
 def _shortest(oracle: Oracle, tasks: Mapping[str, State], bars: Progress) -> dict[str, np.ndarray]:
