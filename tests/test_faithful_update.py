@@ -38,9 +38,9 @@ def ours(recording: Recording) -> dict[str, Any]:
         raw, _ = train.intrinsic_reward(state, trajectory)
         batch, state, _ = train.prepare(state, trajectory)
         moments = (state.extrinsic, state.intrinsic)
-        return trajectory, experience.next_embedding, prediction, raw, batch, moments, state.replay
+        return trajectory, experience.next_embedding, prediction, raw, batch, moments
 
-    names = ("trajectory", "next_embedding", "prediction", "raw", "batch", "moments", "replay")
+    names = ("trajectory", "next_embedding", "prediction", "raw", "batch", "moments")
     return {"train": train, "params": params, **dict(zip(names, run(params), strict=True))}
 
 
@@ -51,7 +51,7 @@ def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
 
     @jax.jit
     def update(params, opt_state):
-        gradient, terms = jax.grad(train.loss, has_aux=True)(params, batch, ours["replay"])
+        gradient, terms = jax.grad(train.loss, has_aux=True)(params, batch)
         step, opt_state = train.optimizer.update(gradient, opt_state, params)
         clipped, _ = clip.update(gradient, clip.init(params))
         params = optax.apply_updates(params, step)
