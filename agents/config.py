@@ -283,7 +283,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "minibatch": 64,
         "epochs": 8,
         "bootstrap": "value",
-        "filters": (16, 32),
+        "filters": (8, 16),
         "entropy_coef": 3e-3,
         "curiosity": "counts",
         "episodic_novelty": True,
