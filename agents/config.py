@@ -68,7 +68,7 @@ class Config:
 
       learning_rate: Adam's step size.
       cooldown: share of the gradient steps, the last ones, over which the step size falls
-        linearly to 0.
+        geometrically to a fiftieth.
       adam_epsilon: Adam's epsilon.
       max_gradient_norm: global norm to which gradients are clipped.
 
@@ -294,19 +294,19 @@ PRESETS: dict[str, dict[str, Any]] = {
     # sees objects instead of colours, the food ahead.
     "best": {
         "env_id": "pstsy",
-        "iterations": 1100,
+        "iterations": 1150,
         "episodes": 512,
         "epochs": 4,
         "minibatch": 64,
-        "discount": 0.995,
+        "discount": 0.98,
         "bootstrap": "value",
         "value_coef": 0.5,
         "entropy_coef": 5e-3,
-        "cooldown": 1.0,
+        "cooldown": 0.65,
         "curiosity": "effects",
-        "intrinsic_scale": 0.3,
+        "intrinsic_scale": 0.03,
         "intrinsic_start": 3.0,
-        "intrinsic_fall": 0.4,
+        "intrinsic_fall": 0.8,
         "rewards": "apart",
         "replayed": (0.125, 0.125, 0.5),
         "facing": True,

@@ -14,7 +14,7 @@ def test_the_cooldown_counts_gradient_steps():
     )
     assert config.gradient_steps == 4
     schedule = step_size(config)
-    for count, share in ((0, 1), (28, 1), (29, 11 / 12), (34, 0.5), (39, 1 / 12), (40, 0)):
+    for count, share in ((0, 1), (28, 1), (29, 50 ** (-1 / 12)), (34, 50**-0.5), (40, 0.02)):
         np.testing.assert_allclose(schedule(jnp.int32(count)), 0.5 * share, rtol=1e-5)
 
 
@@ -22,7 +22,7 @@ def test_the_cooldown_counts_gradient_steps():
 def test_none_or_all_of_training_may_be_cooldown(cooldown):
     config = Config(iterations=1, epochs=2, episodes=8, minibatch=4, cooldown=cooldown)
     rates = jnp.stack([jnp.asarray(step_size(config)(jnp.int32(n))) for n in range(4)])
-    expected = np.full(4, 1e-3) * (1 - cooldown * np.arange(4) / 4)
+    expected = 1e-3 * 50 ** (-cooldown * np.arange(4) / 4)
     np.testing.assert_allclose(rates, expected, rtol=1e-5)
 
 

@@ -8,6 +8,8 @@ import optax
 
 from agents.config import Config
 
+LAST_STEP_SIZE = 1 / 50  # that of the last gradient step of a cooldown, beside the first
+
 
 class AdamState(NamedTuple):
     """Adam's moments.
@@ -73,9 +75,11 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
 
 
 def step_size(config: Config) -> optax.Schedule:
-    """The learning rate by gradient steps: constant, then linear to 0 in the cooldown."""
+    """The learning rate by gradient steps: constant, then falling geometrically in the cooldown."""
     total = config.iterations * config.gradient_steps
     falling = round(config.cooldown * total)
     if not falling:
         return optax.constant_schedule(config.learning_rate)
-    return optax.linear_schedule(config.learning_rate, 0.0, falling, total - falling)
+    return optax.exponential_decay(
+        config.learning_rate, falling, LAST_STEP_SIZE, transition_begin=total - falling
+    )
