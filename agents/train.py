@@ -15,6 +15,7 @@ from rich.console import Console
 import trap_tube_jax as tt
 from agents.config import PRESETS, Config
 from agents.parallel import processes
+from agents.parallel.cores import become_devices
 from agents.parallel.sharding import Placement
 from agents.runs import compilation_cache
 from agents.runs.folder import Run, RunFolder
@@ -41,6 +42,9 @@ class Selection(processes.Job):
       out: the folder of all runs.
       resume: continue the run of this name where its newest checkpoint ends; its settings
         are the defaults then, and only --iterations and --stop-when-solved may change.
+      devices: how many devices share the episodes and seeds, or `all` there are. On a CPU a
+        device is a core, and up to 4 share them unless said otherwise; else one, or with several
+        processes all of theirs.
     """
 
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
@@ -51,6 +55,7 @@ class Selection(processes.Job):
     name: str | None = None
     out: Path = Path("runs")
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    devices: int | Literal["all"] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +66,6 @@ class Options(Selection):
     --resume then continues to the same result as if nothing had happened.
 
     Attributes:
-      devices: how many devices share the episodes and seeds, or `all` there are; one if
-        absent, and with several processes all of theirs.
       checkpoint_every: iterations from one checkpoint to the next.
       keep: how many checkpoints to keep, the newest.
       no_cache: compile everything anew, instead of keeping compiled programs in
@@ -70,7 +73,6 @@ class Options(Selection):
       config: the settings of training.
     """
 
-    devices: int | Literal["all"] | None = None
     checkpoint_every: int = 10
     keep: int = 3
     no_cache: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -137,6 +139,8 @@ def start(arguments: Sequence[str]) -> Session:
       OSError: the run's folder cannot be made.
     """
     selection = select(arguments)
+    if selection.is_alone:
+        become_devices(selection.devices)
     selection.join()
     console = Console(quiet=not processes.is_first())
     options, folder, run = processes.from_first(lambda: open_run(selection, arguments))

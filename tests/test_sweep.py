@@ -108,7 +108,7 @@ def fake(monkeypatch, how):
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores cannot be chosen")
 def test_runs_share_the_cores_and_failures_do_not_stop_the_others(tmp_path, monkeypatch):
     fake(monkeypatch, "end")
-    monkeypatch.setattr(workers, "_cores", lambda: cores)
+    monkeypatch.setattr(workers, "available_cores", lambda: cores)
     given = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, own: given.append(list(own)))
     cores = [0, 1, 2]

@@ -12,7 +12,7 @@ from agents.acting.frames import Frame
 from agents.acting.rollout import Trajectory, greedy_action, rollout
 from agents.config import Config
 from agents.networks.agent import Agent, Params
-from agents.parallel.sharding import ALONE, DEFAULT_DEVICE, Placement, Shards
+from agents.parallel.sharding import ALONE, Shards
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.scoring.scores import Optimality, Score
 from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks, label, layout_numbers
@@ -85,16 +85,13 @@ def play_greedily(
 class Evaluator:
     """Greedy play on the tasks of several sets, compiled once for any parameters."""
 
-    def __init__(
-        self, config: Config, tasks: Mapping[str, State], placement: Placement = DEFAULT_DEVICE
-    ):
+    def __init__(self, config: Config, tasks: Mapping[str, State]):
         """Prepares the play.
 
         Args:
           config: the settings of the policies to come.
           tasks: the tasks of each set, by name; see `evaluation_tasks`. Where `config.max_steps`
             is None, the names are those of registered sets, whose limits hold.
-          placement: the devices that share the tasks.
 
         Raises:
           ValueError: a name is to be that of a registered set, and is not.
@@ -111,19 +108,12 @@ class Evaluator:
         longest = max(self.limits.values())
         env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
         agent = Agent(config)
-        shards = Shards(placement.num_devices)
-        self._play: Any = placement.share(
-            lambda params, states: evaluate(agent, params, env, states, config.chunk, shards)
+        self._play: Any = jax.jit(
+            lambda params, states: evaluate(agent, params, env, states, config.chunk)
         )
 
     @classmethod
-    def of_sets(
-        cls,
-        config: Config,
-        sets: Sequence[str],
-        num_tasks: int,
-        placement: Placement = DEFAULT_DEVICE,
-    ) -> "Evaluator":
+    def of_sets(cls, config: Config, sets: Sequence[str], num_tasks: int) -> "Evaluator":
         """That of registered task sets.
 
         Raises:
@@ -133,10 +123,10 @@ class Evaluator:
             raise ValueError(f"name at least one task set; allowed: {', '.join(ALL_SETS)}")
         names = [tt.task_set(name).short for name in sets]
         tasks = {name: evaluation_tasks(name, num_tasks, config.num_features) for name in names}
-        return cls(config, tasks, placement)
+        return cls(config, tasks)
 
     def compile(self, params: Params) -> None:
-        """Compiles for parameters of these shapes, as the first call would; for one device."""
+        """Compiles for parameters of these shapes, as the first call would."""
         self._play = self._play.lower(params, self._blocks[0]).compile()
 
     def __call__(self, params: Params) -> dict[str, Evaluation]:

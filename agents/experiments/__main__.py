@@ -18,6 +18,7 @@ from rich.console import Console
 from agents.config import PRESETS
 from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol
+from agents.parallel.cores import become_devices
 from agents.runs import compilation_cache
 from agents.runs.stopping import Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
@@ -63,8 +64,8 @@ class Options:
       quick: the reduced protocol: the fast preset, ppo and preset, 1 seed, 16 tasks per set,
         evaluated every 5 iterations; exp1 20 iterations or until solved, exp2 15 iterations.
       side_by_side: train all missing seeds of an algorithm at once, for a GPU.
-      devices: how many devices share a run's episodes and seeds, or `all` there are; one if
-        absent.
+      devices: how many devices share a run's episodes and seeds, or `all` there are. On a CPU
+        a device is a core, and up to 4 share them unless said otherwise; else one.
       name: the folder within --out; <experiment>-<preset> if absent, with the --train-set if
         one is given, and with -quick.
       out: the folder of all runs.
@@ -164,6 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     stop = StopSignals(lambda: console.print("Finishing this iteration; again to abandon it."))
     try:
         options = tyro.cli(Options, args=arguments, prog=PROGRAM)
+        become_devices(options.devices)
         if not options.no_cache:
             compilation_cache.enable()
         run(options, console, stop)

@@ -45,7 +45,7 @@ class Resources(NamedTuple):
 
     Attributes:
       side_by_side: train all missing seeds of an algorithm at once.
-      devices: how many share a run's episodes and seeds, or `all`; one if absent.
+      devices: how many share a run's episodes and seeds, or `all`; see `Placement.of`.
       checkpoint_every: iterations from one checkpoint to the next.
       commit: the commit to note where git does not tell it.
     """

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.progress import TimeElapsedColumn as Elapsed
 
 from agents import train
+from agents.parallel.cores import available_cores
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import read_metrics
 from agents.runs.stopping import Stopped, StopSignals
@@ -43,7 +44,7 @@ def default_processes() -> int:
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
-    return len(_cores()) if done.stdout.strip() == "cpu" else 1
+    return len(available_cores()) if done.stdout.strip() == "cpu" else 1
 
 
 def train_runs(
@@ -70,7 +71,7 @@ def train_runs(
       KeyboardInterrupt: on a second request; the current iterations are lost.
     """
     waiting, working, failed = list(runs), list[Worker](), list[RunFolder]()
-    cores = _cores()
+    cores = available_cores()
     free = [cores[first::processes] or cores for first in range(processes)]
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Elapsed())
     told = False
@@ -98,12 +99,6 @@ def train_runs(
     if stop.received:
         raise Stopped(stop.received)
     return failed
-
-
-def _cores() -> list[int]:
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
 
 
 def _command(folder: RunFolder, run: Run, arguments: Sequence[str]) -> list[str]:

@@ -65,13 +65,18 @@ class Job:
         if self.peer_timeout < 1:
             raise ValueError(f"peer_timeout must be >= 1, got {self.peer_timeout}")
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether there are no others."""
+        return not self.distributed and self.coordinator is None
+
     def join(self) -> None:
         """Waits for the other processes, if there are any. Call it before any computation.
 
         Raises:
           ValueError: they cannot be found, or differ in their number of devices.
         """
-        if not self.distributed and self.coordinator is None:
+        if self.is_alone:
             return
         if jax.__version_info__ < (0, 7):
             raise ValueError(f"several processes need jax 0.7 or newer, not {jax.__version__}")

@@ -117,8 +117,8 @@ class Placement:
         """The placement of a run on a number of devices.
 
         Args:
-          devices: how many, over all processes, or `all`; one, or with several processes
-            all, if absent.
+          devices: how many, over all processes, or `all`. If absent: with several processes
+            all, on a CPU as many as share the work evenly, else one.
           config: the settings.
           seeds: seeds trained side by side.
 
@@ -126,10 +126,10 @@ class Placement:
           ValueError: there are not as many, or they cannot share the work evenly.
         """
         processes, available = jax.process_count(), len(jax.devices())
-        if devices is None:
-            devices = "all" if processes > 1 else 1
-        wanted = available if devices == "all" else devices
         allowed = [n for n in range(1, available + 1) if _is_even(n, processes, config, seeds)]
+        if devices is None and processes == 1:
+            devices = max(allowed) if jax.default_backend() == "cpu" else 1
+        wanted = available if devices in ("all", None) else devices
         if wanted not in allowed:
             raise ValueError(
                 f"devices must be a number that {available} {jax.default_backend()} devices of "
@@ -150,11 +150,6 @@ class Placement:
         """How the episodes of a seed are divided."""
         return ALONE if self.mesh is None else Shards(self.mesh.shape[EPISODES])
 
-    @property
-    def num_devices(self) -> int:
-        """How many devices, over all processes."""
-        return 1 if self.mesh is None else self.mesh.size
-
     def local_seeds(self, seeds: int) -> int:
         """How many of all seeds a device trains."""
         return seeds if self.mesh is None else seeds // self.mesh.shape[SEEDS]
@@ -174,14 +169,6 @@ class Placement:
 
         outputs = (PartitionSpec(SEEDS), PartitionSpec())
         return _map(own, self.mesh, PartitionSpec(SEEDS), outputs)
-
-    def share(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Compiles a function with `Shards(num_devices)` in it; arguments and result are whole."""
-        if self.mesh is None:
-            return jax.jit(function)
-        row = Mesh(self.mesh.devices.reshape(-1), EPISODES)
-        mapped = _map(function, row, PartitionSpec(), PartitionSpec())
-        return jax.jit(mapped, in_shardings=NamedSharding(row, PartitionSpec()))
 
     def put(self, state: Tree) -> Tree:
         """A state [S, ...] from the default device to the devices that train with it."""
@@ -216,7 +203,7 @@ class Placement:
             return kind
         processes = jax.process_count()
         within = f" of {processes} processes" if processes > 1 else ""
-        return f"{self.num_devices} {kind} devices{within}"
+        return f"{self.mesh.size} {kind} devices{within}"
 
 
 DEFAULT_DEVICE = Placement()

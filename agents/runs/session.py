@@ -218,9 +218,7 @@ class Session:
         return compiled
 
     def _prepare_results(self) -> None:
-        """Compiles in the background what `finish` needs, unless there are several devices."""
-        if self._placement.mesh is not None:
-            return
+        """Compiles in the background what `finish` needs."""
         worker = futures.ThreadPoolExecutor(1)
         self._results = worker.submit(self._ready)
         worker.shutdown(wait=False)
@@ -229,10 +227,9 @@ class Session:
         """What plays the tasks of all sets, and what the curiosity pays for it, compiled."""
         config = self.run.config
         sets = own_and_paper_sets(config)
-        evaluator = Evaluator.of_sets(config, sets, config.eval_episodes, self._placement)
+        evaluator = Evaluator.of_sets(config, sets, config.eval_episodes)
         state = jax.eval_shape(self._train.init, jax.random.key(0))
-        if self._placement.mesh is None:
-            evaluator.compile(state.params)
+        evaluator.compile(state.params)
         return evaluator, report_page.compile_pay(config, state, evaluator)
 
     def _iterate(self, advance: Advance) -> list[Row]:
