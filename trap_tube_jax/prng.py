@@ -9,6 +9,7 @@ Source: Salmon et al. (2011) for the hash; JAX's documentation of `jax_threefry_
 for how the counters are chosen.
 """
 
+import functools
 import math
 
 import jax
@@ -43,6 +44,7 @@ def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
     return pair[0], pair[1]
 
 
+@functools.partial(jax.jit, static_argnums=1, inline=True)
 def fold_in(key: jax.Array, data: int) -> jax.Array:
     """The key of `jax.random.fold_in`, of the same type as `key`."""
     return _like(jax.random.fold_in(loop_free(key), data), key)

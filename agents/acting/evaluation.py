@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
@@ -141,7 +140,7 @@ class Evaluator:
         }
 
     def _all_tasks(self) -> State:
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *self.tasks.values())
+        return jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
 
 
 def scores(

@@ -70,8 +70,8 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     # Transfers are compiled one by one: the sets share them, so eight sets take three
     # compilations, and a transfer has the same bits in each.
     draw = compose(*map(_compiled, env.transfers))
-    base = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), env.base)
-    return jax.vmap(draw)(evaluation_keys(name, count, purpose), base)
+    base = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), env.base)
+    return jax.device_put(jax.vmap(draw)(evaluation_keys(name, count, purpose), base))
 
 
 def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax.Array:
@@ -79,8 +79,12 @@ def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax
 
     More tasks begin with the same ones. No key serves two purposes or sets.
     """
-    root = jax.random.wrap_key_data(jnp.asarray(_ROOTS[purpose]), impl="threefry2x32")
-    set_key = jax.random.fold_in(root, zlib.crc32(name.encode()))
+    return _keys(_ROOTS[purpose], np.uint32(zlib.crc32(name.encode())), num_tasks)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _keys(root: np.ndarray, of_set: np.ndarray, num_tasks: int) -> jax.Array:
+    set_key = jax.random.fold_in(jax.random.wrap_key_data(root, impl="threefry2x32"), of_set)
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(set_key, jnp.arange(num_tasks))
 
 
