@@ -79,12 +79,12 @@ def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax
 
     More tasks begin with the same ones. No key serves two purposes or sets.
     """
-    return _keys(_ROOTS[purpose], np.uint32(zlib.crc32(name.encode())), num_tasks)
+    return _keys(jnp.asarray(_ROOTS[purpose]), np.uint32(zlib.crc32(name.encode())), num_tasks)
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _keys(root: np.ndarray, of_set: np.ndarray, num_tasks: int) -> jax.Array:
-    set_key = jax.random.fold_in(jax.random.wrap_key_data(root, impl="threefry2x32"), of_set)
+def _keys(root: jax.Array, number: jax.typing.ArrayLike, num_tasks: int) -> jax.Array:
+    set_key = jax.random.fold_in(jax.random.wrap_key_data(root, impl="threefry2x32"), number)
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(set_key, jnp.arange(num_tasks))
 
 
