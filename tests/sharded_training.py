@@ -90,8 +90,8 @@ def on_one_device(state, iterations):
     )
 
 
-def play(params, devices):
-    """Greedy play of three tasks by a number of devices, which share them."""
+def play(params, tasks, devices):
+    """Greedy play of tasks by a number of devices, which share them."""
     env = tt.make("st", max_steps=CONFIG.max_steps)
 
     def own(params, tasks):
@@ -100,7 +100,7 @@ def play(params, devices):
     mesh = Mesh(np.array(jax.devices()[:devices]), EPISODES)
     whole = PartitionSpec()
     shared = jax.shard_map(own, mesh=mesh, in_specs=whole, out_specs=whole, check_vma=False)
-    return jax.tree.map(np.asarray, jax.jit(shared)(params, evaluation_tasks("st", 3)))
+    return jax.tree.map(np.asarray, jax.jit(shared)(params, tasks))
 
 
 def difference(one, other):
@@ -137,7 +137,12 @@ def main(folder):
     from_eight, _ = on_one_device(restored, 2)
     twice, _ = trainer(restored, 2)
     params = jax.tree.map(lambda x: np.asarray(x[0]), once.params)
-    same = jax.tree.map(is_same, play(params, 1), play(params, 8))
+    tasks = {name: evaluation_tasks(name, 3) for name in ("base", "st")}
+    played = [
+        {name: play(params, states, devices) for name, states in tasks.items()}
+        for devices in (1, 8)
+    ]
+    same = jax.tree.map(is_same, *played)
     head = "params/heads/params/move/kernel"
     report = {
         "mesh": dict(placement.mesh.shape),
@@ -148,6 +153,7 @@ def main(folder):
         "eight_to_one": difference(expected, from_eight),
         "eight_to_eight": digest(to_arrays(twice)) == digest(to_arrays(found)),
         "evaluation": all(jax.tree.leaves(same)),
+        "tasks": {name: len(outcome.solved) for name, outcome in played[1].items()},
     }
     print(json.dumps(report))
 

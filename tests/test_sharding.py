@@ -69,6 +69,7 @@ def test_eight_devices_train_as_one(eight):
 
 @pytest.mark.slow
 def test_eight_devices_evaluate_as_one(eight):
+    assert eight["tasks"] == {"base": 1, "st": 3}
     assert eight["evaluation"]
 
 

@@ -99,8 +99,9 @@ class Evaluator:
         self.limits = {name: config.step_limit(name) for name in self.tasks}
         self._total = sum(len(states.time) for states in self.tasks.values())
         block = min(BLOCK, self._total)
+        together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
         self._blocks = [
-            _rows(self._all_tasks(), np.arange(start, start + block) % self._total)
+            _rows(together, np.arange(start, start + block) % self._total)
             for start in range(0, self._total, block)
         ]
         # All sets are played up to the largest limit; `__call__` cuts off what is beyond a set's.
@@ -138,9 +139,6 @@ class Evaluator:
             name: _within(_rows(whole, slice(start, end)), self.limits[name])
             for name, start, end in zip(self.tasks, starts, ends, strict=True)
         }
-
-    def _all_tasks(self) -> State:
-        return jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
 
 
 def scores(
