@@ -230,6 +230,7 @@ def test_counts_of_a_record_made_by_hand():
     table = tables.mistakes_table(record, policy).to_markdown()
     assert "| failed: tool touched | 1 |" in table
     assert "| failed ones, distance first rose: median step | 4 |" in table
+    assert "| detours, tool moved: median step | 2 |" in table
     assert "| detours, begun after: tool moved | 1 |" in table
 
 
