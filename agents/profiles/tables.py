@@ -93,7 +93,10 @@ def mistakes_table(record: Record, policy: Record) -> Table:
         for turn, text in TURNS.items()
     ]
     rows += [
-        (f"detours, {goal}: median step", *(_median([row[goal] for row in each]) for each in detours))
+        (
+            f"detours, {goal}: median step",
+            *(_median([row[goal] for row in each]) for each in detours),
+        )
         for goal in SUBGOALS
     ]
     begins = [Counter(map(_begin, each)) for each in detours]
