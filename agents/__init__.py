@@ -6,9 +6,9 @@ from typing import Any
 
 from agents.acting.policy import Policy
 from agents.config import Config
-from agents.ppo.learner import Train, TrainState, make_train
+from agents.ppo.learner import Learner, TrainState, make_train
 
-__all__ = ["Config", "Policy", "Train", "TrainState", "load", "make_train", "results"]
+__all__ = ["Config", "Learner", "Policy", "TrainState", "load", "make_train", "results"]
 
 
 def load(

@@ -77,9 +77,9 @@ class Config:
         by the inverse loss alone. `rnd`: imitation of a random network. `noveld`: where that
         error rises. `ride`: how much a step changes features of the observation. `e3b`: how
         unlike the episode's others they are. `counts`: how seldom training has seen an
-        observation. `effects`: how seldom something other than the agent comes to a place, or
-        the hand to a look, that is new to the episode. `none`: plain PPO. Or a name that you
-        registered.
+        observation. `effects`: the first time in an episode that food or tool come to a cell, or
+        that the hand grasps at a colour; what happens seldom pays more. `none`: plain PPO. Or a
+        name that you registered.
       intrinsic_scale: weight of the normalised intrinsic reward, or of its advantage.
       intrinsic_start: its weight at first, which falls geometrically to `intrinsic_scale`; 0 for
         a weight that is the same throughout.
@@ -87,10 +87,12 @@ class Config:
       curiosity_coef: weight of the curiosity's losses.
       rewards: what becomes of extrinsic and intrinsic reward. `summed`: both are divided by their
         deviation and added; there is one value. `apart`: each has a value of its own, and the
-        normalised advantages are added (`agents.ppo.advantages`).
+        normalised advantages are added (`agents.ppo.advantages`). In either case the advantages
+        are normalised in the end, so that `intrinsic_scale` decides between the two rewards.
       episodic_novelty: pay the intrinsic reward only for observations that are new in
         their episode.
-      reward_rate: weight of the past in the moving moments that normalise both rewards.
+      reward_rate: weight of the past in the moving moments that normalise both rewards, and in
+        the rates of `effects`.
 
       imitation_coef: weight of imitating the agent's own solved episodes; 0 for none.
       imitation_episodes: the newest solved episodes that are remembered and imitated.
@@ -99,8 +101,8 @@ class Config:
         so on; none for none.
       failures: how many tasks of each kind, the newest, are kept for that.
 
-      facing: whether the agent sees and acts in a frame in which the food lies ahead at first,
-        one of the board's eight symmetries, instead of on the board as it is.
+      facing: whether the board is turned and mirrored for the agent, once for each episode, so
+        that the food lies ahead of it at the start.
       encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
         seen from agent and food is all that is encoded. Or a name that you registered.
       filters: channels of the first convolution, and of all later ones; units of the layers
@@ -109,7 +111,8 @@ class Config:
       embedding: units of each action embedding and of the reward's.
       recurrent: whether the GRU's state lasts. Without, the agent remembers its previous action
         and reward and no more.
-      chunk: distinct observations that are encoded at once; changes speed, not results.
+      chunk: distinct observations that are encoded at once; changes speed, and results only by
+        the order of float32 sums.
     """
 
     imports: tuple[str, ...] = _setting(())
@@ -135,7 +138,7 @@ class Config:
     # The optimizer.
     learning_rate: float = _setting(1e-3, 0)
     cooldown: float = _setting(0.0, 0, 1)
-    adam_epsilon: float = _setting(1e-7, 0)
+    adam_epsilon: float = _setting(1e-7, 1e-12)
     max_gradient_norm: float = _setting(1.0, 0)
     # Intrinsic reward.
     curiosity: str = _setting("icm")
@@ -180,10 +183,15 @@ class Config:
             raise ValueError(f"rewards='apart' needs bootstrap='value', got {self.bootstrap!r}")
         if self.intrinsic_start and not self.intrinsic_scale:
             raise ValueError("intrinsic_start > 0 needs intrinsic_scale > 0, to fall to; got 0")
+        if 0 < self.intrinsic_start < self.intrinsic_scale:
+            raise ValueError(
+                f"intrinsic_start must be 0, or at least intrinsic_scale={self.intrinsic_scale}, "
+                f"to which it falls; got {self.intrinsic_start}"
+            )
         if self.num_new < 1:
             raise ValueError(
-                f"replayed must leave some of {self.episodes} episodes to new tasks, got shares "
-                f"{self.replayed}; allowed: a sum below 1"
+                f"replayed must leave at least one of {self.episodes} episodes to new tasks, got "
+                f"shares {self.replayed}, which are {sum(self.num_replayed)} episodes"
             )
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
@@ -247,14 +255,9 @@ class Config:
         return task_set(name).max_steps if self.max_steps is None else self.max_steps
 
     @property
-    def transitions(self) -> int:
-        """The largest number of environment steps of one iteration."""
-        return self.episodes * self.step_limit(self.env_id)
-
-    @property
     def streams(self) -> int:
         """V, how many streams of rewards have a value each."""
-        return 2 if self.rewards == "apart" else 1
+        return 2 if self.rewards == "apart" and self.curiosity != "none" else 1
 
     @property
     def num_replayed(self) -> tuple[int, ...]:
@@ -339,7 +342,7 @@ def _check_type(field: dataclasses.Field, value: Any) -> None:
         wanted = "int or None" if default is None else type(default).__name__
         if isinstance(default, tuple):
             names = {int: f"{len(default)} integers", str: "names"}
-            wanted = names.get(_kind_of_items(field), "numbers")
+            wanted = f"a tuple of {names.get(_kind_of_items(field), 'numbers')}"
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
 
 

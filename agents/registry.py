@@ -1,8 +1,7 @@
 """The names by which `Config` knows intrinsic rewards and encoders.
 
-Tables of their own, below everything else, so that settings can be checked without the modules
-that the names stand for. `agents.curiosity` and `agents.networks` fill them; a module of your own
-may add to them (agents/extending.md).
+Kept apart from the modules that fill them, `agents.curiosity` and `agents.networks`, because those
+import `Config`. A module of your own may add to them (agents/extending.md).
 """
 
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from typing import Any
 
 
 class Registry:
-    """What is known of one kind, by name."""
+    """Factories of one kind, by name."""
 
     def __init__(self, kind: str):
         """An empty table; `kind` is what messages call an entry."""
@@ -29,11 +28,11 @@ class Registry:
         """
         if name in self._factories:
             known = ", ".join(self.names())
-            raise ValueError(f"{self.kind} {name!r} is registered already; known: {known}")
+            raise ValueError(f"{self.kind} {name!r} is registered already; taken: {known}")
         self._factories[name] = factory
 
     def names(self) -> tuple[str, ...]:
-        """The names that are known."""
+        """All names, in the order of registration."""
         return tuple(self._factories)
 
     def factory(self, name: str) -> Callable[..., Any]:
@@ -44,7 +43,7 @@ class Registry:
         """
         if name not in self._factories:
             known = ", ".join(self.names())
-            raise ValueError(f"unknown {self.kind} {name!r}; known: {known}")
+            raise ValueError(f"unknown {self.kind} {name!r}; allowed: {known}")
         return self._factories[name]
 
 

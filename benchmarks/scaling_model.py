@@ -158,9 +158,9 @@ def repeated_seconds(config: Config, repeats: int = 5) -> float:
     def repeat(trajectory: Any) -> Any:
         distribution = ActionDistribution(logits, logits)
         actions = jax.lax.map(lambda key: sample_action(key, distribution), step_keys)
-        return actions, train.learner.prepare(state, trajectory)
+        return actions, train.prepare(state, trajectory)
 
-    trajectory = jax.jit(train.learner.play)(state.params, jax.random.key(1), jax.random.key(3))
+    trajectory = jax.jit(train.play)(state.params, jax.random.key(1), jax.random.key(3))
     return harness.measure(lambda _: repeat(trajectory), repeats).median_s
 
 

@@ -27,7 +27,7 @@ from agents.config import PRESETS
 from agents.curiosity import Experience
 from agents.networks.agent import Params
 from agents.networks.windows import encode_rows
-from agents.ppo.learner import Batch, Train, TrainState
+from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
 
@@ -106,9 +106,9 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     for _ in range(warm):
         state, _ = iterate(state)
     reset_keys = jax.random.split(state.key, config.episodes)
-    play = jax.jit(lambda state: train.learner.play(state.params, reset_keys, state.key))
+    play = jax.jit(lambda state: train.play(state.params, reset_keys, state.key))
     trajectory = play(state)
-    batch, _, _ = jax.jit(train.learner.prepare)(state, trajectory)
+    batch, _, _ = jax.jit(train.prepare)(state, trajectory)
     flop = useful_flop(train, state, batch)
     parts: list[tuple[str, Callable[[], Any], float]] = [
         ("iteration", lambda: iterate(state), sum(flop)),
@@ -128,7 +128,7 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     ]
 
 
-def useful_flop(train: Train, state: TrainState, batch: Batch) -> Flop:
+def useful_flop(train: Learner, state: TrainState, batch: Batch) -> Flop:
     """The useful operations of an iteration with these episodes; see `Part`."""
     config, agent = train.config, train.agent
 
@@ -143,7 +143,7 @@ def useful_flop(train: Train, state: TrainState, batch: Batch) -> Flop:
     per_step = matrix_flop(jax.make_jaxpr(step)(state.params, features))
     distinct = float(jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch))
     steps = float(jnp.sum(batch.episodes.mask))
-    outputs = 2 if train.learner.curiosity.needs_embeddings else 1
+    outputs = 2 if train.curiosity.needs_embeddings else 1
     # One pass forward, and one each for the derivatives by inputs and by kernels.
     passes = 3 * config.epochs
     return Flop(
@@ -205,7 +205,7 @@ def _accumulate(config: Config, gradient: Callable[[jax.Array], Params], params:
     return jax.lax.scan(add, zero, _minibatches(config))[0]
 
 
-def _encoder_only(train: Train, state: TrainState, batch: Batch) -> Params:
+def _encoder_only(train: Learner, state: TrainState, batch: Batch) -> Params:
     def total(params: Params, part: Batch) -> jax.Array:
         encode = functools.partial(encode_rows, train.agent.encoder)
         features = encode_episodes(
@@ -224,12 +224,12 @@ def _encoder_only(train: Train, state: TrainState, batch: Batch) -> Params:
     )
 
 
-def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajectory) -> Params:
+def _core_only(train: Learner, state: TrainState, batch: Batch, trajectory: Trajectory) -> Params:
     agent = train.agent
 
     def total(params: Params, features: jax.Array, part: Batch) -> jax.Array:
         given = (params, features, part.episodes.action, part.episodes.reward)
-        if train.learner.curiosity.needs_embeddings:
+        if train.curiosity.needs_embeddings:
             embedding, following = agent.unroll_both(*given)
             experience = Experience(
                 part.episodes,
@@ -239,7 +239,7 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
                 following,
                 agent.embed_action(params, part.episodes.action),
             )
-            own = train.learner.curiosity.losses(params["curiosity"], experience)
+            own = train.curiosity.losses(params["curiosity"], experience)
         else:
             embedding, own = agent.unroll(*given), {}
         everything = jax.tree.leaves((agent.act(params, embedding), own))
@@ -256,8 +256,8 @@ def _core_only(train: Train, state: TrainState, batch: Batch, trajectory: Trajec
     return _accumulate(train.config, gradient, state.params)
 
 
-def _optimizer_only(train: Train, state: TrainState) -> Params:
-    optimizer = train.learner.optimizer
+def _optimizer_only(train: Learner, state: TrainState) -> Params:
+    optimizer = train.optimizer
 
     def update(carry: Any, _: jax.Array) -> tuple[Any, None]:
         params, opt_state = carry
@@ -268,7 +268,7 @@ def _optimizer_only(train: Train, state: TrainState) -> Params:
     return jax.lax.scan(update, (state.params, state.opt_state), jnp.arange(steps))[0][0]
 
 
-def _jitted(function: Callable[..., Any], train: Train, *arrays: Any) -> Callable[[], Any]:
+def _jitted(function: Callable[..., Any], train: Learner, *arrays: Any) -> Callable[[], Any]:
     compiled = jax.jit(lambda *x: function(train, *x))
     return lambda: compiled(*arrays)
 

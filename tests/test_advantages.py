@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import trap_tube_jax as tt
 from agents import Config, make_train
-from agents.ppo import advantages
+from agents.acting.episodes import Episodes
+from agents.ppo import advantages, returns
 
 TINY = {
     "env_id": "pstsy", "episodes": 8, "minibatch": 4, "epochs": 1, "filters": (4, 4),
@@ -57,3 +59,24 @@ def test_training_with_two_streams_replays_and_frames():
     assert int(after.failures.next[0]) == failed % TINY["failures"]
     assert 0 <= float(metrics["replayed_success"]) <= 1
     assert all(np.isfinite(float(value)) for value in metrics.values())
+
+
+def test_without_curiosity_the_task_has_the_only_value():
+    train = make_train(Config.preset("best", **TINY, curiosity="none"))
+    params = jax.eval_shape(train.init_params, jax.random.key(0))
+    assert params["heads"]["params"]["value"]["kernel"].shape == (4, 1)
+    value = jax.random.normal(jax.random.key(2), (7, 8, 1))
+    ones = jnp.ones((6, 8))
+    episodes = Episodes(tt.base_state(), ones, ones, ones, ones, ones)
+    moments = (returns.Moments.zero(), returns.Moments.zero())
+    found, target, _ = advantages.of_streams(
+        train.config, episodes, jnp.zeros((6, 8)), 3.0, value, moments
+    )
+    expected = advantages.advantages_and_targets(train.config, ones, episodes, value[..., 0])
+    np.testing.assert_array_equal(found, expected[0])
+    np.testing.assert_array_equal(target[..., 0], expected[1])
+
+
+def test_more_steps_than_can_be_counted_are_refused():
+    with pytest.raises(ValueError, match=r"2,560,000,000 steps; allowed: at most 2,147,483,647"):
+        make_train(Config(max_steps=10_000))

@@ -27,10 +27,24 @@ class Corners(Curiosity):
         return jnp.all(agent % 11 == 0, axis=-1).astype(jnp.float32), memory + 1
 
 
+class Plain(Curiosity):
+    """Encodes without parameters, pays NaN after an episode's end, and has a loss of PPO's name."""
+
+    def encode(self, params, observation):
+        return observation.reshape(len(observation), -1)[:, :3] / 255.0
+
+    def reward(self, params, memory, experience):
+        mask = experience.episodes.mask
+        return experience.features[1:, :, 0] * 0 + 1 / mask - jnp.where(mask, 0.0, jnp.inf), memory
+
+    def losses(self, params, experience):
+        return {"value_loss": experience.episodes.mask}
+
+
 @pytest.fixture(scope="module")
 def trajectory():
     """Random episodes of {Sy}, 40 of 4 steps."""
-    learner = make_train(Config.from_dict({**TINY, "episodes": 40})).learner
+    learner = make_train(Config.from_dict({**TINY, "episodes": 40}))
     params = jax.jit(learner.init_params)(jax.random.key(0))
     reset_keys = jax.random.split(jax.random.key(1), 40)
     return jax.jit(learner.play)(params, reset_keys, jax.random.key(2))
@@ -43,7 +57,7 @@ def own_table(monkeypatch):
 
 def test_a_curiosity_of_ones_own_is_trained_with(trajectory):
     register("corners", lambda config, env: Corners())
-    train = make_train(Config.from_dict({**TINY, "curiosity": "corners"})).learner
+    train = make_train(Config.from_dict({**TINY, "curiosity": "corners"}))
     start = jax.jit(train.init)(jax.random.key(0))
     episodes = trajectory.episodes
     cells = episodes.cells.at[1, 0, 0].set(jnp.array([11, 0], jnp.uint8))
@@ -55,8 +69,27 @@ def test_a_curiosity_of_ones_own_is_trained_with(trajectory):
     assert memory == 1
 
 
+def test_a_curiosity_without_parameters_encodes_and_may_pay_anything_after_the_end(trajectory):
+    register("plain", lambda config, env: Plain())
+    train = make_train(Config.from_dict({**TINY, "curiosity": "plain"}))
+    episodes = trajectory.episodes
+    episodes = episodes._replace(mask=episodes.mask.at[2:, 0].set(0.0))
+    start = jax.jit(train.init)(jax.random.key(0))
+    shortened = trajectory._replace(episodes=episodes)
+    reward, _ = jax.jit(train.intrinsic_reward)(start, shortened)
+    np.testing.assert_array_equal(reward, episodes.mask)
+
+
+def test_losses_called_like_those_of_ppo_are_refused():
+    register("plain", lambda config, env: Plain())
+    train = make_train(Config.from_dict({**TINY, "curiosity": "plain"}))
+    start = jax.eval_shape(train.init, jax.random.key(0))
+    with pytest.raises(ValueError, match="need names of their own, got value_loss"):
+        jax.eval_shape(train.iterate, start)
+
+
 def test_names_are_checked_against_the_registry():
-    with pytest.raises(ValueError, match=r"unknown curiosity 'rdn'; known: icm, .*counts, none"):
+    with pytest.raises(ValueError, match=r"unknown curiosity 'rdn'; allowed: icm, .*counts, none"):
         Config(curiosity="rdn")
     with pytest.raises(ValueError, match="curiosity 'icm' is registered already"):
         register("icm", lambda config, env: Curiosity())

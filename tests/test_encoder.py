@@ -13,7 +13,7 @@ from agents.networks import chunks
 from agents.networks.convolution import convolve
 from agents.networks.encoder import Encoder
 from agents.networks.grouping import group_rows
-from agents.networks.layers import draw
+from agents.networks.layers import Deviation, draw
 from agents.networks.windows import cut_into_windows, encode_by_windows
 
 EPISODES, STEPS = 3, 6
@@ -52,7 +52,9 @@ def observation(request: pytest.FixtureRequest) -> jax.Array:
 def parameters(observation: jax.Array) -> Any:
     deviations = encoder.init(jax.random.key(0), observation[:1])
     # Biases too: what lies beyond the edge is zero only because nothing is added to it.
-    deviations = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else leaf + 0.1, deviations)
+    deviations = jax.tree.map(
+        lambda leaf: leaf if leaf.ndim > 1 else Deviation(leaf + 0.1), deviations
+    )
     return draw(jax.random.key(3), deviations)
 
 

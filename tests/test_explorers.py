@@ -23,7 +23,7 @@ SETTINGS = Config(
 
 
 def learner_of(name: str) -> Learner:
-    return make_train(Config.from_dict({**SETTINGS, "curiosity": name})).learner
+    return make_train(Config.from_dict({**SETTINGS, "curiosity": name}))
 
 
 def reward_of(name: str, features: Any, observation_id: Any) -> np.ndarray:

@@ -101,7 +101,7 @@ def test_the_pages_other_commands_run(trained):
 def test_the_pages_curiosity_pays_for_a_moved_tool(here, own_tables):
     config = Config(imports=("my_module",), env_id="cold", curiosity="tool-moved", encoder="flat",
                     episodes=4, minibatch=2, hidden=4, embedding=2, chunk=4)  # fmt: skip
-    learner = make_train(config).learner
+    learner = make_train(config)
     assert learner.env.max_steps == 30
     start = learner.init(jax.random.key(0))
     assert start.params["encoder"]["params"]["Dense_0"]["kernel"].shape == (432, 4)
@@ -131,7 +131,7 @@ def test_missing_modules_are_named(tmp_path, monkeypatch, capsys, own_tables):
         Config(imports=("needs_more",))
     with pytest.raises(ValueError, match=r"cannot import '\./x\.py': name a module"):
         import_modules(["./x.py"])
-    with pytest.raises(ValueError, match=r"imports must be names, got \('a', 3\)"):
+    with pytest.raises(ValueError, match=r"imports must be a tuple of names, got \('a', 3\)"):
         Config.from_dict({"imports": ["a", 3]})
 
 
@@ -143,7 +143,7 @@ def test_another_module_is_another_run(here, capsys, own_tables):
 
 
 def test_unknown_encoders_are_refused(capsys):
-    with pytest.raises(ValueError, match="unknown encoder 'flat'; known: paper, objects"):
+    with pytest.raises(ValueError, match="unknown encoder 'flat'; allowed: paper, objects"):
         Config(encoder="flat")
     assert "unknown encoder 'flat'" in refused(capsys, "--encoder", "flat", "--no-cache")
 

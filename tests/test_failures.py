@@ -1,4 +1,4 @@
-"""Failed tasks are played again, those failed more often apart, until newer ones push them out."""
+"""Failed tasks are played again, those failed more often apart, until newer ones overwrite them."""
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +15,19 @@ def failures() -> Failures:
     return Failures.untried(jax.random.key(0), LISTS, CAPACITY)
 
 
-def test_failed_tasks_rise_by_one_list_and_take_the_oldest_places(failures):
+def data(keys: jax.Array) -> np.ndarray:
+    return np.asarray(jax.random.key_data(keys))
+
+
+def test_failed_tasks_are_added_to_the_next_list_in_the_oldest_places(failures):
     keys = jax.random.split(jax.random.key(1), 6)
-    new = np.asarray(jax.random.key_data(keys))
+    new = data(keys)
     failed = jnp.array([True, False, True, True, True, True])
     # Three new tasks, two of the first list, one of the last.
     after = failures.remember(keys, failed, (2, 1))
-    once, twice = np.asarray(failures.keys)
-    np.testing.assert_array_equal(after.keys[0], [new[0], new[2], *once[2:]])
-    np.testing.assert_array_equal(after.keys[1], [new[3], new[4], *twice[2:]])
+    once, twice = data(failures.keys)
+    np.testing.assert_array_equal(data(after.keys[0]), [new[0], new[2], *once[2:]])
+    np.testing.assert_array_equal(data(after.keys[1]), [new[3], new[4], *twice[2:]])
     np.testing.assert_array_equal(after.next, [2, 2])
 
 
@@ -32,16 +36,36 @@ def test_places_are_filled_in_turn(failures):
     for pair in (keys[:2], keys[2:4], keys[4:]):
         failures = failures.remember(pair, jnp.array([True, True]), (0, 0))
     assert int(failures.next[0]) == 6 % CAPACITY
-    np.testing.assert_array_equal(failures.keys[0, 0], jax.random.key_data(keys)[5])
+    np.testing.assert_array_equal(data(failures.keys[0, 0]), data(keys[5]))
+
+
+def test_of_more_failures_than_places_the_last_are_kept(failures):
+    keys = jax.random.split(jax.random.key(1), 2 * CAPACITY + 3)
+    failed = jnp.ones(len(keys), bool).at[-2].set(False)
+    after = failures.remember(keys, failed, (0, 0))
+    kept = [*data(keys[-CAPACITY - 1 : -2]), data(keys[-1])]
+    assert {tuple(key) for key in data(after.keys[0])} == {tuple(key) for key in kept}
+    assert int(after.next[0]) == len(keys[:-1]) % CAPACITY
+
+
+@pytest.mark.parametrize(
+    "key", [jax.random.key(0, impl="rbg"), jax.random.PRNGKey(0)], ids=["rbg", "raw"]
+)
+def test_keys_of_any_kind_are_remembered(key):
+    failures = Failures.untried(key, LISTS, CAPACITY)
+    drawn = failures.draw(key, (2, 2))
+    after = failures.remember(drawn, jnp.ones(4, bool), (2, 2))
+    assert after.keys.dtype == failures.keys.dtype
+    np.testing.assert_array_equal(data(after.keys[1, :2]), data(drawn[:2]))
 
 
 def test_solved_tasks_stay(failures):
     keys = failures.draw(jax.random.key(1), (4, 4))
     after = failures.remember(keys, jnp.zeros(8, bool), (4, 4))
-    np.testing.assert_array_equal(after.keys, failures.keys)
+    np.testing.assert_array_equal(data(after.keys), data(failures.keys))
 
 
 def test_all_that_is_remembered_is_drawn_in_its_place(failures):
-    drawn = np.asarray(jax.random.key_data(failures.draw(jax.random.key(1), (300, 200))))
-    for part, keys in zip((drawn[:300], drawn[300:]), np.asarray(failures.keys), strict=True):
+    drawn = data(failures.draw(jax.random.key(1), (300, 200)))
+    for part, keys in zip((drawn[:300], drawn[300:]), data(failures.keys), strict=True):
         assert {tuple(key) for key in part} == {tuple(key) for key in keys}

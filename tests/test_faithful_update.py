@@ -25,7 +25,7 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def ours(recording: Recording) -> dict[str, Any]:
-    train = make_train(CONFIG).learner
+    train = make_train(CONFIG)
     params = recording.params("param", jax.jit(train.init_params)(jax.random.key(0)))
 
     @jax.jit

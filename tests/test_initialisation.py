@@ -1,10 +1,11 @@
 """How parameters are drawn."""
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.networks.layers import dense, draw, init_module, output_dense
+from agents.networks.layers import Deviation, dense, draw, init_module, output_dense
 
 
 def test_weights_have_the_variance_of_their_layer_and_biases_are_zero():
@@ -17,5 +18,15 @@ def test_weights_have_the_variance_of_their_layer_and_biases_are_zero():
 
 
 def test_parameters_of_the_same_shape_differ():
-    one, other = draw(jax.random.key(0), [jnp.ones(9), jnp.ones(9)])
+    one, other = draw(jax.random.key(0), [Deviation(jnp.ones(9)), Deviation(jnp.ones(9))])
     assert not np.any(np.isclose(one, other))
+
+
+def test_layers_of_flax_start_as_flax_has_it():
+    mixed = nn.Sequential([dense(4), nn.LayerNorm(), nn.Dense(4)])
+    keys = jax.random.split(jax.random.key(0))
+    one, other = (init_module(mixed, key, jnp.ones((1, 3)))["params"] for key in keys)
+    np.testing.assert_array_equal(one["layers_1"]["scale"], 1)
+    assert not np.any(np.isclose(one["layers_2"]["kernel"], other["layers_2"]["kernel"]))
+    own = nn.Dense(4).init(keys[0], jnp.ones((1, 4)))["params"]["kernel"]
+    np.testing.assert_allclose(np.std(one["layers_2"]["kernel"]), np.std(own), rtol=0.5)

@@ -148,8 +148,10 @@ def test_a_policy_may_draw_its_actions(run_path):
 def test_impossible_requests_are_refused(run_path, tmp_path):
     policy = Policy("x", CONFIG, random_params(0), 1, greedy=False)
     observation = jax.vmap(tt.observe)(make_tasks())
-    with pytest.raises(ValueError, match=r"must be of shape \(3, 12, 12, 1\), got \(4, 12, 12, 1"):
+    with pytest.raises(ValueError, match=r"must be uint8\[3, 12, 12, 1\], got uint8\[4, 12, 12, 1"):
         policy.act(observation, policy.initial(3), jax.random.key(0))
+    with pytest.raises(ValueError, match=r"got float32\[4, 12, 12, 1\]"):
+        policy.act(observation / 255, policy.initial(4), jax.random.key(0))
     with pytest.raises(ValueError, match="a policy that draws its actions needs a key"):
         policy.act(observation, policy.initial(4))
     with pytest.raises(ValueError, match=r"mine has no seed 5; allowed: 3, 4"):

@@ -72,7 +72,7 @@ def test_more_successes_than_places(empty):
 @pytest.fixture(scope="module")
 def learner() -> Any:
     """A learner, parameters, and the imitation's loss and gradient beside a minibatch."""
-    train = make_train(CONFIG).learner
+    train = make_train(CONFIG)
     params = jax.jit(train.init_params)(jax.random.key(0))
     others = played([0, 2], [False, True])
     nothing = jnp.zeros((STEPS, 2))

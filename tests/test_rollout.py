@@ -181,7 +181,7 @@ class Problem(NamedTuple):
 @functools.cache
 def prepared(curiosity):
     """A learner with fresh parameters, and the batch that it makes of episodes."""
-    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity})).learner
+    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity}))
 
     @jax.jit
     def prepare(trajectory):

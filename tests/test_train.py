@@ -169,7 +169,7 @@ def refused(capsys, *arguments, command=main):
         ("--env p --env-id st", "--env p contradicts --env-id st"),
         ("--minibatch 3 --episodes 8", "minibatch must divide episodes=8, got 3; allowed: 1, 2"),
         ("--episodess 8", "Unrecognized options: --episodess, 8"),
-        ("--curiosity icmm", "unknown curiosity 'icmm'; known: icm, "),
+        ("--curiosity icmm", "unknown curiosity 'icmm'; allowed: icm, "),
         ("--discount 2", "discount must lie in [0, 1], got 2"),
         ("--seed -1", "seed must be an integer >= 0, got -1"),
         ("--seeds 0", "seeds must be an integer >= 1, got 0"),

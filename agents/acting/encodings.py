@@ -43,7 +43,7 @@ def encode_episodes(
         jax.tree.map(lambda x: x[episode], episodes.layout), episodes.cells[time, episode]
     )
     features = chunks.map_rows(encode_rows, chunk, params, rows, groups.total)
-    return jax.tree.map(lambda x: x[groups.number].reshape(*shape, -1), features)
+    return jax.tree.map(lambda x: x[groups.number].reshape(*shape, *x.shape[1:]), features)
 
 
 class Cache(NamedTuple):
@@ -53,8 +53,8 @@ class Cache(NamedTuple):
       layout_id: i32[B], equal only for equal layouts.
       position: i32[T + 1, B], see `position_id`.
       features: f32[T + 1, B, F].
-      newest: i32[S], by hash of an observation, where above (time * B + episode) it was last
-        met; -1 where it never was. Of observations with the same hash, one is forgotten.
+      newest: i32[S], by hash: the flat index time * B + episode at which an observation with this
+        hash was last seen, -1 where none was. A later one overwrites an earlier one.
     """
 
     layout_id: jax.Array

@@ -72,11 +72,14 @@ class Policy(NamedTuple):
           The actions i32[B, 2], (grasp, move) each, and the next carry.
 
         Raises:
-          ValueError: the shape of `observation` is wrong, or a key is missing.
+          ValueError: shape or type of `observation` is wrong, or a key is missing.
         """
         wanted = (len(carry.action_tm1), BOARD_SIZE, BOARD_SIZE, self.config.num_features)
-        if observation.shape != wanted:
-            raise ValueError(f"observation must be of shape {wanted}, got {observation.shape}")
+        if observation.shape != wanted or observation.dtype != jnp.uint8:
+            raise ValueError(
+                f"observation must be uint8{list(wanted)}, "
+                f"got {observation.dtype}{list(observation.shape)}"
+            )
         if key is None and not self.greedy:
             raise ValueError("a policy that draws its actions needs a key; greedy ones do not")
         agent = _agent(self.config)

@@ -74,12 +74,15 @@ class Curiosity:
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The intrinsic reward f32[T, B] of every step, before scaling, and the new memory.
 
-        Values after an episode's end are ignored.
+        Values after an episode's end are ignored, whatever they are.
         """
         del params
         return jnp.zeros_like(experience.episodes.reward), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
-        """Terms of the loss by name, f32[T, B] each; {} if nothing is trained."""
+        """Terms of the loss by name, f32[T, B] each, finite also after an episode's end.
+
+        {} if nothing is trained. Names are other than those of PPO's terms (`Learner.loss`).
+        """
         del params, experience
         return {}

@@ -62,7 +62,7 @@ def observation_slots(episodes: Episodes) -> jax.Array:
     position = position_ids(episodes)
     layout = jnp.broadcast_to(layout_hashes(episodes.layout), position.shape)
     rows = jnp.stack([layout, position.astype(jnp.uint32)], axis=-1)
-    return slots(rows.reshape(-1, 2), SLOT_BITS).reshape(position.shape)
+    return slots(rows, SLOT_BITS)
 
 
 def visit_bonus(visits: jax.Array, slot: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -41,7 +41,7 @@ class Effects(Curiosity):
         self._keep = config.reward_rate
 
     def memory(self) -> jax.Array:
-        """The rates f32[3]; 0 before the first batch, which is taken as it is."""
+        """The rates f32[3]; each is 0 until it is first above 0, and is then taken as it is."""
         return jnp.zeros(NUM_KINDS)
 
     def reward(
@@ -80,5 +80,4 @@ def new_touches(episodes: Episodes) -> jax.Array:
     hand = jnp.clip(hand, 0, BOARD_SIZE - 1)
     time, episode = jnp.indices(hand.shape[:2])
     look = episodes.observations()[time, episode, hand[..., 0], hand[..., 1]]
-    look = hash_rows(look.reshape(-1, look.shape[-1])).reshape(on_board.shape)
-    return first_visits(jnp.where(on_board, look, 0)) * on_board
+    return first_visits(jnp.where(on_board, hash_rows(look), 0)) * on_board

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from agents.config import Config
-from agents.curiosity.base import Curiosity, Experience, Params
+from agents.curiosity.base import Experience, Params
+from agents.curiosity.icm import ICM
 from agents.curiosity.models import ForwardModel, InverseFeatures
 from agents.networks.actions import ActionDistribution
 from agents.networks.layers import init_module
@@ -51,11 +52,18 @@ class Models(InverseFeatures):
         return jnp.square(predicted - there), self.inverse(features, next_features)
 
 
-class DetachedICM(Curiosity):
-    """Forward and inverse models over features of its own; reward and losses as in `ICM`."""
+class DetachedICM(ICM):
+    """Forward and inverse models over features of its own; reward and losses are those of `ICM`.
+
+    Attributes:
+      detached: as in `Models`.
+    """
+
+    needs_embeddings = False
+    detached = True
 
     def __init__(self, config: Config):
-        self._models = Models(config.hidden, config.filters)
+        self._models = Models(config.hidden, config.filters, self.detached)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of the encoder and of both models."""
@@ -65,19 +73,6 @@ class DetachedICM(Curiosity):
         """Features of its own encoder, f32[M, filters[1]]."""
         features: Any = self._models.apply(params, observation, method=Models.encode)
         return features
-
-    def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
-        """The sum over units of the forward model's squared errors."""
-        error, _ = self.predict(params, experience)
-        return jnp.sum(error, axis=-1), memory
-
-    def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
-        """The mean over units of the same errors, and -log p(action)."""
-        error, action = self.predict(params, experience)
-        return {
-            "forward_loss": jnp.mean(error, axis=-1),
-            "inverse_loss": -action.log_prob(experience.episodes.action),
-        }
 
     def predict(self, params: Params, experience: Experience) -> Any:
         """The squared errors f32[T, B, F] of the predicted features, and the inferred action."""

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from agents.acting.identity import visits
-from agents.config import Config
 from agents.curiosity.base import Experience, Params
-from agents.curiosity.icm_detached import DetachedICM, Models
+from agents.curiosity.icm_detached import DetachedICM
 
 
 class RIDE(DetachedICM):
@@ -21,9 +20,7 @@ class RIDE(DetachedICM):
     which both the forward and the inverse loss shape; the losses are those of `ICM`.
     """
 
-    def __init__(self, config: Config):
-        super().__init__(config)
-        self._models = Models(config.hidden, config.filters, detached=False)
+    detached = False
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The change of the features, over the root of the visits."""

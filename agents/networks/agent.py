@@ -30,20 +30,21 @@ class Agent:
         self.heads = Heads(config.streams)
         self.facing = config.facing
         self._hidden = config.hidden
-        self._board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
+        self._num_features = config.num_features
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters."""
-        unused_key = jax.random.key(0)
-        features, encoder = self.encoder.init_with_output(unused_key, self._board)
+        encoder_key = jax.random.fold_in(key, 0)
+        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self._num_features), jnp.uint8)
+        features, encoder = self.encoder.init_with_output(encoder_key, board)
         state = jnp.zeros((1, self._hidden))
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
-        deviations = {
+        params = {
             "encoder": encoder,
-            "core": self.core.init(unused_key, state, features, action, reward),
-            "heads": self.heads.init(unused_key, state),
+            "core": self.core.init(key, state, features, action, reward),
+            "heads": self.heads.init(key, state),
         }
-        return draw(key, deviations)
+        return draw(key, params)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features f32[M, F] of observations u8[M, 12, 12, N]; reads `params["encoder"]`."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from agents.networks.shared_maximum import shared_maximum
 
-REMEMBERED_BYTES = 2**26  # by one `map_rows`; changes speed, not results
+REMEMBERED_BYTES = 2**26  # by one `map_rows`; changes speed and nothing else
 
 
 class RowFn(Protocol):
@@ -88,7 +88,7 @@ def _map_rows_forward(
         for length, shape in zip((num_chunks, num_remembered + 1), shapes, strict=True)
     )
     features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, outputs)
-    features = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:num_rows], features)
+    features = jax.tree.map(lambda x: jax.lax.collapse(x, 0, 2)[:num_rows], features)
     return features, (params, rows, count, memory)
 
 

@@ -44,8 +44,8 @@ def group(*keys: jax.Array) -> Groups:
 def group_rows(content: jax.Array) -> Groups:
     """Groups rows integer[M, K] that agree everywhere.
 
-    Every row looks up whom a table names at its hash, and joins them if they are equal. Equal
-    rows are in one group unless the table names another for them; different ones never are.
+    Each row is compared with one row of the same hash, and joins its group if the two are equal.
+    Different rows are never in one group. Equal rows may be in two if hashes collide.
     """
     own = jnp.arange(len(content))
     slot = slots(content, SLOT_BITS)
@@ -62,14 +62,15 @@ def group_rows(content: jax.Array) -> Groups:
 
 
 def slots(content: jax.Array, bits: int) -> jax.Array:
-    """A hash i32[M] of rows integer[M, K], below 2**bits, to look them up in a table by."""
+    """A hash i32[...] of rows integer[..., K], below 2**bits, to look them up in a table by."""
     return (hash_rows(content) >> (32 - bits)).astype(jnp.int32)
 
 
 def hash_rows(content: jax.Array) -> jax.Array:
-    """A hash u32[M] of every row of integer[M, K]; its high bits are the best."""
-    weights = np.random.default_rng(0).integers(1, 2**32, content.shape[1], np.uint32)
-    return jnp.sum(content.astype(jnp.uint32) * weights[None], axis=1, dtype=jnp.uint32)
+    """A hash u32[...] of every row of integer[..., K]; its high bits are the best."""
+    weights = np.random.default_rng(0).integers(1, 2**32, content.shape[-1], np.uint32)
+    weights = weights.reshape((1,) * (content.ndim - 1) + (-1,))
+    return jnp.sum(content.astype(jnp.uint32) * weights, axis=-1, dtype=jnp.uint32)
 
 
 def _differs_from_previous(key: jax.Array) -> jax.Array:

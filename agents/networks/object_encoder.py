@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from agents.networks.grouping import hash_rows
 from agents.networks.layers import dense
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS
 from trap_tube_jax.state import base_state
@@ -68,9 +69,8 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
       the agent, 12 + 12, of the food, 12 + 12, and of the food as seen from the agent, 23 + 23.
     """
     num_features = observation.shape[-1]
-    weights = np.random.default_rng(0).integers(1, 2**32, num_features, np.uint32)
-    color = _hash_colors(observation, weights)
-    own_colors = _hash_colors(base_state(num_features).palette, weights)
+    color = hash_rows(observation)
+    own_colors = hash_rows(base_state(num_features).palette)
     anchors = [color == own_colors[thing] for thing in (AGENT, FOOD)]
 
     lines = _objects(color, left=~(anchors[0] | anchors[1]))
@@ -162,9 +162,3 @@ def _unpack(bits: jax.Array, count: int) -> jax.Array:
     """The lowest bits of u32[...] as flags bool[..., count]."""
     places = np.arange(count, dtype=np.uint32).reshape((1,) * bits.ndim + (-1,))
     return (bits[..., None] >> places) & 1 == 1
-
-
-def _hash_colors(colors: jax.Array, weights: np.ndarray) -> jax.Array:
-    """u8[..., N] to u32[...], different for different colours but for rare collisions."""
-    weights = weights.reshape((1,) * (colors.ndim - 1) + (-1,))
-    return jnp.sum(colors.astype(jnp.uint32) * weights, axis=-1, dtype=jnp.uint32)

@@ -1,4 +1,4 @@
-"""Advantages, and what the values are to become, from the rewards of episodes.
+"""Advantages and value targets from the rewards of episodes.
 
 Two rules join the task's reward and the curiosity's: `of_sum` adds the rewards, `of_streams` the
 advantages.
@@ -87,12 +87,14 @@ def of_streams(
 
     Arguments and results are those of `of_sum`, but for two streams, the task's and the
     curiosity's: values f32[T + 1, B, 2], their targets f32[T, B, 2], and the second moments are
-    those of the intrinsic returns.
+    those of the intrinsic returns. Without a curiosity there is one stream, the task's.
     """
     gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
     mask = episodes.mask
-    intrinsic = moments[1].update(discounted_returns(novelty, gamma), mask, config.reward_rate)
     task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
+    if config.streams == 1:
+        return task, task_target[..., None], moments
+    intrinsic = moments[1].update(discounted_returns(novelty, gamma), mask, config.reward_rate)
     own = continuing_value(value[..., 1], mask)
     discount = jnp.full_like(novelty, gamma)
     reward = RETURN_DEVIATION * novelty / intrinsic.deviation

@@ -8,11 +8,12 @@ Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO"
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from agents import curiosity as curiosities
@@ -34,6 +35,8 @@ from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.registry import make
 
 Metrics = dict[str, jax.Array]
+
+MAX_STEPS = np.iinfo(np.int32).max  # of `TrainState.transitions`
 
 
 class TrainState(NamedTuple):
@@ -88,7 +91,8 @@ class Batch(NamedTuple):
 class Learner:
     """The parts of training, and what one iteration does with them. Holds no parameters.
 
-    All methods are pure functions of arrays.
+    `init` and `iterate` are all that training needs: jit `iterate`, and vmap both over seeds. All
+    methods are pure functions of arrays.
 
     Attributes:
       config: the settings.
@@ -106,8 +110,9 @@ class Learner:
     optimizer: optax.GradientTransformation
     shards: Shards = ALONE
 
+    @functools.partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array) -> TrainState:
-        """The first state."""
+        """The first state, compiled as one program."""
         params_key, failures_key, key = jax.random.split(key, 3)
         params = self.init_params(params_key)
         zero = jnp.zeros((), jnp.int32)
@@ -213,7 +218,7 @@ class Learner:
             "intrinsic_reward": jnp.sum(novelty) / jnp.sum(episodes.mask),
             "distinct_observations": jnp.max(batch.observation_id) + 1,
         }
-        if config.num_replayed:
+        if sum(config.num_replayed):
             solved = episodes.solved[config.num_new :]
             metrics["replayed_success"] = jnp.mean(solved.astype(jnp.float32))
         state = state._replace(
@@ -239,7 +244,9 @@ class Learner:
             experience = experience._replace(observation_id=everyones)
         own = state.params.get("curiosity", {})
         reward, memory = self.curiosity.reward(own, state.memory, experience)
-        reward = reward * experience.episodes.mask
+        mask = experience.episodes.mask
+        chex.assert_equal_shape([reward, mask])
+        reward = jnp.where(mask > 0, reward, 0.0)
         if self.config.episodic_novelty:
             reward = reward * first_visits(experience.observation_id)[1:]
         if not self.curiosity.needs_all_episodes:
@@ -251,10 +258,11 @@ class Learner:
         episodes = trajectory.episodes
         observation_id = observation_ids(episodes)
         features = jnp.zeros((*observation_id.shape, 0))
-        if self._curiosity_width:
+        if type(self.curiosity).encode is not Curiosity.encode:
             encode = _without_memory(self.curiosity.encode)
+            own = params.get("curiosity", {})
             features = encode_episodes(
-                encode, params["curiosity"], episodes, observation_id, chunk=self.config.chunk
+                encode, own, episodes, observation_id, chunk=self.config.chunk
             )
         experience = Experience(episodes, observation_id, features)
         if not self.curiosity.needs_embeddings:
@@ -308,12 +316,16 @@ class Learner:
           L = policy + value - entropy + curiosity_coef * curiosity's losses
               - imitation_coef * sum_t G_t log pi(a_t | o_t) / steps, of remembered successes
 
-        Beside the terms: the sums of the entropy over `steps`, and of those.
+        Also returned: `entropy`, summed over the steps before an episode's end, and `steps`, their
+        number.
 
         Args:
           params: the parameters to differentiate by.
           batch: this device's part of a minibatch.
           imitated: its part of the episodes to imitate, if any are.
+
+        Raises:
+          ValueError: the curiosity calls a loss of its own like one of PPO's.
         """
         config, mask = self.config, batch.episodes.mask
         embedding, experience = self.learning_experience(params, batch, imitated)
@@ -321,7 +333,7 @@ class Learner:
         actions, value = self.agent.act(params, played)
         log_prob = actions.log_prob(batch.episodes.action)
         surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
-        value_error = jnp.sum(losses.squared_error(value, batch.value_target), axis=-1)
+        value_error = jnp.sum(optax.squared_error(value, batch.value_target), axis=-1)
         entropy = actions.entropy()
         terms = {
             "policy_loss": losses.padded_mean(surrogate, mask),
@@ -329,6 +341,10 @@ class Learner:
             "entropy_loss": -config.entropy_coef * losses.padded_mean(entropy, mask),
         }
         own = self.curiosity.losses(params.get("curiosity", {}), experience)
+        if taken := own.keys() & {*terms, "imitation_loss", "loss", "entropy", "steps"}:
+            raise ValueError(
+                f"a curiosity's losses need names of their own, got {', '.join(sorted(taken))}"
+            )
         for name, term in own.items():
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         if imitated is not None:
@@ -354,10 +370,9 @@ class Learner:
             observation_id = jnp.concatenate([observation_id, other_id], axis=1)
         read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
         encode = functools.partial(_encode_both, self.agent, self.curiosity)
-        features = encode_episodes(encode, read, both, observation_id, chunk=self.config.chunk)
-        width, size = features.shape[-1] - self._curiosity_width, batch.log_prob.shape[1]
-        features, own = features[..., :width], features[:, :size, width:]
-        experience = Experience(batch.episodes, batch.observation_id, own)
+        features, own = encode_episodes(encode, read, both, observation_id, chunk=self.config.chunk)
+        size = batch.log_prob.shape[1]
+        experience = Experience(batch.episodes, batch.observation_id, own[:, :size])
         given = (params, features, both.action, both.reward)
         if not self.curiosity.needs_embeddings:
             return self.agent.unroll(*given), experience
@@ -368,54 +383,12 @@ class Learner:
             action_embedding=self.agent.embed_action(params, batch.episodes.action),
         )
 
-    @functools.cached_property
-    def _curiosity_width(self) -> int:
-        """How many features the curiosity makes of an observation."""
-        shape = (1, BOARD_SIZE, BOARD_SIZE, self.config.num_features)
-        params = jax.eval_shape(self.init_params, jax.random.key(0)).get("curiosity", {})
-        board = jax.ShapeDtypeStruct(shape, jnp.uint8)
-        return jax.eval_shape(self.curiosity.encode, params, board).shape[-1]
-
     def _whole(self, record: Any) -> Any:
         """A record of all devices' episodes from those of each."""
         return along_episodes(lambda axis, x: self.shards.whole(x, axis), record)
 
 
-class Train(NamedTuple):
-    """Training as two pure functions; jit `iterate`, and vmap both over seeds.
-
-    Attributes:
-      init: PRNG key to the first state.
-      iterate: a state to the next one and metrics, f32[] each.
-      learner: what they are made of.
-    """
-
-    init: Callable[[jax.Array], TrainState]
-    iterate: Callable[[TrainState], tuple[TrainState, Metrics]]
-    learner: Learner
-
-    @property
-    def config(self) -> Config:
-        """The settings."""
-        return self.learner.config
-
-    @property
-    def env(self) -> Environment:
-        """The environment."""
-        return self.learner.env
-
-    @property
-    def agent(self) -> Agent:
-        """The policy network's functions."""
-        return self.learner.agent
-
-    @property
-    def shards(self) -> Shards:
-        """How `iterate` divides its episodes over devices."""
-        return self.learner.shards
-
-
-def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Train:
+def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Learner:
     """Builds training from its settings.
 
     Args:
@@ -424,7 +397,8 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
       shards: how to divide the episodes; more than one only within `Placement.shard`.
 
     Raises:
-      ValueError: `env` contradicts `config`, or the curiosity is not for this environment.
+      ValueError: `env` contradicts `config`, the curiosity is not for this environment, or the
+        environment steps are too many to count.
     """
     if env is None:
         env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
@@ -434,18 +408,23 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
                 f"the environment's {name} is {getattr(env, name)}, the config's "
                 f"{getattr(config, name)}; they must agree"
             )
+    steps = config.iterations * config.episodes * env.max_steps
+    if steps > MAX_STEPS:
+        raise ValueError(
+            f"iterations={config.iterations} of {config.episodes} episodes of {env.max_steps} "
+            f"steps are {steps:,} steps; allowed: at most {MAX_STEPS:,}"
+        )
     curiosity = curiosities.make(config, env)
-    learner = Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
-    return Train(jax.jit(learner.init), learner.iterate, learner)
+    return Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
 
 
 def _encode_both(
     agent: Agent, curiosity: Curiosity, params: Params, observation: jax.Array, remembered: Any
-) -> tuple[jax.Array, Any]:
-    """The policy's features, then the curiosity's; a row function of `chunks.map_rows`."""
+) -> tuple[tuple[jax.Array, jax.Array], Any]:
+    """The policy's features and the curiosity's; a row function of `chunks.map_rows`."""
     features, remembered = encode_rows(agent.encoder, params["encoder"], observation, remembered)
     own = curiosity.encode(params.get("curiosity", {}), observation)
-    return jnp.concatenate([features, own], axis=-1), remembered
+    return (features, own), remembered
 
 
 def _without_memory(encode: Any) -> Any:

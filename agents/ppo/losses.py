@@ -39,9 +39,3 @@ def clipped_surrogate(
     ratio = jnp.exp(log_prob - old_log_prob)
     clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
     return -jnp.minimum(ratio * advantage, clipped * advantage)
-
-
-def squared_error(prediction: jax.Array, target: jax.Array) -> jax.Array:
-    """(prediction - target)^2, f32[...]."""
-    chex.assert_equal_shape([prediction, target])
-    return jnp.square(prediction - target)

@@ -1,4 +1,4 @@
-"""The published baseline's optimiser: Adam in the form that bounds the uncorrected moments."""
+"""The published baseline's optimiser: Adam with epsilon added before the correction of bias."""
 
 from typing import Any, NamedTuple
 
@@ -8,7 +8,7 @@ import optax
 
 from agents.config import Config
 
-LAST_STEP_SIZE = 1 / 50  # that of the last gradient step of a cooldown, beside the first
+LAST_STEP_SIZE = 1 / 50  # of the last gradient step of a cooldown, as a fraction of the first
 
 
 class AdamState(NamedTuple):
@@ -32,7 +32,7 @@ def adam(
     beta2: float = 0.999,
     epsilon: float = 1e-7,
 ) -> optax.GradientTransformation:
-    """Adam with epsilon beside the uncorrected second moment.
+    """Adam with epsilon added to the root of the uncorrected second moment.
 
       m <- beta1 m + (1 - beta1) g,  v <- beta2 v + (1 - beta2) g^2,
       step = -learning_rate sqrt(1 - beta2^t) / (1 - beta1^t) * m / (sqrt(v) + epsilon).

@@ -68,7 +68,7 @@ def load(path: Path | Traversable, name: str | None = None) -> Policy:
     try:
         config = Config.from_dict(header["config"])
         arrays = {key: array.astype(np.float32) for key, array in arrays.items()}
-        template = jax.eval_shape(make_train(config).learner.init_params, jax.random.key(0))
+        template = jax.eval_shape(make_train(config).init_params, jax.random.key(0))
         params = jax.tree.map(jnp.asarray, from_arrays(arrays, template))
     except ValueError as error:
         raise ValueError(f"{path} does not fit this version: {error}") from error

@@ -86,7 +86,7 @@ def load_run(path: Path, iteration: int | None = None) -> list[Policy]:
     with checkpoint.Checkpoints(folder.checkpoints) as checkpoints:
         arrays, record = checkpoints.load(iteration)
         params = jax.tree.map(jnp.asarray, checkpoint.subtree(arrays, "params"))
-        expected = jax.eval_shape(make_train(run.config).learner.init_params, jax.random.key(0))
+        expected = jax.eval_shape(make_train(run.config).init_params, jax.random.key(0))
         try:
             seeds = [jax.tree.map(lambda x, i=i: x[i], params) for i in range(run.seeds)]
             checkpoint.from_arrays(checkpoint.to_arrays(seeds[0]), expected)

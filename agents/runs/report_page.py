@@ -222,7 +222,7 @@ def compile_pay(config: Config, state: TrainState, evaluator: Evaluator) -> Pay:
       state: the state of training of one seed, or its shapes.
       evaluator: that of the page, for the number of tasks and the step limit.
     """
-    learner = make_train(config).learner
+    learner = make_train(config)
     longest = max(evaluator.limits.values())
     env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
 

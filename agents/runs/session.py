@@ -19,7 +19,7 @@ from agents.acting.policy import Policy
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import DEFAULT_DEVICE, Placement
-from agents.ppo.learner import Train, TrainState, make_train
+from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
@@ -338,7 +338,7 @@ class Session:
         self._say([f"{name:>15}: {path}" for name, path in files.items()])
 
 
-def make_advance(train: Train, num_seeds: int) -> Advance:
+def make_advance(train: Learner, num_seeds: int) -> Advance:
     """One iteration of every seed and the greedy evaluation after it, as a pure function.
 
     The function takes the states [S, ...] and bool[S], the seeds to advance; the others stay
