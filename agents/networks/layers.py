@@ -13,16 +13,17 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import flax
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from flax.core import meta
 
 TRUNCATED_DEVIATION = 0.87962566103423978  # of a standard normal variable cut off at -2 and 2
 
 
-class Deviation(flax.struct.PyTreeNode, flax.core.meta.AxisMetadata):
+class Deviation(struct.PyTreeNode, meta.AxisMetadata):
     """A parameter that is still to be drawn.
 
     Modules see its value in the meantime.
