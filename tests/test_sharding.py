@@ -157,8 +157,8 @@ def refused(capsys, arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--devices 2", "seeds=1 divide into, got 2; allowed: 1"),
-        ("--devices 0", "got 0; allowed: 1"),
+        ("--devices 2", "2 devices cannot share minibatch="),
+        ("--devices 0", "are there; allowed: 1"),
         ("--coordinator a:1", "coordinator, processes and process_id belong together"),
         ("--coordinator a --processes 2 --process-id 0", "coordinator must be HOST:PORT, got 'a'"),
         ("--coordinator a:1 --processes 2 --process-id 2", "process_id must lie in [0, 1], got 2"),

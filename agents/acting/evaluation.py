@@ -27,8 +27,8 @@ class Evaluation(NamedTuple):
       solved: bool[B].
       length: i32[B], steps taken.
       action: i32[B, T, 2], (grasp, move); without meaning from `length` on.
-      value: f32[B, T], the network's value of every state, of the task's rewards where each
-        stream of rewards has its own; likewise.
+      value: f32[B, T], the network's value of every state; of the task's rewards alone where the
+        intrinsic reward has a value of its own. Without meaning from `length` on, too.
     """
 
     solved: jax.Array

@@ -1,8 +1,8 @@
 """A frame of reference: the board, turned and mirrored so that the food lies ahead.
 
 The rules are the same under the eight symmetries of the board. So an agent may look at a mirror
-image and act in it. One that chooses the image by what it sees first, where the food is from
-where it stands itself, has an eighth of the situations to learn. The frame holds for the episode.
+image and act in it. One that chooses the image by the food's position relative to its own, as it
+first sees them, has an eighth of the situations to learn. The frame holds for the episode.
 
 Source: own; frames are averaged over, and chosen, in Puny et al. (2022).
 """

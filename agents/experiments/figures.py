@@ -127,13 +127,20 @@ def _save(
 
 
 def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
-    """Every seed as a thin line, and their mean as far as there are all of them."""
+    """Every seed as a thin line, and their mean; without it where some stopped earlier."""
+    shared, complete = _of_all_seeds(episodes, values)
+    all_end_together = len(shared) == len(episodes)
+    if all_end_together:
+        axis.plot(shared, np.mean(complete, axis=0), linewidth=1.6, **style)
     if len(values) > 1:
+        label = None if all_end_together else style["label"]
         for row in values:
             known = ~np.isnan(row)
-            axis.plot(episodes[known], row[known], color=style["color"], linewidth=0.8, alpha=0.35)
-    shared, values = _of_all_seeds(episodes, values)
-    axis.plot(shared, np.mean(values, axis=0), linewidth=1.6, **style)
+            axis.plot(
+                episodes[known], row[known], color=style["color"], linewidth=0.8,
+                alpha=0.35 if all_end_together else 0.7, label=label,
+            )  # fmt: skip
+            label = None
 
 
 def _draw_spread(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:

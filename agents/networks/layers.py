@@ -11,7 +11,7 @@ Source: agents/agent.md, "Network".
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import flax.linen as nn
 import jax
@@ -38,11 +38,11 @@ class Deviation(struct.PyTreeNode, meta.AxisMetadata):
         """The value."""
         return self.value
 
-    def replace_boxed(self, val: Any) -> "Deviation":
+    def replace_boxed(self, val: Any) -> Self:
         """The same with another value."""
         return self.replace(value=val)
 
-    def add_axis(self, index: int, params: dict[Any, Any]) -> "Deviation":
+    def add_axis(self, index: int, params: dict[Any, Any]) -> Self:
         """Itself: axes have no names."""
         del index, params
         return self

@@ -3,9 +3,9 @@
 Up to its first pooling, the encoder turns a 4x4 window of the observation into the features of
 one 2x2 block of the board. An observation is 36 windows, and most of them repeat: one step of an
 episode changes a handful. So a batch of observations is cut into windows. Each distinct window
-goes through the first two convolutions once, and then through the third one, which is linear, as
-far as to say what it adds to each of the cells around. Adding that up, and all that follows, is
-done observation by observation.
+goes through the first two convolutions once. The third one is linear, so what a window contributes
+to each of the cells around it is computed once, too. Adding these contributions up, and all that
+follows, is done observation by observation.
 
 Features and gradient are those of `Encoder`, up to the order of float32 sums; tests compare them.
 Nothing but speed depends on this module: `encode_rows` may as well apply any encoder as it is.
@@ -33,7 +33,7 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 WINDOW = 4  # cells a side, of which the first pooling sees one 2x2 block of features
 BLOCKS = BOARD_SIZE // 2
-WINDOW_CHUNK = 128  # distinct windows that are encoded at once; changes speed, not results
+WINDOW_CHUNK = 128  # distinct windows that are encoded at once; changes speed, and results by rounding
 
 Weights = Any  # nested dictionaries of arrays: the parameters of `Encoder`, or of a layer in it
 

@@ -1,13 +1,14 @@
 """The same training over several devices: what each computes, and what they exchange.
 
-A mesh has two axes, `seeds` and `episodes`. Along `seeds` nothing is exchanged. Along
+A mesh has two axes, `seeds` and `episodes`. Along `seeds` nothing but metrics is exchanged. Along
 `episodes` every device holds all parameters and computes what is expensive for its own share
-alone: it plays its episodes, and of every minibatch it differentiates its part. In between
-come two exchanges:
+alone: it plays its episodes, computes what the curiosity pays for them, and differentiates its
+part of every minibatch. Three things are exchanged:
 
-  1. once per iteration, the episodes without their features (two kilobytes each) are
-     gathered, and every device derives rewards and advantages from all of them;
-  2. once per gradient step, gradient and metrics are averaged in one reduction.
+  1. once per iteration, the episodes without their features (two kilobytes each) and their
+     intrinsic rewards, from which every device computes all advantages;
+  2. once per gradient step, gradient and metrics, averaged in one reduction;
+  3. the outcomes of evaluation.
 
 `jax.shard_map` rather than the compiler's own partitioning, because observations are sorted
 to find the distinct ones and loops run as long as the data ask for: within a share both stay
@@ -132,9 +133,9 @@ class Placement:
         wanted = available if devices in ("all", None) else devices
         if wanted not in allowed:
             raise ValueError(
-                f"devices must be a number that {available} {jax.default_backend()} devices of "
-                f"{processes} process(es), minibatch={config.minibatch} and seeds={seeds} "
-                f"divide into, got {wanted}; allowed: {', '.join(map(str, allowed)) or 'none'}"
+                f"{wanted} devices cannot share minibatch={config.minibatch} and seeds={seeds} "
+                f"evenly; {available} {jax.default_backend()} devices of {processes} process(es) "
+                f"are there; allowed: {', '.join(map(str, allowed)) or 'none'}"
             )
         if wanted == processes == 1:
             return cls()
