@@ -36,6 +36,7 @@ def refused(capsys, *arguments):
         ("--settings hidden", "settings are given as NAME=VALUE, got 'hidden'"),
         ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
         ("--report-only", "exp1-paper holds no experiment"),
+        ("--algorithms ppo ppo+counts --train-set p", "'counts' needs tasks that return"),
     ],
 )
 def test_impossible_experiments_are_refused(capsys, tmp_path, arguments, message):
@@ -54,6 +55,14 @@ def test_protocols_are_the_papers():
         assert (protocol.selection, protocol.num_reported) == ("validation", 1000)
     fast = QUICK["exp1"].config("preset")
     assert (fast.curiosity, fast.imitation_coef, fast.eval_episodes) == ("counts", 1.0, 16)
+
+
+@pytest.mark.parametrize("experiment", QUICK)
+def test_the_quick_protocol_can_be_trained(tmp_path, experiment):
+    protocol = training.open_experiment(
+        tmp_path / "x", experiment, QUICK[experiment], {}, create=True
+    )
+    assert protocol == QUICK[experiment]
 
 
 def test_stored_protocols_are_whole():
