@@ -47,7 +47,7 @@ def run_path(tmp_path_factory):
             params = jax.tree.map(lambda x, n=iteration: x * n, both)
             state = {"params": params, "iteration": jnp.full(2, iteration)}
             checkpoints.save(iteration, state, {})
-    pretrained.save(folder.best(3), Policy("any", CONFIG, random_params(9), 4))
+    pretrained.save(folder.best(3, 4), Policy("any", CONFIG, random_params(9), 4))
     return path
 
 
@@ -121,7 +121,7 @@ def test_impossible_exports_are_refused(run_path, tmp_path, capsys):
     for arguments, message in (
         (["--seed", 5], "mine has no seed 5; allowed: 3, 4"),
         (["--iteration", 7], "holds no checkpoint 7; allowed: 5, 6"),
-        (["--best", "--seed", 4], "best-seed4.npz does not exist"),
+        (["--best", "--seed", 4], "mine keeps no best parameters of seed 4"),
         (["--best", "--iteration", 5], "--best and --iteration name different parameters"),
     ):
         given = ["export", run_path, "--name", "x", "--out", tmp_path, *arguments]

@@ -98,12 +98,13 @@ def find_policy(options: Export) -> Policy:
         return load(options.run, seed=seed, iteration=options.iteration)
     if options.iteration is not None:
         raise ValueError("--best and --iteration name different parameters; give one")
-    if not folder.best(seed).exists():
+    kept = list(folder.kept_best(seed).values())
+    if not kept:
         raise ValueError(
-            f"{folder.best(seed)} does not exist: only the runs of agents.experiments keep the "
-            "best parameters; without --best the newest checkpoint is exported"
+            f"{options.run} keeps no best parameters of seed {seed}: only the runs of "
+            "agents.experiments do; without --best the newest checkpoint is exported"
         )
-    return pretrained.load(folder.best(seed))
+    return pretrained.load(kept[-1])
 
 
 if __name__ == "__main__":

@@ -134,9 +134,22 @@ class RunFolder:
         """A row per evaluation on several sets: the steps of every task."""
         return self.path / "outcomes.csv"
 
-    def best(self, seed: int) -> Path:
-        """The parameters of a seed's best evaluation on several sets."""
-        return self.path / f"best-seed{seed}.npz"
+    def best(self, seed: int, iteration: int) -> Path:
+        """The parameters of a seed's evaluation on several sets that was the best until then."""
+        return self.path / f"best-seed{seed}-iteration{iteration}.npz"
+
+    def kept_best(self, seed: int) -> dict[int, Path]:
+        """The files of these parameters that there are, by iteration, in order; the last is best.
+
+        That of an earlier version, which had one without an iteration in its name, is at 0.
+        """
+        prefix = f"best-seed{seed}-iteration"
+        paths = self.path.glob(f"{prefix}*.npz")
+        kept = {int(path.stem.removeprefix(prefix)): path for path in paths}
+        nameless = self.path / f"best-seed{seed}.npz"
+        if nameless.exists():
+            kept[0] = nameless
+        return dict(sorted(kept.items()))
 
     def tested(self, seed: int) -> Path:
         """The steps that these parameters take in the tasks that are reported."""

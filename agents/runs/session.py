@@ -276,6 +276,8 @@ class Session:
         state = self._placement.local(self._state)
         if self._checkpoints is not None:
             self._checkpoints.save(self._progress.iteration, state, record)
+            if self._tracker is not None:
+                self._tracker.forget(self._checkpoints.iterations[0])
         self.saved = self._progress.iteration
 
     def _policies(self) -> list[Policy]:
