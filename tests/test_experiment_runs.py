@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +73,7 @@ def fake_train(config, shards=ALONE):
         )
         return state, {"success": jnp.float32(0.25)}
 
-    return real._replace(init=init, iterate=iterate)
+    return SimpleNamespace(**vars(real), init=init, iterate=iterate)
 
 
 class FakeEvaluator:

@@ -6,10 +6,12 @@ import re
 
 import pytest
 
-from agents.config import PRESETS
+from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
-from agents.experiments import training
+from agents.experiments import records, training
 from agents.experiments.protocol import PROTOCOLS, QUICK, Protocol, algorithms
+from agents.runs.folder import Run, RunFolder, write_json
+from agents.runs.metrics import MetricsLog
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
 
@@ -42,6 +44,19 @@ def refused(capsys, *arguments):
 def test_impossible_experiments_are_refused(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, "exp1", *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_dirty_tree_is_refused_before_training(capsys, tmp_path, monkeypatch):
+    arguments = ["exp1", "--out", tmp_path, "--record", tmp_path / "x.json"]
+    monkeypatch.setattr(records, "machine", lambda: {"commit": "abc-dirty"})
+    assert "this one of abc-dirty" in refused(capsys, *arguments)
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(records, "machine", lambda: {"commit": "abc"})
+    folder = RunFolder.create(tmp_path / "exp1-paper" / "ppo-seed0", Run(Config()))
+    write_json(folder.machines, [{"commit": "def-dirty"}])
+    MetricsLog(folder.metrics).append([{"seed": 0, "iteration": 1}])
+    assert "this one of def-dirty" in refused(capsys, *arguments)
+    assert not (tmp_path / "exp1-paper" / "experiment.json").exists()
 
 
 def test_protocols_are_the_papers():

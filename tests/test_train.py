@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -341,7 +342,8 @@ def test_solved_seeds_stay_as_they_are():
     keys = jax.random.split(jax.random.key(0), 2)
     shapes = jax.eval_shape(jax.vmap(real.init), keys)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
-    state, train = zeros._replace(key=keys), real._replace(iterate=iterate)
+    state = zeros._replace(key=keys)
+    train = SimpleNamespace(**vars(real), iterate=iterate)
     after, metrics = jax.jit(make_advance(train, 2))(state, jnp.array([True, False]))
     assert after.iteration.tolist() == [1, 0]
     assert metrics["steps"].tolist() == [48, 48]

@@ -20,6 +20,7 @@ from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol
 from agents.parallel.cores import become_devices
 from agents.runs import compilation_cache
+from agents.runs.folder import read_json
 from agents.runs.stopping import Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
 from trap_tube_jax.imports import import_modules
@@ -187,6 +188,10 @@ def run(options: Options, console: Console, stop: StopSignals) -> None:
     """
     import_modules(options.imports)
     root, experiment, create = options.root, options.experiment, not options.report_only
+    if options.record is not None:  # before training, which would be in vain
+        runs = [entry for entry in training.find_runs(root) if entry.rows]
+        used = [each for run in runs for each in read_json(run.folder.machines) or ()]
+        records.check_clean({"machines": used}, options.commit)
     protocol = training.open_experiment(
         root, experiment, options.defaults, options.given(), create=create
     )

@@ -194,8 +194,7 @@ def draw_tasks(
 def note_machine(folder: RunFolder, commit: str | None) -> None:
     """Adds this machine to those that a run ran on."""
     known = read_json(folder.machines) or []
-    here = machine()
-    here["commit"] = here["commit"] or commit
+    here = machine(commit)
     if here not in known:
         write_json(folder.machines, [*known, here])
 
