@@ -35,6 +35,8 @@ def refused(capsys, *arguments):
         ("--checkpoint-every 0", "checkpoint_every must be >= 1, got 0"),
         ("--iterations 0", "iterations must lie in [1, inf], got 0"),
         ("--settings hiden=4", "unknown setting 'hiden'; did you mean 'hidden'?"),
+        ("--settings iterations=9", "iterations is none of --settings; give --iterations"),
+        ("--settings eval_episodes=9", "eval_episodes is none of --settings; give --tasks"),
         ("--settings hidden", "settings are given as NAME=VALUE, got 'hidden'"),
         ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
         ("--report-only", "exp1-paper holds no experiment"),
@@ -84,6 +86,8 @@ def test_stored_protocols_are_whole():
     """An old one did not say on which tasks its evaluations were chosen."""
     values = json.loads(json.dumps(dataclasses.asdict(PROTOCOLS["exp1"])))
     assert Protocol.from_dict(values) == PROTOCOLS["exp1"]
+    settings = {"hidden": 4, "eval_episodes": 9}  # the second had no effect, and was allowed
+    assert Protocol.from_dict({**values, "settings": settings}).settings == {"hidden": 4}
     del values["selection"]
     with pytest.raises(ValueError, match="a protocol lacks selection"):
         Protocol.from_dict(values)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from agents.config import PRESETS, Config
+from agents.runs.metrics import first_solved, read_metrics
 from trap_tube_jax._version import __version__
 
 CONFIG_FILE = "config.json"
@@ -246,13 +247,18 @@ class RunFolder:
 
 def is_done(folder: RunFolder, run: Run) -> bool:
     """Whether a run has been trained and summarised in full."""
-    summary = read_json(folder.summary)
+    summary, config = read_json(folder.summary), run.config
     if summary is None:
         return False
-    solved = all(seed["first_solved"] for seed in summary["seeds"])
-    return summary["iterations"] >= run.config.iterations or (
-        run.config.stop_when_solved > 0 and solved
-    )
+    if summary["iterations"] >= config.iterations:
+        return True
+    if config.stop_when_solved == 0:
+        return False
+    # The summary may be of another threshold, and the metrics of an iteration after it.
+    rows = [
+        row for row in read_metrics(folder.metrics) if row["iteration"] <= summary["iterations"]
+    ]
+    return all(first_solved(rows, run.seed_range, config.stop_when_solved))
 
 
 def write_json(path: Path, values: Any) -> None:

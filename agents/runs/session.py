@@ -23,8 +23,8 @@ from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
-from agents.runs.metrics import MetricsLog, Row, read_metrics
-from agents.runs.progress import Progress, first_solved
+from agents.runs.metrics import MetricsLog, Row, first_solved, read_metrics
+from agents.runs.progress import Progress
 from agents.runs.stopping import Stopped, StopSignals
 from agents.runs.story import Story
 from agents.runs.tracking import Tracker
@@ -253,7 +253,8 @@ class Session:
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        solved = first_solved(self.run, progress.solved, rows)
+        now = first_solved(rows, self.run.seed_range, config.stop_when_solved)
+        solved = tuple(first or new for first, new in zip(progress.solved, now, strict=True))
         rows = self._track(rows, is_due=solved != progress.solved)
         if self._log is not None:
             self._log.append(rows)
