@@ -12,6 +12,7 @@ from rich.console import Console
 
 from agents.acting.policy import Policy
 from agents.experiments.records import check_clean, read_record, write_record
+from agents.pretrained import load_shipped
 from agents.profiles import figures, tables
 from agents.profiles.measure import SCHEMA, Settings, profile
 from agents.profiles.tasks import PARTS, STRENGTHS
@@ -74,15 +75,14 @@ class Options:
         """
         if not self.runs and not self.pretrained:
             raise ValueError("give runs' folders or --pretrained NAME, one or more of them")
-        sources = [(path.resolve().name, path) for path in self.runs]
-        sources += [(name, name) for name in self.pretrained]
-        names = [name for name, _ in sources]
+        names = [*(path.resolve().name for path in self.runs), *self.pretrained]
         if len(set(names)) < len(names):
             raise ValueError(
                 "two agents have the same name, by which figures tell them apart: "
                 f"{', '.join(names)}; rename one folder or file"
             )
-        return {name: load(source) for name, source in sources}
+        found = [*map(load, self.runs), *map(load_shipped, self.pretrained)]
+        return dict(zip(names, found, strict=True))
 
     def machines(self) -> list[Any]:
         """Those that the runs were trained on."""

@@ -18,7 +18,7 @@ from agents.parallel import processes
 from agents.parallel.cores import become_devices
 from agents.parallel.sharding import Placement
 from agents.runs import compilation_cache
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import Run, RunFolder, check_name
 from agents.runs.session import Session
 from agents.runs.stopping import Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
@@ -232,8 +232,7 @@ def run_path(selection: Selection, env_id: str) -> Path:
     short = tt.task_set(env_id).short
     last = f"to{selection.seed + selection.seeds - 1}" if selection.seeds > 1 else ""
     name = selection.name or f"{selection.preset}-{short}-{selection.seed}{last}"
-    if Path(name).name != name:
-        raise ValueError(f"name must be the name of a folder, without a path, got {name!r}")
+    check_name(name)
     return selection.out / name
 
 

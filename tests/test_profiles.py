@@ -321,7 +321,7 @@ def test_records_of_profiles_name_a_commit_known_before_measuring(tmp_path, monk
     ("arguments", "message"),
     [
         ([], "give runs' folders or --pretrained NAME"),
-        (["--pretrained", "none"], "shipped parameters: base"),
+        (["--pretrained", "none"], "unknown parameters 'none'; allowed: base"),
         (["--pretrained", "base", "base"], "tell them apart: base, base; rename one"),
         (["--pretrained", "base", "--import", "no.such"], "no.such"),
         (["--pretrained", "base", "--tasks", "0"], "tasks must be >= 1, got 0"),

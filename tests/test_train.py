@@ -178,6 +178,7 @@ def refused(capsys, *arguments, command=main):
         ("--keep 0", "keep must be >= 1, got 0"),
         ("--checkpoint-every 0", "checkpoint_every must be >= 1, got 0"),
         ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
+        ("--name ..", "name must be the name of a folder, without a path, got '..'"),
         ("--resume --name no", "no holds no run; runs in "),
     ],
 )

@@ -20,7 +20,7 @@ from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol
 from agents.parallel.cores import become_devices
 from agents.runs import compilation_cache
-from agents.runs.folder import read_json
+from agents.runs.folder import check_name, read_json
 from agents.runs.stopping import Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
 from trap_tube_jax.imports import import_modules
@@ -115,10 +115,8 @@ class Options:
         """
         if self.checkpoint_every < 1:
             raise ValueError(f"checkpoint_every must be >= 1, got {self.checkpoint_every}")
-        if self.name is not None and Path(self.name).name != self.name:
-            raise ValueError(
-                f"name must be the name of a folder, without a path, got {self.name!r}"
-            )
+        if self.name is not None:
+            check_name(self.name)
 
     @property
     def defaults(self) -> Protocol:

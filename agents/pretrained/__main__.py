@@ -10,7 +10,7 @@ import tyro
 
 from agents import pretrained
 from agents.acting.policy import Policy
-from agents.runs.folder import RunFolder
+from agents.runs.folder import RunFolder, check_name
 from agents.runs.loading import load
 
 PROGRAM = "python -m agents.pretrained"
@@ -32,6 +32,7 @@ class Export:
       best: take the parameters of the best evaluation of an experiment's run instead.
       half: round to float16, for half the size.
       out: the folder to write to.
+      force: replace a file of that name.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -41,6 +42,7 @@ class Export:
     best: Flag = False
     half: Flag = False
     out: Path = Path(pretrained.__file__).parent
+    force: Flag = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +76,12 @@ def export(options: Export) -> Path:
     """Writes the file that the options ask for, and returns its place.
 
     Raises:
-      ValueError: there is no such run, seed or checkpoint, or the name is not one.
+      ValueError: there is no such run, seed or checkpoint, or the name is not one, or taken.
     """
-    if Path(options.name).name != options.name:
-        raise ValueError(f"name must be that of a file, without a path, got {options.name!r}")
+    check_name(options.name, "file")
     path = options.out / f"{options.name}{pretrained.SUFFIX}"
+    if path.exists() and not options.force:
+        raise ValueError(f"{path} exists; give --force to replace it, or another --name")
     pretrained.save(path, find_policy(options), half=options.half)
     return path
 

@@ -245,6 +245,16 @@ class RunFolder:
         write_json(self.config, {"version": __version__, **run.to_dict()})
 
 
+def check_name(name: str, what: str = "folder") -> None:
+    """Checks that a name is that of a folder, or of another thing, within some folder.
+
+    Raises:
+      ValueError: it is empty, or a path.
+    """
+    if Path(name).name != name or name in ("", ".."):
+        raise ValueError(f"name must be the name of a {what}, without a path, got {name!r}")
+
+
 def is_done(folder: RunFolder, run: Run) -> bool:
     """Whether a run has been trained and summarised in full."""
     summary, config = read_json(folder.summary), run.config
