@@ -22,7 +22,7 @@ from agents.ppo.learner import make_train
 from agents.runs.folder import check_name, is_done, write_json
 from agents.runs.report import NOTHING
 from agents.runs.results import results
-from agents.runs.stopping import Stopped, StopSignals
+from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
 
 PERCENT = "percent_"
@@ -101,7 +101,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     console = Console()
-    stop = StopSignals(lambda: console.print("Finishing these iterations; again to abandon them."))
+    stop = StopSignals(lambda: console.print(f"Finishing these iterations; {AGAIN}."))
     try:
         options = tyro.cli(Options, args=arguments, prog="python -m agents.sweep")
         jax.config.update("jax_platforms", "cpu")  # devices are the runs' alone

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
-from agents import evaluate
+from agents import evaluate, train
 from agents.config import PRESETS, Config
 from agents.ppo.learner import make_train
 from agents.runs import compilation_cache
@@ -234,6 +235,35 @@ def test_resumed_runs_keep_their_settings(tmp_path):
     assert (options.config, options.seed, options.seeds) == (stored.config, 5, 2)
     _, options = parsed(*arguments, "--iterations", "999")
     assert options.config == dataclasses.replace(stored.config, iterations=999)
+
+
+def test_resumed_runs_keep_their_task_set(capsys, tmp_path):
+    RunFolder.create(tmp_path / "x", Run(Config()))
+    arguments = ["--resume", "--no-cache", "--name", "x", "--out", str(tmp_path)]
+    message = refused(capsys, *arguments, "--env", "sy")
+    assert "x is of TrapTube-v0, not of --env sy; leave that out, or begin a new run" in message
+    assert parsed(*arguments, "--env", "base")[0] == Run(Config())
+
+
+def test_a_second_ctrl_c_ends_the_process_at_once(tmp_path, monkeypatch, capsys):
+    """An orderly exit would wait for what compiles in the background."""
+
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    class Ended(BaseException):
+        pass
+
+    def end(code):
+        raise Ended(code)
+
+    session = SimpleNamespace(console=Console(), saved=3, resume_command="again")
+    session.train, session.close = interrupted, lambda: None
+    monkeypatch.setattr(train, "start", lambda arguments: session)
+    monkeypatch.setattr(os, "_exit", end)
+    with pytest.raises(Ended, match="130"):
+        train.train([])
+    assert "Stopped at iteration 3. Continue with: again" in capsys.readouterr().out
 
 
 def test_a_run_with_a_cooldown_is_not_extended(capsys, tmp_path):

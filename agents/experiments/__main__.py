@@ -21,7 +21,7 @@ from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol
 from agents.parallel.cores import become_devices
 from agents.runs import compilation_cache
 from agents.runs.folder import check_name, read_json
-from agents.runs.stopping import Stopped, StopSignals
+from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.registry import task_set
@@ -161,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     console = Console()
-    stop = StopSignals(lambda: console.print("Finishing this iteration; again to abandon it."))
+    stop = StopSignals(lambda: console.print(f"Finishing this iteration; {AGAIN}."))
     try:
         options = tyro.cli(Options, args=arguments, prog=PROGRAM)
         become_devices(options.devices)

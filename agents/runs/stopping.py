@@ -5,6 +5,8 @@ import threading
 from collections.abc import Callable
 from typing import Any, Self
 
+AGAIN = "press Ctrl-C again to stop at once"
+
 
 class Stopped(Exception):  # noqa: N818  it is no error
     """Training was asked to stop and has saved.
