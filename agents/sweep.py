@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     stop = StopSignals(lambda: console.print(f"Finishing these iterations; {AGAIN}."))
     try:
         options = tyro.cli(Options, args=arguments, prog="python -m agents.sweep")
-        jax.config.update("jax_platforms", "cpu")  # devices are the runs' alone
+        jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
         failed = run(options, console, stop)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

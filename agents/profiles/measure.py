@@ -214,13 +214,16 @@ def _pushes(oracle: Oracle, played: Played, advance: Advance) -> dict[str, list]
 def _mistakes(
     oracle: Oracle, played: Played, shortest: np.ndarray, advance: Advance
 ) -> dict[str, Any]:
-    """Where the first episodes go wrong that could be shorter; columns, by `task`.
+    """Where those of the first n episodes that took more than the shortest plan went wrong.
 
     Args:
       oracle: what knows the distances.
       played: the episodes.
       shortest: i32[n], the shortest plans of the first n of them.
       advance: called once an episode.
+
+    Returns:
+      Columns, of which `task` says which episode.
     """
     names = ("task", *Turns._fields, *SUBGOALS)
     columns: dict[str, list[int]] = {name: [] for name in names}
