@@ -124,6 +124,7 @@ def train(arguments: Sequence[str]) -> None:
     except (Stopped, KeyboardInterrupt) as stopped:
         console.print(f"Stopped at iteration {session.saved}. {resume}", soft_wrap=True)
         if isinstance(stopped, Stopped):
+            stop.end_process()  # the exit may have to wait for what compiles in the background
             raise SystemExit(128 + stopped.signal) from None
         end_at_once(128 + (stop.received or signal.SIGINT))
     except (jax.errors.JaxRuntimeError, ValueError) as error:

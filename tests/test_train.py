@@ -25,6 +25,7 @@ from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.session import make_advance
+from agents.runs.stopping import StopSignals
 from agents.train import main, parse, select
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
@@ -264,6 +265,19 @@ def test_a_second_ctrl_c_ends_the_process_at_once(tmp_path, monkeypatch, capsys)
     with pytest.raises(Ended, match="130"):
         train.train([])
     assert "Stopped at iteration 3. Continue with: again" in capsys.readouterr().out
+
+
+def test_after_stopping_a_further_ctrl_c_ends_the_process():
+    previous = {number: signal.getsignal(number) for number in StopSignals.SIGNALS}
+    try:
+        stop = StopSignals(lambda: None)
+        with stop:
+            pass
+        stop.end_process()
+        assert {signal.getsignal(number) for number in previous} == {signal.SIG_DFL}
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def test_a_run_with_a_cooldown_is_not_extended(capsys, tmp_path):

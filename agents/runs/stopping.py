@@ -41,6 +41,12 @@ class StopSignals:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
+    def end_process(self) -> None:
+        """Lets further signals end the process at once, as they do by default."""
+        if threading.current_thread() is threading.main_thread():
+            for number in self.SIGNALS:
+                signal.signal(number, signal.SIG_DFL)
+
     def _handle(self, number: int, frame: Any) -> None:
         del frame
         if self.received is not None:
