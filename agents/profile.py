@@ -12,12 +12,15 @@ from rich.console import Console
 
 from agents.acting.policy import Policy
 from agents.experiments.records import check_clean, read_record, write_record
+from agents.pretrained import load_shipped
 from agents.profiles import figures, tables
 from agents.profiles.measure import SCHEMA, Settings, profile
 from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation_cache
-from agents.runs.folder import read_json
+from agents.runs.folder import RunFolder, read_json
 from agents.runs.loading import load
+from trap_tube_jax.command_line import Imports
+from trap_tube_jax.imports import import_modules
 
 PROGRAM = "python -m agents.profile"
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
@@ -36,6 +39,8 @@ class Options:
     Attributes:
       runs: folders of runs, or files of parameters; of a run its first seed.
       pretrained: names of shipped parameters.
+      imports: modules of your own to import first, for what the agents' settings name; those of
+        the runs are known.
       parts: what to measure: some of colours, layout, both, swaps, controls, pairs.
       strengths: how far colours and layouts are changed: above 0, the base task, to 1, the
         paper's transfers.
@@ -51,6 +56,7 @@ class Options:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     pretrained: tuple[str, ...] = ()
+    imports: Imports = ()
     parts: tuple[str, ...] = PARTS
     strengths: tuple[float, ...] = STRENGTHS
     tasks: int = Settings.tasks
@@ -69,16 +75,18 @@ class Options:
         """
         if not self.runs and not self.pretrained:
             raise ValueError("give runs' folders or --pretrained NAME, one or more of them")
-        sources = [(path.resolve().name, path) for path in self.runs]
-        sources += [(name, name) for name in self.pretrained]
-        names = [name for name, _ in sources]
+        names = [*(path.resolve().name for path in self.runs), *self.pretrained]
         if len(set(names)) < len(names):
-            raise ValueError(f"figures tell agents by their names, which differ; got {names}")
-        return {name: load(source) for name, source in sources}
+            raise ValueError(
+                "two agents have the same name, by which figures tell them apart: "
+                f"{', '.join(names)}; rename one folder or file"
+            )
+        found = [*map(load, self.runs), *map(load_shipped, self.pretrained)]
+        return dict(zip(names, found, strict=True))
 
     def machines(self) -> list[Any]:
         """Those that the runs were trained on."""
-        return [each for path in self.runs for each in read_json(path / "machines.json") or ()]
+        return [each for path in self.runs for each in read_json(RunFolder(path).machines) or ()]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -101,7 +109,12 @@ def run(options: Options, arguments: Sequence[str]) -> None:
       ValueError: an option is not allowed, or a record cannot be read or written.
     """
     console = Console()
-    if options.draw is None:
+    import_modules(options.imports)
+    drawn = None if options.draw is None else read_record(options.draw, SCHEMA)
+    if options.record is not None:  # before measuring, which would be in vain
+        known = {"machines": options.machines()} if drawn is None else drawn
+        check_clean(known, options.commit)
+    if drawn is None:
         settings = Settings(options.parts, options.strengths, options.tasks, options.episodes)
         found = profile(
             options.policies(),
@@ -109,9 +122,10 @@ def run(options: Options, arguments: Sequence[str]) -> None:
             console,
             command=f"{PROGRAM} {shlex.join(arguments)}",
             machines=options.machines(),
+            commit=options.commit,
         )
     else:
-        found = read_record(options.draw, SCHEMA)
+        found = drawn
     for table in tables.tables(found):
         console.print(table.to_rich())
     options.out.mkdir(parents=True, exist_ok=True)

@@ -19,10 +19,10 @@ from agents.experiments.statistics import Spread
 from agents.experiments.tables import Table
 from agents.experiments.training import FOLDER_NAME, find_runs, plan_runs
 from agents.ppo.learner import make_train
-from agents.runs.folder import is_done, write_json
+from agents.runs.folder import check_name, is_done, write_json
 from agents.runs.report import NOTHING
 from agents.runs.results import results
-from agents.runs.stopping import Stopped, StopSignals
+from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
 
 PERCENT = "percent_"
@@ -73,10 +73,8 @@ class Options:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be >= 1, got {value}")
-        if self.name is not None and Path(self.name).name != self.name:
-            raise ValueError(
-                f"name must be the name of a folder, without a path, got {self.name!r}"
-            )
+        if self.name is not None:
+            check_name(self.name)
 
     def configs(self) -> dict[str, Config]:
         """The settings of every point of the grid, by its name.
@@ -86,7 +84,7 @@ class Options:
         """
         values = dict(map(_values, self.settings))
         if len(values) < len(self.settings):
-            raise ValueError(f"every setting is given once, got {' '.join(self.settings)}")
+            raise ValueError(f"a setting may be given only once, got {' '.join(self.settings)}")
         given: dict[str, Any] = {"imports": self.imports} if self.imports else {}
         given |= {} if self.env is None else {"env_id": self.env}
         configs = {}
@@ -103,10 +101,10 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     console = Console()
-    stop = StopSignals(lambda: console.print("Finishing these iterations; again to abandon them."))
+    stop = StopSignals(lambda: console.print(f"Finishing these iterations; {AGAIN}."))
     try:
         options = tyro.cli(Options, args=arguments, prog="python -m agents.sweep")
-        jax.config.update("jax_platforms", "cpu")  # devices are the runs' alone
+        jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
         failed = run(options, console, stop)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

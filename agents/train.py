@@ -1,6 +1,7 @@
 """Training from the command line: python -m agents.train --help."""
 
 import dataclasses
+import os
 import signal
 import sys
 import traceback
@@ -18,9 +19,9 @@ from agents.parallel import processes
 from agents.parallel.cores import become_devices
 from agents.parallel.sharding import Placement
 from agents.runs import compilation_cache
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import Run, RunFolder, check_name
 from agents.runs.session import Session
-from agents.runs.stopping import Stopped, StopSignals
+from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
 from trap_tube_jax.imports import import_modules
 
@@ -115,16 +116,17 @@ def train(arguments: Sequence[str]) -> None:
         end_without_peers(error, "Begin again with the same command.")
 
     console = session.console
-    resume = how_to_resume(session.folder)
-    stop = StopSignals(lambda: console.print("Finishing this iteration; again to abandon it."))
+    resume = f"Continue with: {session.resume_command}"
+    stop = StopSignals(lambda: console.print(f"Finishing this iteration; {AGAIN}."))
     try:
         session.train(stop, then_finish=True)
         session.finish()
     except (Stopped, KeyboardInterrupt) as stopped:
         console.print(f"Stopped at iteration {session.saved}. {resume}", soft_wrap=True)
         if isinstance(stopped, Stopped):
+            stop.end_process()  # the exit may have to wait for what compiles in the background
             raise SystemExit(128 + stopped.signal) from None
-        processes.leave(128 + (stop.received or signal.SIGINT))
+        end_at_once(128 + (stop.received or signal.SIGINT))
     except (jax.errors.JaxRuntimeError, ValueError) as error:
         end_without_peers(error, f"Iteration {session.saved} is saved. {resume}")
     finally:
@@ -154,6 +156,7 @@ def start(arguments: Sequence[str]) -> Session:
         checkpoint_every=options.checkpoint_every,
         keep=options.keep,
         placement=Placement.of(options.devices, run.config, run.seeds),
+        options=() if options.devices is None else ("--devices", str(options.devices)),
     )
     # More iterations, once the run has been taken up.
     processes.from_first(lambda: folder.note(run))
@@ -204,6 +207,12 @@ def parse(selection: Selection, arguments: Sequence[str]) -> tuple[Run | None, O
     path = run_path(selection, config.env_id)
     if selection.resume:
         _, stored = RunFolder.open(path)
+        own_id = tt.task_set(stored.config.env_id).id
+        if selection.env is not None and tt.task_set(selection.env).id != own_id:
+            raise ValueError(
+                f"the run in {path} is of {own_id}, not of --env {selection.env}; leave that out, "
+                "or begin a new run"
+            )
         defaults = Options(
             preset=stored.preset,
             seed=stored.seed,
@@ -232,15 +241,18 @@ def run_path(selection: Selection, env_id: str) -> Path:
     short = tt.task_set(env_id).short
     last = f"to{selection.seed + selection.seeds - 1}" if selection.seeds > 1 else ""
     name = selection.name or f"{selection.preset}-{short}-{selection.seed}{last}"
-    if Path(name).name != name:
-        raise ValueError(f"name must be the name of a folder, without a path, got {name!r}")
+    check_name(name)
     return selection.out / name
 
 
-def how_to_resume(folder: RunFolder) -> str:
-    """What to type to continue."""
-    out = "" if folder.path.parent == Path("runs") else f" --out {folder.path.parent}"
-    return f"Continue with: {PROGRAM} --resume --name {folder.path.name}{out}"
+def end_at_once(code: int) -> NoReturn:
+    """Ends this process without waiting for what compiles in the background.
+
+    What it has written is on disk; a checkpoint that it was writing is as if it had not begun.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def end_without_peers(error: Exception, advice: str) -> NoReturn:

@@ -76,12 +76,12 @@ class Throughput:
         return self.steps_per_s * self.observation_bytes
 
 
-def measure(function: Callable[[int], Any], repeats: int = 5) -> Timing:
-    """Times `function(index)`, which returns arrays, from call to completion."""
+def measure(function: Callable[[], Any], repeats: int = 5) -> Timing:
+    """Times a function that returns arrays, from call to completion."""
     seconds = []
-    for index in range(repeats + 1):
+    for _ in range(repeats + 1):
         start = time.perf_counter()
-        jax.block_until_ready(function(index))
+        jax.block_until_ready(function())
         seconds.append(time.perf_counter() - start)
     first, *later = seconds
     return Timing(first, statistics.median(later), min(later), max(later))
@@ -127,7 +127,7 @@ def measure_throughput(
     *carry, observation = on_devices(reset, devices)(keys)
     compiled, carry = on_devices(run, devices), tuple(carry)
 
-    def call(_: int) -> jax.Array:
+    def call() -> jax.Array:
         nonlocal carry
         carry = compiled(carry, actions)
         return carry[1]
@@ -174,7 +174,7 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) ->
     def rewrite(array):
         return jax.lax.fori_loop(0, passes, lambda i, old: old ^ i.astype(jnp.uint32), array)
 
-    return passes * num_bytes / measure(lambda _: rewrite(source), repeats).median_s
+    return passes * num_bytes / measure(lambda: rewrite(source), repeats).median_s
 
 
 def write_json(path: str | pathlib.Path, results: Sequence[Any], **extra: Any) -> None:

@@ -7,6 +7,7 @@ cannot be imported is skipped with its reason.
 
 import dataclasses
 import pathlib
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -151,24 +152,34 @@ PEERS: tuple[tuple[str, Callable[[], harness.Subject]], ...] = (
 )
 
 
+INSTALL = " (pip install 'trap-tube-jax[bench]')"
+
+
 def run(arguments: Arguments) -> tuple[list[harness.Throughput], dict[str, str]]:
-    """Measures our own sets and every peer; returns results and reasons of the skipped."""
-    makers = [(name, lambda name=name: env_throughput.subject(name)) for name in arguments.sets]
-    results, skipped = [], {}
-    for name, make_subject in (*makers, *PEERS):
+    """Measures our own sets and every peer; returns results and reasons of the skipped peers.
+
+    Raises:
+      ValueError: one of our own sets is unknown, or the devices do not divide the environments.
+    """
+
+    def measure(subject: harness.Subject) -> harness.Throughput:
+        return harness.measure_throughput(
+            subject,
+            arguments.num_envs,
+            num_steps=arguments.num_steps,
+            repeats=arguments.repeats,
+            devices=arguments.devices,
+        )
+
+    own = [env_throughput.subject(name) for name in arguments.sets]
+    results, skipped = [measure(subject) for subject in own], {}
+    for name, make_subject in PEERS:
         try:
-            result = harness.measure_throughput(
-                make_subject(),
-                arguments.num_envs,
-                num_steps=arguments.num_steps,
-                repeats=arguments.repeats,
-                devices=arguments.devices,
-            )
+            results.append(measure(make_subject()))
         except Exception as error:  # whatever breaks in a peer must not break the others
             first_line = next(iter(str(error).splitlines()), "")
-            skipped[name] = f"{type(error).__name__}: {first_line}"
-        else:
-            results.append(result)
+            hint = INSTALL if isinstance(error, ImportError) else ""
+            skipped[name] = f"{type(error).__name__}: {first_line}{hint}"
     return results, skipped
 
 
@@ -190,9 +201,7 @@ def main(arguments: Arguments) -> None:
         )
     console.print(table)
     for name, reason in skipped.items():
-        console.print(
-            f"skipped {name}: {reason} (pip install 'trap-tube-jax[bench]')", markup=False
-        )
+        console.print(f"skipped {name}: {reason}", markup=False)
     if arguments.json is not None:
         harness.write_json(arguments.json, results, skipped=skipped)
 
@@ -211,4 +220,8 @@ def _split(key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    try:
+        main(tyro.cli(Arguments, description=__doc__))
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error

@@ -34,26 +34,15 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 class Arguments:
     """Names the pages and figures that are not what their records make of them.
 
-    Ends with 1 if there are any. That is also what --check asks for, the default.
+    Ends with 1 if there are any.
 
     Attributes:
       write: bring them up to date instead.
-      check: write nothing.
       root: the folder of the project.
     """
 
     write: Flag = False
-    check: Flag = False
     root: Path = ROOT
-
-    def __post_init__(self) -> None:
-        """Checks that one thing is asked for.
-
-        Raises:
-          ValueError: both --write and --check are given.
-        """
-        if self.write and self.check:
-            raise ValueError("--write and --check exclude each other; give one")
 
     @property
     def results(self) -> Path:

@@ -94,7 +94,7 @@ def _measure_training(kind: Kind, env: str, size: int) -> tuple[float, harness.T
         state, iterate = jax.jit(train.init)(keys[0]), jax.jit(train.iterate)
     else:
         state, iterate = jax.jit(jax.vmap(train.init))(keys), jax.jit(jax.vmap(train.iterate))
-    timing = harness.measure(lambda _: iterate(state), repeats=3)
+    timing = harness.measure(lambda: iterate(state), repeats=3)
     after, _ = iterate(state)
     return float(after.transitions.sum()) / timing.median_s, timing
 

@@ -143,7 +143,7 @@ def share_seconds(config: Config, devices: int, repeats: int = 3) -> float:
     train = make_train(share)
     state = jax.jit(train.init)(jax.random.key(0))
     iterate = jax.jit(train.iterate)
-    return harness.measure(lambda _: iterate(state), repeats).median_s
+    return harness.measure(lambda: iterate(state), repeats).median_s
 
 
 def repeated_seconds(config: Config, repeats: int = 5) -> float:
@@ -161,7 +161,7 @@ def repeated_seconds(config: Config, repeats: int = 5) -> float:
         return actions, train.prepare(state, trajectory)
 
     trajectory = jax.jit(train.play)(state.params, jax.random.key(1), jax.random.key(3))
-    return harness.measure(lambda _: repeat(trajectory), repeats).median_s
+    return harness.measure(lambda: repeat(trajectory), repeats).median_s
 
 
 def speed_up_rows(

@@ -122,10 +122,7 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         ("optimiser", _jitted(_optimizer_only, train, state), 0.0),
     ]
     short = task_set(config.env_id).short
-    return [
-        Part(short, name, harness.measure(lambda _, run=run: run(), repeats), flop)
-        for name, run, flop in parts
-    ]
+    return [Part(short, name, harness.measure(run, repeats), flop) for name, run, flop in parts]
 
 
 def useful_flop(train: Learner, state: TrainState, batch: Batch) -> Flop:
@@ -174,7 +171,7 @@ def matrix_product_flops(repeats: int = 5) -> float:
     """Floating-point operations per second of a large float32 matrix product."""
     matrix = jnp.ones((MATRIX, MATRIX))
     multiply = jax.jit(jnp.matmul)
-    timing = harness.measure(lambda _: multiply(matrix, matrix), repeats)
+    timing = harness.measure(lambda: multiply(matrix, matrix), repeats)
     return 2.0 * MATRIX**3 / timing.median_s
 
 

@@ -46,7 +46,18 @@ def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):
     def fail():
         raise ImportError("no such package")
 
-    monkeypatch.setattr(peers, "PEERS", (("absent", fail),))
+    def crash():
+        raise ValueError("broken")
+
+    monkeypatch.setattr(peers, "PEERS", (("absent", fail), ("present", crash)))
     results, skipped = peers.run(peers.Arguments(num_envs=2, num_steps=1, repeats=1, sets=()))
     assert results == []
-    assert skipped == {"absent": "ImportError: no such package"}
+    assert skipped == {
+        "absent": "ImportError: no such package (pip install 'trap-tube-jax[bench]')",
+        "present": "ValueError: broken",
+    }
+
+
+def test_an_unknown_set_of_our_own_is_no_peer_to_skip():
+    with pytest.raises(ValueError, match="unknown task set 'typo'"):
+        peers.run(peers.Arguments(sets=("typo",)))

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from test_experiments import refused
 import trap_tube_jax as tt
 from agents import pretrained
 from agents.acting import evaluation
+from agents.acting.policy import Policy
 from agents.config import Config
 from agents.experiments import __main__ as experiments
 from agents.experiments import figures, records, reporting, statistics, tables, training
@@ -71,7 +73,7 @@ def fake_train(config, shards=ALONE):
         )
         return state, {"success": jnp.float32(0.25)}
 
-    return real._replace(init=init, iterate=iterate)
+    return SimpleNamespace(**vars(real), init=init, iterate=iterate)
 
 
 class FakeEvaluator:
@@ -191,7 +193,9 @@ def test_the_steps_of_every_task_are_kept(whole):
 @pytest.mark.slow
 def test_the_best_parameters_are_kept(whole):
     for seed, iteration in ((0, 4), (1, 2)):
-        policy = pretrained.load(whole / f"ppo-seed{seed}" / f"best-seed{seed}.npz")
+        kept = RunFolder(whole / f"ppo-seed{seed}").kept_best(seed)
+        assert max(kept) == iteration
+        policy = pretrained.load(kept[iteration])
         assert policy.iteration == iteration
         assert np.all(jax.tree.leaves(policy.params)[0] == 100 * seed + iteration)
 
@@ -316,7 +320,7 @@ def test_seeds_side_by_side_are_those_one_after_another(whole, tmp_path):
         for seed in (0, 1):
             alone = untimed(whole / f"ppo-seed{seed}" / name)
             assert [row for row in rows if row["seed"] == str(seed)] == alone
-    assert [pretrained.load(folder / f"best-seed{i}.npz").iteration for i in (0, 1)] == [4, 2]
+    assert [max(RunFolder(folder).kept_best(seed)) for seed in (0, 1)] == [4, 2]
 
 
 @pytest.mark.slow
@@ -334,6 +338,54 @@ def test_runs_with_a_cooldown_are_not_extended(tmp_path):
     longer = dataclasses.replace(short, iterations=8)
     with pytest.raises(ValueError, match=r"ppo-seed0: the run has cooldown=0.5 and iterations=4"):
         training.plan(tmp_path, longer, side_by_side=False)
+
+
+def test_the_best_parameters_of_the_last_checkpoint_outlive_a_kill(tmp_path, monkeypatch):
+    """The best evaluation is the second; a third, better one comes after the checkpoint."""
+    run, folder = Run(Config(curiosity="none")), RunFolder(tmp_path)
+    shares = {1: 0.25, 2: 0.5, 3: 0.75, 4: 0.25}
+    monkeypatch.setattr(pretrained, "save", lambda path, policy: path.write_text("x"))
+
+    def played(iteration):
+        solved = np.arange(4) < 4 * shares[iteration]
+        return {"p": evaluation.Evaluation(solved, *[np.ones(4, np.int32)] * 3)}
+
+    def tracker():
+        made = tracking.Tracker(folder, run, {}, ranked=["p"])
+        made._evaluator = played
+        return made
+
+    def evaluate(made, iteration):
+        policy = Policy("x", run.config, iteration, iteration)
+        return {"seed": 0, "iteration": iteration, **made.evaluate(0, policy)}
+
+    (tmp_path / "best-seed0.npz").write_text("of an earlier version")
+    first = tracker()
+    first.resume([], 0)
+    rows = [evaluate(first, iteration) for iteration in (1, 2)]
+    assert list(folder.kept_best(0)) == [0, 1, 2]
+    first.forget(2)
+    evaluate(first, 3)
+    assert list(folder.kept_best(0)) == [2, 3]  # killed here
+    second = tracker()
+    second.resume(rows, 2)
+    assert list(folder.kept_best(0)) == [2]
+    shares[3] = 0.25  # another machine comes to another result
+    for iteration in (3, 4):
+        evaluate(second, iteration)
+    assert list(folder.kept_best(0)) == [2]
+
+
+@pytest.mark.parametrize("name", ["best-seed0.npz", "best-seed0-iteration2.npz"])
+def test_the_best_parameters_are_found_by_their_iteration(tmp_path, monkeypatch, name):
+    (tmp_path / name).touch()
+    (tmp_path / "best-seed0-iteration4.npz").touch()  # after the metrics end
+    rows = [{"seed": 0, "iteration": i, "greedy_overall": x} for i, x in ((1, 0.0), (2, 0.5))]
+    entry = training.AlgorithmRun("ppo", RunFolder(tmp_path), Run(Config()), rows)
+    policy = Policy("x", Config(), "parameters", 2)
+    monkeypatch.setattr(pretrained, "load", {tmp_path / name: policy}.__getitem__)
+    steps = reporting.best_steps(entry, 0, Protocol(), lambda params: {"p": [len(params)]})
+    assert steps == {"p": [10]}
 
 
 def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):

@@ -6,10 +6,12 @@ import re
 
 import pytest
 
-from agents.config import PRESETS
+from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
-from agents.experiments import training
+from agents.experiments import records, training
 from agents.experiments.protocol import PROTOCOLS, QUICK, Protocol, algorithms
+from agents.runs.folder import Run, RunFolder, write_json
+from agents.runs.metrics import MetricsLog
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
 
@@ -33,14 +35,30 @@ def refused(capsys, *arguments):
         ("--checkpoint-every 0", "checkpoint_every must be >= 1, got 0"),
         ("--iterations 0", "iterations must lie in [1, inf], got 0"),
         ("--settings hiden=4", "unknown setting 'hiden'; did you mean 'hidden'?"),
+        ("--settings iterations=9", "iterations is none of --settings; give --iterations"),
+        ("--settings eval_episodes=9", "eval_episodes is none of --settings; give --tasks"),
         ("--settings hidden", "settings are given as NAME=VALUE, got 'hidden'"),
         ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
         ("--report-only", "exp1-paper holds no experiment"),
+        ("--algorithms ppo ppo+counts --train-set p", "'counts' needs tasks that return"),
     ],
 )
 def test_impossible_experiments_are_refused(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, "exp1", *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_dirty_tree_is_refused_before_training(capsys, tmp_path, monkeypatch):
+    arguments = ["exp1", "--out", tmp_path, "--record", tmp_path / "x.json"]
+    monkeypatch.setattr(records, "machine", lambda: {"commit": "abc-dirty"})
+    assert "this one of abc-dirty" in refused(capsys, *arguments)
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(records, "machine", lambda: {"commit": "abc"})
+    folder = RunFolder.create(tmp_path / "exp1-paper" / "ppo-seed0", Run(Config()))
+    write_json(folder.machines, [{"commit": "def-dirty"}])
+    MetricsLog(folder.metrics).append([{"seed": 0, "iteration": 1}])
+    assert "this one of def-dirty" in refused(capsys, *arguments)
+    assert not (tmp_path / "exp1-paper" / "experiment.json").exists()
 
 
 def test_protocols_are_the_papers():
@@ -56,10 +74,20 @@ def test_protocols_are_the_papers():
     assert (fast.curiosity, fast.imitation_coef, fast.eval_episodes) == ("counts", 1.0, 16)
 
 
+@pytest.mark.parametrize("experiment", QUICK)
+def test_the_quick_protocol_can_be_trained(tmp_path, experiment):
+    protocol = training.open_experiment(
+        tmp_path / "x", experiment, QUICK[experiment], {}, create=True
+    )
+    assert protocol == QUICK[experiment]
+
+
 def test_stored_protocols_are_whole():
     """An old one did not say on which tasks its evaluations were chosen."""
     values = json.loads(json.dumps(dataclasses.asdict(PROTOCOLS["exp1"])))
     assert Protocol.from_dict(values) == PROTOCOLS["exp1"]
+    settings = {"hidden": 4, "eval_episodes": 9}  # the second had no effect, and was allowed
+    assert Protocol.from_dict({**values, "settings": settings}).settings == {"hidden": 4}
     del values["selection"]
     with pytest.raises(ValueError, match="a protocol lacks selection"):
         Protocol.from_dict(values)

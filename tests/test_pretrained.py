@@ -13,6 +13,7 @@ from agents.networks.agent import Agent
 from agents.pretrained.__main__ import main
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.folder import Run, RunFolder
+from agents.runs.loading import load, load_policies
 
 CONFIG = Config(
     env_id="SymbolicTrapTube-v0",
@@ -47,7 +48,7 @@ def run_path(tmp_path_factory):
             params = jax.tree.map(lambda x, n=iteration: x * n, both)
             state = {"params": params, "iteration": jnp.full(2, iteration)}
             checkpoints.save(iteration, state, {})
-    pretrained.save(folder.best(3), Policy("any", CONFIG, random_params(9), 4))
+    pretrained.save(folder.best(3, 4), Policy("any", CONFIG, random_params(9), 4))
     return path
 
 
@@ -81,7 +82,7 @@ def test_a_run_is_exported(run_path, tmp_path, arguments, iteration, seed, facto
 def test_half_precision_is_half_the_size_and_close(run_path, tmp_path):
     whole = export(tmp_path, run_path)
     size = (tmp_path / "x.npz").stat().st_size
-    half = export(tmp_path, run_path, "--half")
+    half = export(tmp_path, run_path, "--half", "--force")
     assert (tmp_path / "x.npz").stat().st_size < size
     for a, b in zip(jax.tree.leaves(half.params), jax.tree.leaves(whole.params), strict=True):
         assert a.dtype == jnp.float32
@@ -121,15 +122,34 @@ def test_impossible_exports_are_refused(run_path, tmp_path, capsys):
     for arguments, message in (
         (["--seed", 5], "mine has no seed 5; allowed: 3, 4"),
         (["--iteration", 7], "holds no checkpoint 7; allowed: 5, 6"),
-        (["--best", "--seed", 4], "best-seed4.npz does not exist"),
+        (["--best", "--seed", 4], "mine keeps no best parameters of seed 4"),
         (["--best", "--iteration", 5], "--best and --iteration name different parameters"),
     ):
         given = ["export", run_path, "--name", "x", "--out", tmp_path, *arguments]
         assert message in refused(capsys, main, *given)
-    message = refused(capsys, main, "export", run_path, "--name", "a/x", "--out", tmp_path)
-    assert "name must be that of a file, without a path, got 'a/x'" in message
+    for name in ("a/x", "..", ""):
+        message = refused(capsys, main, "export", run_path, "--name", name, "--out", tmp_path)
+        assert f"name must be the name of a file, without a path, got {name!r}" in message
     assert "holds no run" in refused(capsys, main, "export", tmp_path / "no", "--name", "x")
     assert not list(tmp_path.iterdir())
+
+
+def test_parameters_are_replaced_on_demand_only(tmp_path, capsys):
+    (tmp_path / "x.npz").touch()
+    arguments = ["export", tmp_path / "no", "--name", "x", "--out", tmp_path]
+    assert "x.npz exists; give --force to replace it" in refused(capsys, main, *arguments)
+    assert "holds no run" in refused(capsys, main, *arguments, "--force")
+
+
+def test_a_folder_that_is_no_run_does_not_hide_shipped_parameters(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "base").mkdir()
+    monkeypatch.setattr(pretrained, "load_shipped", lambda name: f"shipped {name}")
+    assert load_policies("base") == ["shipped base"]
+    with pytest.raises(ValueError, match=r"holds no run; .*shipped parameters: base"):
+        load_policies("./base/.")
+    with pytest.raises(ValueError, match="seed names a policy of a run: base is none"):
+        load("base", seed=1)
 
 
 def test_unknown_parameters_are_refused(run_path, shipped, capsys):

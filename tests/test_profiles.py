@@ -298,12 +298,32 @@ def test_pages_hold_the_tables_of_a_profile(tiny, tmp_path):
     readme_tables.main(readme_tables.Arguments(root=tmp_path))
 
 
+def test_records_of_profiles_name_a_commit_known_before_measuring(tmp_path, monkeypatch, capsys):
+    arguments = ["--pretrained", "base", "--parts", "swaps", "--no-cache"]
+    arguments += ["--out", str(tmp_path / "out"), "--record", str(tmp_path / "x.json")]
+    monkeypatch.setattr(command, "profile", None)
+    for commit, message in (("abc-dirty", "this one of abc-dirty"), (None, "give --commit")):
+        monkeypatch.setattr(records, "machine", lambda commit=commit: {"commit": commit})
+        with pytest.raises(SystemExit):
+            command.main(arguments)
+        assert message in capsys.readouterr().err
+
+    def profile(policies, settings, console, *, commit, **known):
+        raise ValueError(f"measures, of commit {commit}")
+
+    monkeypatch.setattr(command, "profile", profile)
+    with pytest.raises(SystemExit):
+        command.main([*arguments, "--commit", "abc"])
+    assert "measures, of commit abc" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "give runs' folders or --pretrained NAME"),
-        (["--pretrained", "none"], "shipped parameters: base"),
-        (["--pretrained", "base", "base"], "which differ"),
+        (["--pretrained", "none"], "unknown parameters 'none'; allowed: base"),
+        (["--pretrained", "base", "base"], "tell them apart: base, base; rename one"),
+        (["--pretrained", "base", "--import", "no.such"], "no.such"),
         (["--pretrained", "base", "--tasks", "0"], "tasks must be >= 1, got 0"),
         (["--draw", "none.json"], "is no record"),
     ],

@@ -1,10 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from agents.config import Config
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved
-from agents.runs.story import Story
+from agents.runs.story import Story, resume_command
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
@@ -22,11 +24,13 @@ def scores(own, percent, others):
 
 def story(tmp_path, own, percent, others, *, is_solved=True, **settings):
     run = Run(Config.preset("paper", env_id=own, iterations=7, **settings))
+    folder = RunFolder(tmp_path / "x")
     return Story.of(
-        RunFolder(tmp_path / "x"),
+        folder,
         run,
         [scores(own, percent, others)],
         [FIRST if is_solved else None],
+        resume_command(folder, "--devices", "2"),
     )
 
 
@@ -58,6 +62,17 @@ def test_a_run_that_has_not_learnt_is_to_be_continued(tmp_path):
     assert "Learnt so far: trained on the base task" in text
     assert "so there is none to watch" in text
     assert "transfer:" not in text
-    assert f"--resume --name x --out {tmp_path} --iterations 14" in after[-1]
+    assert f"--resume --name x --out {tmp_path} --devices 2 --iterations 14" in after[-1]
+    assert "--stop-when-solved" not in after[-1]
+    _, after = story(tmp_path, "pstsy", 60, 0, stop_when_solved=0.5)  # which has ended it
+    assert after[-1].endswith("--iterations 14 --stop-when-solved 0")
     _, after = story(tmp_path, "base", 0, 0, is_solved=False, cooldown=0.5)  # not to be extended
     assert "--resume" not in after[-1]
+
+
+def test_commands_can_be_typed_as_they_are_shown():
+    folder = RunFolder(Path("runs/x"))
+    assert resume_command(folder) == "python -m agents.train --resume --name x"
+    folder = RunFolder(Path("my runs/x y"))
+    shown = "python -m agents.train --resume --name 'x y' --out 'my runs' --devices all"
+    assert resume_command(folder, "--devices", "all") == shown

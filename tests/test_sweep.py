@@ -1,6 +1,7 @@
 """Sweeps: the grid, the processes, and the table of what came of it."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ import agents
 from agents import Config, sweep
 from agents.experiments import workers
 from agents.experiments.training import plan_runs
-from agents.runs.folder import write_json
+from agents.runs.folder import RunFolder, is_done, write_json
 from agents.runs.metrics import MetricsLog, read_metrics
 from agents.runs.stopping import Stopped, StopSignals
 
@@ -78,7 +79,7 @@ def test_modules_of_ones_own_are_imported_first():
     [
         (["--settings", "clip"], "NAME=VALUE,VALUE, got 'clip'"),
         (["--settings", "clip="], "NAME=VALUE,VALUE, got 'clip='"),
-        (["--settings", "clip=1", "clip=2"], "every setting is given once"),
+        (["--settings", "clip=1", "clip=2"], "a setting may be given only once"),
         (["--settings", "klip=1,2"], "did you mean 'clip'"),
         (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
         (["--settings", "env_id=base,p"], "'counts' needs tasks that return"),
@@ -182,6 +183,34 @@ def test_results_are_plain_records(finished):
     unknown = {"finished": False, "trained_iterations": 0, "solved_episodes": None}
     unknown |= {"evaluation": None, "percent_p": None}
     assert {name: records[3][name] for name in unknown} == unknown
+
+
+def test_a_run_is_done_when_it_has_reached_the_threshold_of_now(finished):
+    (folder, run), *_ = planned(finished, "clip=1")
+
+    def done(share, iterations=9):
+        config = Config(iterations=iterations, stop_when_solved=share)
+        return is_done(folder, dataclasses.replace(run, config=config))
+
+    assert done(0.5)
+    assert done(1.0)
+    assert not done(0.0)
+    assert done(0.0, iterations=3)
+    folder.metrics.write_text(folder.metrics.read_text().replace(",1.0,", ",0.75,"))
+    assert done(0.75)
+    assert not done(1.0)  # its summary says that it was solved, by a lower threshold
+    MetricsLog(folder.metrics, last_iteration=3).append(
+        [{**read_metrics(folder.metrics)[-1], "iteration": 4, "evaluation": 1.0}]
+    )
+    assert not done(1.0)  # and so it does while the run is trained on
+
+
+def test_evaluations_of_runs_that_are_extended_are_out_of_date(finished):
+    folder = RunFolder(finished / "clip=1-seed0")
+    row = read_metrics(folder.metrics)[-1]
+    MetricsLog(folder.metrics, last_iteration=3).append([{**row, "iteration": 4}])
+    records = agents.results(finished)
+    assert [record["percent_base"] for record in records] == [None, 100.0, 0.0, None]
 
 
 def test_results_of_several_folders(finished, tmp_path):

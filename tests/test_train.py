@@ -8,13 +8,15 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
-from agents import evaluate
+from agents import evaluate, train
 from agents.config import PRESETS, Config
 from agents.ppo.learner import make_train
 from agents.runs import compilation_cache
@@ -23,6 +25,7 @@ from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.session import make_advance
+from agents.runs.stopping import StopSignals
 from agents.train import main, parse, select
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
@@ -177,6 +180,7 @@ def refused(capsys, *arguments, command=main):
         ("--keep 0", "keep must be >= 1, got 0"),
         ("--checkpoint-every 0", "checkpoint_every must be >= 1, got 0"),
         ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
+        ("--name ..", "name must be the name of a folder, without a path, got '..'"),
         ("--resume --name no", "no holds no run; runs in "),
     ],
 )
@@ -232,6 +236,48 @@ def test_resumed_runs_keep_their_settings(tmp_path):
     assert (options.config, options.seed, options.seeds) == (stored.config, 5, 2)
     _, options = parsed(*arguments, "--iterations", "999")
     assert options.config == dataclasses.replace(stored.config, iterations=999)
+
+
+def test_resumed_runs_keep_their_task_set(capsys, tmp_path):
+    RunFolder.create(tmp_path / "x", Run(Config()))
+    arguments = ["--resume", "--no-cache", "--name", "x", "--out", str(tmp_path)]
+    message = refused(capsys, *arguments, "--env", "sy")
+    assert "x is of TrapTube-v0, not of --env sy; leave that out, or begin a new run" in message
+    assert parsed(*arguments, "--env", "base")[0] == Run(Config())
+
+
+def test_a_second_ctrl_c_ends_the_process_at_once(tmp_path, monkeypatch, capsys):
+    """An orderly exit would wait for what compiles in the background."""
+
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    class Ended(BaseException):
+        pass
+
+    def end(code):
+        raise Ended(code)
+
+    session = SimpleNamespace(console=Console(), saved=3, resume_command="again")
+    session.train, session.close = interrupted, lambda: None
+    monkeypatch.setattr(train, "start", lambda arguments: session)
+    monkeypatch.setattr(os, "_exit", end)
+    with pytest.raises(Ended, match="130"):
+        train.train([])
+    assert "Stopped at iteration 3. Continue with: again" in capsys.readouterr().out
+
+
+def test_after_stopping_a_further_ctrl_c_ends_the_process():
+    previous = {number: signal.getsignal(number) for number in StopSignals.SIGNALS}
+    try:
+        stop = StopSignals(lambda: None)
+        with stop:
+            pass
+        stop.end_process()
+        assert {signal.getsignal(number) for number in previous} == {signal.SIG_DFL}
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def test_a_run_with_a_cooldown_is_not_extended(capsys, tmp_path):
@@ -341,7 +387,8 @@ def test_solved_seeds_stay_as_they_are():
     keys = jax.random.split(jax.random.key(0), 2)
     shapes = jax.eval_shape(jax.vmap(real.init), keys)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
-    state, train = zeros._replace(key=keys), real._replace(iterate=iterate)
+    state = zeros._replace(key=keys)
+    train = SimpleNamespace(**vars(real), iterate=iterate)
     after, metrics = jax.jit(make_advance(train, 2))(state, jnp.array([True, False]))
     assert after.iteration.tolist() == [1, 0]
     assert metrics["steps"].tolist() == [48, 48]

@@ -20,7 +20,8 @@ from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol
 from agents.parallel.cores import become_devices
 from agents.runs import compilation_cache
-from agents.runs.stopping import Stopped, StopSignals
+from agents.runs.folder import check_name, read_json
+from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from trap_tube_jax.command_line import Imports
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.registry import task_set
@@ -114,10 +115,8 @@ class Options:
         """
         if self.checkpoint_every < 1:
             raise ValueError(f"checkpoint_every must be >= 1, got {self.checkpoint_every}")
-        if self.name is not None and Path(self.name).name != self.name:
-            raise ValueError(
-                f"name must be the name of a folder, without a path, got {self.name!r}"
-            )
+        if self.name is not None:
+            check_name(self.name)
 
     @property
     def defaults(self) -> Protocol:
@@ -162,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     console = Console()
-    stop = StopSignals(lambda: console.print("Finishing this iteration; again to abandon it."))
+    stop = StopSignals(lambda: console.print(f"Finishing this iteration; {AGAIN}."))
     try:
         options = tyro.cli(Options, args=arguments, prog=PROGRAM)
         become_devices(options.devices)
@@ -187,6 +186,10 @@ def run(options: Options, console: Console, stop: StopSignals) -> None:
     """
     import_modules(options.imports)
     root, experiment, create = options.root, options.experiment, not options.report_only
+    if options.record is not None:  # before training, which would be in vain
+        runs = [entry for entry in training.find_runs(root) if entry.rows]
+        used = [each for run in runs for each in read_json(run.folder.machines) or ()]
+        records.check_clean({"machines": used}, options.commit)
     protocol = training.open_experiment(
         root, experiment, options.defaults, options.given(), create=create
     )

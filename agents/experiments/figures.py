@@ -158,6 +158,6 @@ def _draw_spread(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: A
 
 
 def _of_all_seeds(episodes: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The points at which no seed is missing: a mean of those left says something else."""
+    """The points that every seed has, for a mean over some of the seeds would mislead."""
     complete = ~np.isnan(values).any(axis=0)
     return episodes[complete], values[:, complete]

@@ -28,7 +28,7 @@ import numpy as np
 from agents.experiments.training import AlgorithmRun
 from agents.runs.folder import read_json, write_json
 from agents.runs.machine import DIRTY, machine
-from agents.runs.metrics import FirstSolved, Row
+from agents.runs.metrics import Row, first_solved
 from agents.runs.tracking import OVERALL, PREFIX
 
 SCHEMA = "trap-tube-jax experiment 1"
@@ -59,7 +59,7 @@ def seed_record(
     """
     rows, config = of_seed(entry.rows, seed), entry.run.config
     last = rows[-1]
-    solved = first_solved(rows, config.stop_when_solved)
+    (solved,) = first_solved(rows, [seed], config.stop_when_solved)
     is_over = last["iteration"] >= config.iterations or (
         config.stop_when_solved > 0 and solved is not None
     )
@@ -90,13 +90,6 @@ def _best(row: Row, steps: Steps | None) -> dict[str, Any]:
         "selected_percent": 100 * float(row[OVERALL]),
         "steps": steps and {name: list(map(int, taken)) for name, taken in steps.items()},
     }
-
-
-def first_solved(rows: Sequence[Row], stop_when_solved: float) -> FirstSolved | None:
-    """When a seed first solved enough of what it trains on: all, unless training stops before."""
-    share = stop_when_solved or 1.0
-    found = next((row for row in rows if row["evaluation"] >= share), None)
-    return None if found is None else FirstSolved.of(found)
 
 
 def best_row(rows: Sequence[Row]) -> Row | None:

@@ -157,9 +157,10 @@ def best_steps(entry: AlgorithmRun, seed: int, protocol: Protocol, play: Play) -
     path, key = entry.folder.tested(seed), [iteration, protocol.reported]
     known = read_json(path)
     if known is None or known["iteration_and_tasks"] != key:
-        policy = pretrained.load(entry.folder.best(seed))
+        kept = entry.folder.kept_best(seed)
+        where = kept.get(iteration) or kept.get(0) or entry.folder.best(seed, iteration)
+        policy = pretrained.load(where)
         if policy.iteration != iteration:
-            where = entry.folder.best(seed)
             raise ValueError(f"{where} is of iteration {policy.iteration}, not of {iteration}")
         steps = {name: list(map(int, taken)) for name, taken in play(policy.params).items()}
         known = {"iteration_and_tasks": key, "steps": steps}

@@ -11,6 +11,7 @@ from rich.console import Console
 from agents.config import Config
 from agents.experiments.protocol import FIXED, LATER, Protocol
 from agents.parallel.sharding import Placement
+from agents.ppo.learner import make_train
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, is_done, read_json, write_json
 from agents.runs.machine import machine
 from agents.runs.metrics import Row, read_metrics
@@ -84,9 +85,10 @@ def open_experiment(
         before, now = getattr(defaults, field), getattr(protocol, field)
         if before != now:
             raise ValueError(f"{root} has {field}={before}, not {now}; use another --name")
-    for algorithm in protocol.algorithms:
-        Run(protocol.config(algorithm), protocol.preset)
+    configs = [protocol.config(algorithm) for algorithm in protocol.algorithms]
     if create:
+        for config in configs:
+            make_train(config)  # refuses what cannot be trained with, before anything is
         root.mkdir(parents=True, exist_ok=True)
         values = {"experiment": experiment, **dataclasses.asdict(protocol)}
         write_json(root / PROTOCOL_FILE, values)
@@ -192,8 +194,7 @@ def draw_tasks(
 def note_machine(folder: RunFolder, commit: str | None) -> None:
     """Adds this machine to those that a run ran on."""
     known = read_json(folder.machines) or []
-    here = machine()
-    here["commit"] = here["commit"] or commit
+    here = machine(commit)
     if here not in known:
         write_json(folder.machines, [*known, here])
 

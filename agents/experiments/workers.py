@@ -39,7 +39,10 @@ class Worker(NamedTuple):
 
 
 def default_processes() -> int:
-    """One a core on a CPU; one in all on another device, which runs share badly."""
+    """How many runs to train at a time: on a CPU as many as there are cores, else one.
+
+    On a GPU, several processes would compete for its memory and slow each other down.
+    """
     program = "import jax; print(jax.default_backend())"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True

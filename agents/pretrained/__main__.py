@@ -10,7 +10,7 @@ import tyro
 
 from agents import pretrained
 from agents.acting.policy import Policy
-from agents.runs.folder import RunFolder
+from agents.runs.folder import RunFolder, check_name
 from agents.runs.loading import load
 
 PROGRAM = "python -m agents.pretrained"
@@ -32,6 +32,7 @@ class Export:
       best: take the parameters of the best evaluation of an experiment's run instead.
       half: round to float16, for half the size.
       out: the folder to write to.
+      force: replace a file of that name.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -41,6 +42,7 @@ class Export:
     best: Flag = False
     half: Flag = False
     out: Path = Path(pretrained.__file__).parent
+    force: Flag = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +76,12 @@ def export(options: Export) -> Path:
     """Writes the file that the options ask for, and returns its place.
 
     Raises:
-      ValueError: there is no such run, seed or checkpoint, or the name is not one.
+      ValueError: there is no such run, seed or checkpoint, or the name is not one, or taken.
     """
-    if Path(options.name).name != options.name:
-        raise ValueError(f"name must be that of a file, without a path, got {options.name!r}")
+    check_name(options.name, "file")
     path = options.out / f"{options.name}{pretrained.SUFFIX}"
+    if path.exists() and not options.force:
+        raise ValueError(f"{path} exists; give --force to replace it, or another --name")
     pretrained.save(path, find_policy(options), half=options.half)
     return path
 
@@ -98,12 +101,13 @@ def find_policy(options: Export) -> Policy:
         return load(options.run, seed=seed, iteration=options.iteration)
     if options.iteration is not None:
         raise ValueError("--best and --iteration name different parameters; give one")
-    if not folder.best(seed).exists():
+    kept = list(folder.kept_best(seed).values())
+    if not kept:
         raise ValueError(
-            f"{folder.best(seed)} does not exist: only the runs of agents.experiments keep the "
-            "best parameters; without --best the newest checkpoint is exported"
+            f"{options.run} keeps no best parameters of seed {seed}: only the runs of "
+            "agents.experiments do; without --best the newest checkpoint is exported"
         )
-    return pretrained.load(folder.best(seed))
+    return pretrained.load(kept[-1])
 
 
 if __name__ == "__main__":

@@ -76,6 +76,7 @@ def profile(
     *,
     command: str = "",
     machines: Sequence[Record] = (),
+    commit: str | None = None,
 ) -> dict[str, Any]:
     """Measures policies and makes their record.
 
@@ -85,11 +86,12 @@ def profile(
       console: where to show how far it is.
       command: what to type for the same.
       machines: those that the policies were trained on, if known.
+      commit: the commit to note where git does not tell it.
 
     Raises:
       ValueError: a setting is not allowed, or there is no policy, or they differ in channels.
     """
-    here = machine()  # first: the code may be changed while this runs
+    here = machine(commit)  # first: the code may be changed while this runs
     policies = {name: _limited(policy) for name, policy in policies.items()}
     channels = {policy.config.num_features for policy in policies.values()}
     if len(channels) != 1:
@@ -212,13 +214,16 @@ def _pushes(oracle: Oracle, played: Played, advance: Advance) -> dict[str, list]
 def _mistakes(
     oracle: Oracle, played: Played, shortest: np.ndarray, advance: Advance
 ) -> dict[str, Any]:
-    """Where the first episodes go wrong that could be shorter; columns, by `task`.
+    """Where those of the first n episodes that took more than the shortest plan went wrong.
 
     Args:
       oracle: what knows the distances.
       played: the episodes.
       shortest: i32[n], the shortest plans of the first n of them.
       advance: called once an episode.
+
+    Returns:
+      Columns, of which `task` says which episode.
     """
     names = ("task", *Turns._fields, *SUBGOALS)
     columns: dict[str, list[int]] = {name: [] for name in names}

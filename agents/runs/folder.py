@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from agents.config import PRESETS, Config
+from agents.runs.metrics import first_solved, read_metrics
 from trap_tube_jax._version import __version__
 
 CONFIG_FILE = "config.json"
@@ -134,9 +135,22 @@ class RunFolder:
         """A row per evaluation on several sets: the steps of every task."""
         return self.path / "outcomes.csv"
 
-    def best(self, seed: int) -> Path:
-        """The parameters of a seed's best evaluation on several sets."""
-        return self.path / f"best-seed{seed}.npz"
+    def best(self, seed: int, iteration: int) -> Path:
+        """The parameters of a seed's evaluation on several sets that was the best until then."""
+        return self.path / f"best-seed{seed}-iteration{iteration}.npz"
+
+    def kept_best(self, seed: int) -> dict[int, Path]:
+        """The files of these parameters that there are, by iteration, in order; the last is best.
+
+        That of an earlier version, which had one without an iteration in its name, is at 0.
+        """
+        prefix = f"best-seed{seed}-iteration"
+        paths = self.path.glob(f"{prefix}*.npz")
+        kept = {int(path.stem.removeprefix(prefix)): path for path in paths}
+        nameless = self.path / f"best-seed{seed}.npz"
+        if nameless.exists():
+            kept[0] = nameless
+        return dict(sorted(kept.items()))
 
     def tested(self, seed: int) -> Path:
         """The steps that these parameters take in the tasks that are reported."""
@@ -231,15 +245,30 @@ class RunFolder:
         write_json(self.config, {"version": __version__, **run.to_dict()})
 
 
+def check_name(name: str, what: str = "folder") -> None:
+    """Checks that a name is that of a folder, or of another thing, within some folder.
+
+    Raises:
+      ValueError: it is empty, or a path.
+    """
+    if Path(name).name != name or name in ("", ".."):
+        raise ValueError(f"name must be the name of a {what}, without a path, got {name!r}")
+
+
 def is_done(folder: RunFolder, run: Run) -> bool:
     """Whether a run has been trained and summarised in full."""
-    summary = read_json(folder.summary)
+    summary, config = read_json(folder.summary), run.config
     if summary is None:
         return False
-    solved = all(seed["first_solved"] for seed in summary["seeds"])
-    return summary["iterations"] >= run.config.iterations or (
-        run.config.stop_when_solved > 0 and solved
-    )
+    if summary["iterations"] >= config.iterations:
+        return True
+    if config.stop_when_solved == 0:
+        return False
+    # The summary may be of another threshold, and the metrics of an iteration after it.
+    rows = [
+        row for row in read_metrics(folder.metrics) if row["iteration"] <= summary["iterations"]
+    ]
+    return all(first_solved(rows, run.seed_range, config.stop_when_solved))
 
 
 def write_json(path: Path, values: Any) -> None:

@@ -38,7 +38,7 @@ def load(
     policies = load_policies(source, iteration)
     if seed is None:
         return policies[0]._replace(greedy=greedy)
-    if not Path(source).is_dir():
+    if not _is_run(source):
         raise ValueError(f"seed names a policy of a run: {source} is none")
     _, run = RunFolder.open(Path(source))
     if seed not in run.seed_range:
@@ -58,7 +58,7 @@ def load_policies(source: str | Path, iteration: int | None = None) -> list[Poli
       ValueError: there is no such policy, or it cannot be read.
     """
     path = Path(source)
-    if path.is_dir():
+    if _is_run(source):
         return load_run(path, iteration)
     is_file = path.is_file()
     if not is_file and str(source) not in pretrained.names():
@@ -97,3 +97,8 @@ def load_run(path: Path, iteration: int | None = None) -> list[Policy]:
         Policy(f"seed {seed}", run.config, policy, int(done))
         for seed, policy, done in zip(run.seed_range, seeds, iterations, strict=True)
     ]
+
+
+def _is_run(source: str | Path) -> bool:
+    """Whether it is a run's folder; one of another kind does not hide shipped parameters."""
+    return RunFolder(Path(source)).config.is_file()

@@ -16,8 +16,12 @@ CODE = ("agents/*.py", "benchmarks/*.py", "trap_tube_jax/*.py", "pyproject.toml"
 DIRTY = "-dirty"
 
 
-def machine() -> dict[str, Any]:
-    """Hardware, versions and commit, for the record."""
+def machine(commit: str | None = None) -> dict[str, Any]:
+    """Hardware, versions and commit, for the record.
+
+    Args:
+      commit: the commit to note where git does not tell it.
+    """
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
@@ -26,7 +30,7 @@ def machine() -> dict[str, Any]:
         "platform": platform.platform(),
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in VERSIONED},
-        "commit": _commit(),
+        "commit": _commit() or commit,
     }
 
 
@@ -40,8 +44,13 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
-    """The commit that the code is of, with "-dirty" where the code was changed since."""
+    """The commit that the code is of, with "-dirty" where the code was changed since.
+
+    None without git, or where the repository is another one that the package is installed in.
+    """
     try:
+        if pathlib.Path(_git("rev-parse", "--show-toplevel")).resolve() != ROOT.resolve():
+            return None
         commit = _git("rev-parse", "--short=12", "HEAD")
         changes = _git("status", "--porcelain", "--", *CODE)
     except (OSError, subprocess.CalledProcessError):

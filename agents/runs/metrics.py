@@ -23,7 +23,7 @@ class MetricsLog:
         """Opens the file, without the rows of any iteration after `last_iteration`.
 
         Args:
-          path: made on the first `append`.
+          path: made at once, empty if there are no rows.
           last_iteration: what training continues from; 0 starts anew.
         """
         self._path = path
@@ -86,6 +86,24 @@ class FirstSolved:
             transitions=int(row["transitions"]),
             seconds=round(float(row["seconds"]), 3),
         )
+
+
+def first_solved(
+    rows: Iterable[Row], seeds: Iterable[int], stop_when_solved: float
+) -> tuple[FirstSolved | None, ...]:
+    """When each seed first solved enough of what it trains on, if it has.
+
+    Args:
+      rows: of metrics, in order of time.
+      seeds: which seeds.
+      stop_when_solved: the share of the tasks that is enough; 0 stands for all of them.
+    """
+    share = stop_when_solved or 1.0
+    found: dict[int, Row] = {}
+    for row in rows:
+        if row["evaluation"] >= share:
+            found.setdefault(int(row["seed"]), row)
+    return tuple(FirstSolved.of(found[seed]) if seed in found else None for seed in seeds)
 
 
 def _columns(row: Row) -> list[str]:

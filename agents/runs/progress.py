@@ -7,7 +7,7 @@ import numpy as np
 
 from agents.config import Config
 from agents.runs.folder import Run
-from agents.runs.metrics import FirstSolved, Row
+from agents.runs.metrics import FirstSolved, Row, first_solved
 
 
 class Progress(NamedTuple):
@@ -42,7 +42,7 @@ class Progress(NamedTuple):
         """
         counts = (values["iteration"], values["seconds"], values["compile_seconds"])
         before = [row for row in rows if row["iteration"] <= values["iteration"]]
-        return cls(*counts, first_solved(run, (None,) * run.seeds, before))
+        return cls(*counts, first_solved(before, run.seed_range, run.config.stop_when_solved))
 
     def check(self, run: Run, iterations: np.ndarray) -> None:
         """Checks that an uninterrupted run would have come to the same states.
@@ -74,18 +74,3 @@ class Progress(NamedTuple):
         """bool[S]: the seeds that have more to learn."""
         done = [config.stop_when_solved > 0 and first is not None for first in self.solved]
         return ~np.array(done) & (self.iteration < config.iterations)
-
-
-def first_solved(
-    run: Run, solved: Sequence[FirstSolved | None], rows: Sequence[Row]
-) -> tuple[FirstSolved | None, ...]:
-    """Adds the seeds that these rows, in order of time, show to be solved for the first time."""
-    share = run.config.stop_when_solved or 1.0
-    found: dict[int, Row] = {}
-    for row in rows:
-        if row["evaluation"] >= share:
-            found.setdefault(int(row["seed"]), row)
-    return tuple(
-        FirstSolved.of(found[seed]) if first is None and seed in found else first
-        for seed, first in zip(run.seed_range, solved, strict=True)
-    )

@@ -57,7 +57,7 @@ $scores
 <p>$few_layouts</p>
 <h2>Episodes</h2>
 <p><select id="episode" aria-label="episode"></select>
-<button id="back">Back</button> <button id="on">On</button>
+<button id="back">Back</button> <button id="next">Next</button>
 <input id="step" type="range" min="0" value="0" aria-label="step"></p>
 <figure><img id="board" alt="the agent's board"><figcaption id="caption"></figcaption></figure>
 <figure><img id="ideal" alt="the shortest plan's board"><figcaption id="hint"></figcaption></figure>
@@ -97,7 +97,7 @@ function move(by) { step.value = Number(step.value) + by; show(); }
 chosen.onchange = choose;
 step.oninput = show;
 document.getElementById("back").onclick = () => move(-1);
-document.getElementById("on").onclick = () => move(1);
+document.getElementById("next").onclick = () => move(1);
 choose();
 </script>
 </body>

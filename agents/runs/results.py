@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, is_done, read_json
-from agents.runs.metrics import Row, read_metrics
-from agents.runs.progress import first_solved
+from agents.runs.metrics import Row, first_solved, read_metrics
 
 COSTS = ("episodes", "transitions", "seconds")
 
@@ -24,7 +23,8 @@ def results(paths: str | Path | Iterable[str | Path]) -> list[dict[str, Any]]:
         solved_iterations     until greedy play first solved the training set (or the share
                               `stop_when_solved` of it); likewise solved_episodes,
                               solved_transitions and solved_seconds; None if it has not
-        percent_<set>         of each set's tasks, percent solved once training was over
+        percent_<set>         of each set's tasks, percent solved once training was over; None
+                              as long as a run is extended
 
     Args:
       paths: a folder or several: of a run, or anything that holds runs, at any depth.
@@ -51,7 +51,7 @@ def _of_folder(path: Path) -> list[dict[str, Any]]:
 
 def _of_run(folder: RunFolder, run: Run) -> list[dict[str, Any]]:
     rows, evaluated = read_metrics(folder.metrics), read_json(folder.evaluation) or []
-    solved = first_solved(run, (None,) * run.seeds, rows)
+    solved = first_solved(rows, run.seed_range, run.config.stop_when_solved)
     finished, records = is_done(folder, run), []
     for seed, first in zip(run.seed_range, solved, strict=True):
         last: Row = next((row for row in reversed(rows) if row["seed"] == seed), {})
@@ -67,12 +67,19 @@ def _of_run(folder: RunFolder, run: Run) -> list[dict[str, Any]]:
                 **{name: last.get(name) for name in ("success", "evaluation")},
                 "solved_iterations": first and first.iteration,
                 **{f"solved_{name}": first and getattr(first, name) for name in COSTS},
-                **_percents(evaluated, seed),
+                **_percents(evaluated, seed, last.get("iteration", 0)),
             }
         )
     return records
 
 
-def _percents(evaluated: list[dict[str, Any]], seed: int) -> dict[str, float]:
-    sets = [entry["sets"] for entry in evaluated if entry["policy"] == f"seed {seed}"]
-    return {f"percent_{score['set']}": score["percent"] for scores in sets for score in scores}
+def _percents(
+    evaluated: list[dict[str, Any]], seed: int, iteration: float
+) -> dict[str, float | None]:
+    """Those of a seed's evaluation; None where training has gone on since."""
+    return {
+        f"percent_{score['set']}": score["percent"] if entry["iteration"] == iteration else None
+        for entry in evaluated
+        if entry["policy"] == f"seed {seed}"
+        for score in entry["sets"]
+    }

@@ -23,10 +23,10 @@ from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
-from agents.runs.metrics import MetricsLog, Row, read_metrics
-from agents.runs.progress import Progress, first_solved
+from agents.runs.metrics import MetricsLog, Row, first_solved, read_metrics
+from agents.runs.progress import Progress
 from agents.runs.stopping import Stopped, StopSignals
-from agents.runs.story import Story
+from agents.runs.story import Story, resume_command
 from agents.runs.tracking import Tracker
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
@@ -50,6 +50,7 @@ class Session:
         keep: int,
         tracker: Tracker | None = None,
         placement: Placement = DEFAULT_DEVICE,
+        options: Sequence[str] = (),
     ):
         """Builds training and takes up the newest checkpoint.
 
@@ -62,12 +63,14 @@ class Session:
           tracker: what evaluates on further task sets as training goes, if anything does; of
             a single process.
           placement: the devices to train on; no matter which wrote the checkpoint.
+          options: those of the command line that a run that is continued needs again.
 
         Raises:
           ValueError: the settings cannot be trained with, or the checkpoint is unusable.
         """
         self.folder, self.run, self.console = folder, run, console
         self._every, self._tracker, self._placement = checkpoint_every, tracker, placement
+        self.resume_command = resume_command(folder, *options)
         self._results: futures.Future[tuple[Evaluator, report_page.Pay]] | None = None
         self._introduce()
         self._train = make_train(run.config, shards=placement.episodes)
@@ -140,7 +143,7 @@ class Session:
         folder.animation.unlink(missing_ok=True)
         report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
         solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
-        story = Story.of(folder, run, results.values(), list(solved.values()))
+        story = Story.of(folder, run, results.values(), list(solved.values()), self.resume_command)
         self._save_page(story, evaluator, played, results, functools.partial(pay, state))
         self._say(story.before)
         for name, result in results.items():
@@ -253,7 +256,8 @@ class Session:
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        solved = first_solved(self.run, progress.solved, rows)
+        now = first_solved(rows, self.run.seed_range, config.stop_when_solved)
+        solved = tuple(first or new for first, new in zip(progress.solved, now, strict=True))
         rows = self._track(rows, is_due=solved != progress.solved)
         if self._log is not None:
             self._log.append(rows)
@@ -276,6 +280,8 @@ class Session:
         state = self._placement.local(self._state)
         if self._checkpoints is not None:
             self._checkpoints.save(self._progress.iteration, state, record)
+            if self._tracker is not None:
+                self._tracker.forget(self._checkpoints.iterations[0])
         self.saved = self._progress.iteration
 
     def _policies(self) -> list[Policy]:

@@ -5,6 +5,8 @@ import threading
 from collections.abc import Callable
 from typing import Any, Self
 
+AGAIN = "press Ctrl-C again to stop at once"
+
 
 class Stopped(Exception):  # noqa: N818  it is no error
     """Training was asked to stop and has saved.
@@ -38,6 +40,12 @@ class StopSignals:
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+
+    def end_process(self) -> None:
+        """Lets further signals end the process at once, as they do by default."""
+        if threading.current_thread() is threading.main_thread():
+            for number in self.SIGNALS:
+                signal.signal(number, signal.SIG_DFL)
 
     def _handle(self, number: int, frame: Any) -> None:
         del frame

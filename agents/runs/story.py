@@ -1,7 +1,9 @@
 """What a run shows, in sentences for somebody who does not know the paper."""
 
+import shlex
 import statistics
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import trap_tube_jax as tt
@@ -9,7 +11,8 @@ from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved
 from trap_tube_jax.scoring.scores import Score
 
-LITTLE, MUCH = 20.0, 80.0  # percent solved, below and above which transfer is named no and yes
+# Below LITTLE percent solved, a policy is said not to transfer, above MUCH to transfer.
+LITTLE, MUCH = 20.0, 80.0
 
 
 class Story(NamedTuple):
@@ -30,6 +33,7 @@ class Story(NamedTuple):
         run: Run,
         results: Iterable[Sequence[Score]],
         solved: Sequence[FirstSolved | None],
+        command: str,
     ) -> "Story":
         """The story of a run.
 
@@ -38,6 +42,7 @@ class Story(NamedTuple):
           run: what it trained.
           results: the scores of every seed.
           solved: when each seed first solved what it trains on.
+          command: the one that continues it.
         """
         own = tt.task_set(run.config.env_id)
         scores = [score for each in results for score in each]
@@ -48,7 +53,7 @@ class Story(NamedTuple):
             watch = "No episode of the evaluation is solved, so there is none to watch."
         return cls(
             before=["", learnt(own, percent, solved), watch, transfers(own, percent, others)],
-            after=["", f"Next: {next_command(folder, run, percent)}"],
+            after=["", f"Next: {next_step(folder, run, percent, solved, command)}"],
         )
 
 
@@ -89,15 +94,38 @@ def transfers(own: tt.TaskSet, percent: float, others: Sequence[float]) -> str:
     )
 
 
-def next_command(folder: RunFolder, run: Run, percent: float) -> str:
-    """The command to try after a run that solves so many percent of its own tasks."""
+def resume_command(folder: RunFolder, *options: str) -> str:
+    """The command that continues a run, with these options."""
+    out = [] if folder.path.parent == Path("runs") else ["--out", str(folder.path.parent)]
+    arguments = ["--resume", "--name", folder.path.name, *out, *options]
+    return f"python -m agents.train {shlex.join(arguments)}"
+
+
+def next_step(
+    folder: RunFolder,
+    run: Run,
+    percent: float,
+    solved: Sequence[FirstSolved | None],
+    command: str,
+) -> str:
+    """What to try after a run.
+
+    Args:
+      folder: its files.
+      run: what it trained.
+      percent: of its own tasks, percent solved.
+      solved: when each seed first solved what it trains on.
+      command: the one that continues it.
+    """
     config = run.config
-    if percent < MUCH and not (config.cooldown or config.intrinsic_start):
-        out = "" if str(folder.path.parent) == "runs" else f" --out {folder.path.parent}"
-        return (
-            f"train longer with python -m agents.train --resume --name {folder.path.name}{out} "
-            f"--iterations {2 * config.iterations}"
-        )
+    more = f"--iterations {2 * config.iterations}"
+    can_go_on = not (config.cooldown or config.intrinsic_start)
+    if config.stop_when_solved > 0 and all(solved):
+        more += " --stop-when-solved 0"
+        can_go_on &= run.seeds == 1  # several may have stopped at different iterations
+    if percent < MUCH and can_go_on:
+        return f"train longer with {command} {more}"
     if tt.task_set(config.env_id).short != "pstsy":
         return "train on all transfers at once with python -m agents.train --preset best"
-    return f"compare with shortest plans, python -m agents.evaluate {folder.path} --optimality"
+    path = shlex.quote(str(folder.path))
+    return f"compare with shortest plans, python -m agents.evaluate {path} --optimality"

@@ -24,7 +24,9 @@ class Tracker:
     Each evaluation adds to the metrics the share of tasks solved of every set, `greedy_<set>`,
     and their mean over the ranked sets, `greedy_overall`; in between these are NaN. The run's
     `outcomes.csv` gets the steps taken in every task, 0 where it is not solved, and
-    `best-seed<seed>.npz` the parameters of the best overall evaluation so far.
+    `best-seed<seed>-iteration<iteration>.npz` the parameters of the best overall evaluation so far.
+    Those of the best until a checkpoint stay at least until the next one, so that a run that is
+    killed and continues from there finds them.
     """
 
     def __init__(
@@ -55,6 +57,10 @@ class Tracker:
     def resume(self, rows: Sequence[Row], iteration: int) -> None:
         """Continues after these rows of metrics, the last of which is of `iteration`."""
         self._log = MetricsLog(self._folder.outcomes, last_iteration=iteration)
+        for seed in self._best:
+            for done, path in self._folder.kept_best(seed).items():
+                if done > iteration:
+                    path.unlink()
         for row in rows:
             seed, overall = int(row["seed"]), float(row.get(OVERALL, math.nan))
             self._best[seed] = max(self._best[seed], overall)
@@ -62,6 +68,15 @@ class Tracker:
     def is_due(self, iteration: int) -> bool:
         """Whether this iteration is among those that are evaluated in any case."""
         return iteration % self._every == 0
+
+    def forget(self, iteration: int) -> None:
+        """Deletes the parameters that are not the best of any iteration from this one on."""
+        for seed in self._best:
+            before = [
+                path for done, path in self._folder.kept_best(seed).items() if done <= iteration
+            ]
+            for path in before[:-1]:
+                path.unlink()
 
     def skip(self) -> dict[str, float]:
         """The columns of an iteration without evaluation."""
@@ -77,7 +92,7 @@ class Tracker:
         overall = float(np.mean([shares[name] for name in self._ranked]))
         if overall > self._best[seed]:
             self._best[seed] = overall
-            pretrained.save(self._folder.best(seed), policy)
+            pretrained.save(self._folder.best(seed, policy.iteration), policy)
         return {**{PREFIX + name: share for name, share in shares.items()}, OVERALL: overall}
 
 
