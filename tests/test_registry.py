@@ -66,6 +66,11 @@ def test_register_adds_a_set(own_registry):
     assert tt.make("Top-v0").transfers == (tt.structural, to_the_top)
 
 
+def test_register_takes_transfers_of_any_iterable(own_registry):
+    entry = tt.register("Once-v0", (each for each in (tt.structural, tt.symbolic)))
+    assert entry.transfers == tt.make("Once-v0").transfers == (tt.structural, tt.symbolic)
+
+
 def test_register_holds_base_state_and_step_limit(own_registry):
     base = tt.base_state(5).replace(agent=np.array((0, 0), np.int32))
     entry = tt.register("Own-v0", (), short="own", base=base, max_steps=20)
@@ -115,6 +120,7 @@ def test_make_refuses(options, words):
         (7, (), None, ["non-empty string", "7"]),
         ("Mine-v0", (), 7, ["non-empty string", "7"]),
         ("Mine-v0", tt.symbolic, None, ["transfers", "sequence", "symbolic"]),
+        ("Mine-v0", None, None, ["transfers", "sequence", "None"]),
         ("Mine-v0", ("symbolic",), None, ["(key, state) -> state", "'symbolic'", "perceptual"]),
     ],
 )
