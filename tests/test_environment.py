@@ -191,6 +191,13 @@ def test_the_limit_truncates_and_keeps_the_discount(easy_step):
     assert (timestep.terminated, timestep.truncated) == (False, True)
 
 
+def test_a_truncated_state_stays_under_a_larger_limit(easy_step):
+    truncated = EASY.replace(time=jnp.int32(1), truncated=jnp.array(True))
+    after, timestep = easy_step(truncated, RIGHT)
+    assert_same(after, truncated)
+    assert (timestep.done, timestep.reward) == (True, 0)
+
+
 def test_fifty_steps_unless_told_otherwise():
     env = tt.Environment()
     assert env.max_steps == 50
@@ -290,6 +297,29 @@ def test_episode_statistics_around_a_bare_environment_count_one_episode():
     for _ in range(5):
         state, _ = step(state, RIGHT)
     assert (state.episodes, state.last_length, state.last_return) == (1, 2, 1)
+
+
+def test_episode_statistics_of_a_vector_count_each_environment():
+    fast = tt.EpisodeStatistics(tt.VectorEnvironment(tt.Environment(base=EASY, max_steps=3)))
+
+    @jax.jit
+    def run(keys):
+        state, _ = fast.reset(keys)
+        actions = jnp.broadcast_to(jnp.stack([RIGHT, DOWN]), (6, 2, 2))
+        return jax.lax.scan(fast.step, state, actions)[0]
+
+    state = run(jax.random.split(jax.random.key(0), 2))
+    np.testing.assert_array_equal(state.episodes, [3, 2])
+    np.testing.assert_array_equal(state.last_length, [2, 3])
+    np.testing.assert_array_equal(state.last_return, [1, 0])
+
+
+@pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
+def test_auto_reset_refuses_what_starts_over_by_itself(wrapper):
+    env = wrapper(tt.Environment())
+    words = [wrapper.__name__, "starts over by itself", "trap_tube_jax.Environment"]
+    assert_refused(words, tt.AutoReset, env)
+    assert_refused(["starts over by itself"], tt.AutoReset, tt.EpisodeStatistics(env))
 
 
 def test_own_transfers_apply_in_order_to_an_own_base():
@@ -428,6 +458,7 @@ def test_step_refuses(action, words):
 )
 def test_reset_refuses(key, words):
     assert_refused(words, tt.Environment().reset, key)
+    assert_refused(words, tt.AutoReset(tt.Environment()).reset, key)
 
 
 def test_raw_keys_serve_as_well():

@@ -120,7 +120,7 @@ class Environment:
         was_done = state.terminated | state.truncated
         state = dynamics.step(state, action)
         time = state.time + ~was_done
-        truncated = ~state.terminated & (time >= self.max_steps)
+        truncated = state.truncated | (~state.terminated & (time >= self.max_steps))
         state = state.replace(time=time, truncated=truncated)
         reward = (state.terminated & ~was_done).astype(jnp.float32)
         return state, _timestep(state, reward)
@@ -177,8 +177,12 @@ def _timestep(state: State, reward: jax.Array) -> TimeStep:
     )
 
 
-def _typed_key(key: Any) -> jax.Array:
-    """One PRNG key as a typed one: transfers get this type, whatever `reset` was given."""
+def check_key(key: Any) -> jax.Array:
+    """Returns `key` if it is one PRNG key, typed or u32[2].
+
+    Raises:
+      ValueError: it is not.
+    """
     is_typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     is_raw = getattr(key, "dtype", None) == jnp.uint32 and np.shape(key) == (2,)
     if not is_raw and not (is_typed and key.shape == ()):
@@ -186,7 +190,13 @@ def _typed_key(key: Any) -> jax.Array:
             f"reset takes one PRNG key, got {type(key).__name__} of shape {np.shape(key)}; "
             "make one with jax.random.key(seed), and jax.vmap over several"
         )
-    return jax.random.wrap_key_data(key) if is_raw else key
+    return key
+
+
+def _typed_key(key: Any) -> jax.Array:
+    """One PRNG key as a typed one: transfers get this type, whatever `reset` was given."""
+    key = check_key(key)
+    return jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
 def _check_action(action: Any) -> jax.Array:
