@@ -192,3 +192,29 @@ def test_refusals():
 def test_single_actions_are_checked(action):
     words = ["(grasp, move)", "0 to 3", "0 to 15", repr(action)]
     assert_refused(words, tt.score_gymnasium, Single(action), ["base"])
+
+
+class Constant:
+    """Takes one action i32[2] three times, then others, i32[2] or i32[B, 2]."""
+
+    def __init__(self, action, later=None):
+        self.action, self.later = jnp.array(action), jnp.array(action if later is None else later)
+
+    def initial(self, batch):
+        return jnp.int32(0)
+
+    def act(self, observation, carry, key):
+        del key
+        action = jnp.where(carry < 3, self.action, self.later)
+        return jnp.broadcast_to(action, (len(observation), 2)), carry + 1
+
+
+def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
+    over = rightward_food(evaluation_tasks("near", 20))[:, None]
+    first, later = [UP, RIGHT], np.where(over, 9, RIGHT)
+    assert tt.score(Constant(first, later), ["near"], 20)["near"].solved == over.sum()
+    words = ["an action that is none", "(grasp, move)", "0 to 3"]
+    for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):
+        assert_refused(words, tt.score, action, ["near"], 20)
+    floats = Constant([0.0, 3.0])
+    assert_refused(["integer[2]", "float32[2]"], tt.score, floats, ["near"], 20)
