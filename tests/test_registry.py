@@ -83,6 +83,11 @@ def test_register_holds_base_state_and_step_limit(own_registry):
     assert len({entry, *tt.PAPER_TASK_SETS}) == 9
 
 
+@pytest.mark.parametrize("options", [{"base": tt.base_state()}, {"max_steps": 20}])
+def test_other_tasks_than_the_papers_have_no_label_of_the_papers(own_registry, options):
+    assert tt.register("Own-v0", (tt.structural,), short="own", **options).label == "own"
+
+
 def test_register_takes_the_id_for_a_missing_short_name(own_registry):
     assert tt.register("Plain-v0", ()).short == "Plain-v0"
 

@@ -13,7 +13,7 @@ from refusal import assert_refused
 import trap_tube_jax as tt
 from trap_tube_jax import registry
 from trap_tube_jax.scoring import benchmark
-from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, evaluation_tasks
+from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, evaluation_tasks, layout_numbers
 
 # Of the first 32 tasks of every set. Other tasks need another version of the protocol.
 DIGESTS = {
@@ -109,9 +109,27 @@ def test_a_policy_is_scored_on_the_fixed_tasks(scores):
     assert [score.tasks for score in scores.sets] == [20, 1]
     assert scores["near"].solved == solvable.sum()
     assert scores["near"].percent == 5 * solvable.sum()
-    assert scores["near"].interval is not None
     assert scores["near"].mean_steps == 3
     assert (scores["base"].solved, scores["base"].interval) == (0, None)
+
+
+def test_few_layouts_are_counted_in_place_of_an_interval(scores):
+    assert (scores["near"].interval, str(scores["near"].layouts)) == (None, "1 of 2")
+
+
+def test_few_layouts_are_those_that_return():
+    def in_row(rows):
+        rows = jnp.array(rows, jnp.int32)
+        tasks = jax.tree.map(lambda x: np.broadcast_to(x, (len(rows), *x.shape)), tt.base_state())
+        return tasks.replace(agent=jnp.stack([rows, rows], axis=1))
+
+    assert layout_numbers("own", in_row([3, 1, 1, 3])).tolist() == [1, 0, 0, 1]
+    assert layout_numbers("own", in_row([7])).tolist() == [0]
+    assert layout_numbers("own", in_row([1, 2, 3])) is None, "no sign that they are few"
+    assert layout_numbers("own", in_row([0, 1, 2, 3, 4, 4])) is not None
+    assert layout_numbers("own", in_row([0, 1, 2, 3, 4, 5, 5])) is None
+    assert layout_numbers("p", in_row([1, 1])) is None
+    assert layout_numbers("sy", in_row([0, 1, 2])).tolist() == [0, 1, 2]
 
 
 def test_blocks_change_nothing(scores, monkeypatch):

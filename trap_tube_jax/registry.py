@@ -33,17 +33,17 @@ class TaskSet:
 
     @property
     def label(self) -> str:
-        """The set in the paper's notation, as in "{P, St}".
+        """The set in the paper's notation, as in "{P, St}"; without transfers, "base".
 
-        Without transfers: "base", or the short name if the set has a base state of its own.
+        The short name if the set has a base state or a step limit of its own.
         """
+        if self.base is not None or self.max_steps != MAX_STEPS:
+            return self.short
         symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
         names = (
             symbols.get(transfer, getattr(transfer, "__name__", "?")) for transfer in self.transfers
         )
-        if self.transfers:
-            return "{" + ", ".join(names) + "}"
-        return "base" if self.base is None else self.short
+        return "{" + ", ".join(names) + "}" if self.transfers else "base"
 
 
 PAPER_TASK_SETS = (
