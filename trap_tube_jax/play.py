@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import tyro
 
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import (
     AGENT,
@@ -423,7 +423,5 @@ def _attribute(color: tuple[int, int, int]) -> int:
 
 
 if __name__ == "__main__":
-    try:
+    with plain_errors():
         main(tyro.cli(Arguments))
-    except ValueError as error:
-        sys.exit(f"play: {error}")
