@@ -198,6 +198,10 @@ def test_a_truncated_state_stays_under_a_larger_limit(easy_step):
     assert (timestep.done, timestep.reward) == (True, 0)
 
 
+def test_an_environment_may_be_made_within_a_traced_function():
+    assert jax.eval_shape(lambda: tt.Environment(base=tt.base_state()).base.food).shape == (2,)
+
+
 def test_fifty_steps_unless_told_otherwise():
     env = tt.Environment()
     assert env.max_steps == 50

@@ -335,7 +335,7 @@ def test_command_line_draws_distances(tmp_path, capsys):
 
 
 def test_the_command_line_says_that_no_state_leads_to_the_goal():
-    plan = tt.Plan(np.zeros((0, 2), np.int32), np.int32(-1), np.False_)
+    plan = tt.Plan(np.zeros((0, 2), np.int32), np.array(-1), np.array(False))
     found = tt.Distances(from_start=np.arange(1234), to_goal=np.full(1234, -1))
     line = "1,234 reachable states, none of them with a way to the goal; unsolvable from the start"
     assert _distances_line(plan, found) == line

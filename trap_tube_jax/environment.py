@@ -217,9 +217,10 @@ def _check_action(action: Any) -> jax.Array:
 def _check_base(base: State) -> State:
     """Returns `base` if an episode can start from it."""
     validate(base)
-    if base.time != 0:
+    time = int(base.time)
+    if time != 0:
         raise ValueError(
-            f"the base state is at time {base.time}; allowed: time 0, as in "
+            f"the base state is at time {time}; allowed: time 0, as in "
             "base.replace(time=np.int32(0))"
         )
     return base

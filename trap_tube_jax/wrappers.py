@@ -17,11 +17,11 @@ class EnvironmentLike(Protocol):
     One that starts over by itself has an attribute `starts_over` that is true.
     """
 
-    def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
+    def reset(self, key: jax.Array, /) -> tuple[Any, TimeStep]:
         """Starts an episode."""
         ...
 
-    def step(self, state: Any, action: jax.Array) -> tuple[Any, TimeStep]:
+    def step(self, state: Any, action: jax.Array, /) -> tuple[Any, TimeStep]:
         """Takes one action."""
         ...
 
