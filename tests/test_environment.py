@@ -191,6 +191,17 @@ def test_the_limit_truncates_and_keeps_the_discount(easy_step):
     assert (timestep.terminated, timestep.truncated) == (False, True)
 
 
+def test_a_truncated_state_stays_under_a_larger_limit(easy_step):
+    truncated = EASY.replace(time=jnp.int32(1), truncated=jnp.array(True))
+    after, timestep = easy_step(truncated, RIGHT)
+    assert_same(after, truncated)
+    assert (timestep.done, timestep.reward) == (True, 0)
+
+
+def test_an_environment_may_be_made_within_a_traced_function():
+    assert jax.eval_shape(lambda: tt.Environment(base=tt.base_state()).base.food).shape == (2,)
+
+
 def test_fifty_steps_unless_told_otherwise():
     env = tt.Environment()
     assert env.max_steps == 50
@@ -292,6 +303,29 @@ def test_episode_statistics_around_a_bare_environment_count_one_episode():
     assert (state.episodes, state.last_length, state.last_return) == (1, 2, 1)
 
 
+def test_episode_statistics_of_a_vector_count_each_environment():
+    fast = tt.EpisodeStatistics(tt.VectorEnvironment(tt.Environment(base=EASY, max_steps=3)))
+
+    @jax.jit
+    def run(keys):
+        state, _ = fast.reset(keys)
+        actions = jnp.broadcast_to(jnp.stack([RIGHT, DOWN]), (6, 2, 2))
+        return jax.lax.scan(fast.step, state, actions)[0]
+
+    state = run(jax.random.split(jax.random.key(0), 2))
+    np.testing.assert_array_equal(state.episodes, [3, 2])
+    np.testing.assert_array_equal(state.last_length, [2, 3])
+    np.testing.assert_array_equal(state.last_return, [1, 0])
+
+
+@pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
+def test_auto_reset_refuses_what_starts_over_by_itself(wrapper):
+    env = wrapper(tt.Environment())
+    words = [wrapper.__name__, "starts over by itself", "trap_tube_jax.Environment"]
+    assert_refused(words, tt.AutoReset, env)
+    assert_refused(["starts over by itself"], tt.AutoReset, tt.EpisodeStatistics(env))
+
+
 def test_own_transfers_apply_in_order_to_an_own_base():
     def to_last_row(key, state):
         del key
@@ -353,8 +387,11 @@ BAD_ENVIRONMENTS: list[tuple[str, dict[str, Any], list[str]]] = [
     ("half a step", {"max_steps": 2.5}, ["max_steps", "integer >= 1", "2.5"]),
     ("steps a text", {"max_steps": "50"}, ["max_steps", "integer >= 1", "'50'"]),
     ("steps a truth", {"max_steps": True}, ["max_steps", "integer >= 1", "True"]),
+    ("too many steps", {"max_steps": 10**10}, ["max_steps", "<= 2147483647", "10000000000"]),
     ("base no state", {"base": "TrapTube-v0"}, ["trap_tube_jax.State", "str"]),
     ("base solved", {"base": EASY.replace(agent=EASY.food)}, ["share cell (0, 3)", "apart"]),
+    ("base in play", {"base": EASY.replace(time=np.int32(3))}, ["time 3", "allowed: time 0"]),
+    ("no transfers", {"transfers": None}, ["transfers", "(key, state) -> state", "None"]),
     ("a bare function", {"transfers": tt.symbolic}, ["transfers", "sequence", "symbolic"]),
     ("a name", {"transfers": ("symbolic",)}, ["(key, state) -> state", "'symbolic'"]),
     ("nothing returned", {"transfers": (no_state,)}, ["no_state", "broken", "State", "NoneType"]),
@@ -425,6 +462,7 @@ def test_step_refuses(action, words):
 )
 def test_reset_refuses(key, words):
     assert_refused(words, tt.Environment().reset, key)
+    assert_refused(words, tt.AutoReset(tt.Environment()).reset, key)
 
 
 def test_raw_keys_serve_as_well():

@@ -6,6 +6,7 @@ from PIL import Image
 
 import trap_tube_jax as tt
 from trap_tube_jax import gallery
+from trap_tube_jax.command_line import plain_errors
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +73,10 @@ def test_the_command_line_writes_the_pictures(tmp_path, monkeypatch, capsys):
     written = [path.name for path in sorted((tmp_path / "new").iterdir())]
     assert written == ["gallery.png", "solved_base.gif"]
     assert "solved_base.gif" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("error", [ValueError("no such set"), PermissionError("no such folder")])
+def test_command_lines_say_in_a_line_what_is_wrong(error, capsys):
+    with pytest.raises(SystemExit, match="2"), plain_errors():
+        raise error
+    assert capsys.readouterr().err == f"error: {error}\n"

@@ -200,6 +200,12 @@ def test_structural_goes_along_the_great_circle(num_features):
         np.testing.assert_allclose(turned + rest, whole, atol=2e-3)
 
 
+def test_structural_goes_straight_from_the_centre():
+    drawn = np.array([[0.6, 0.8, 0], [0, 0, -1]], np.float32)
+    points = points_between(jnp.zeros((2, 3)), jnp.asarray(drawn), 0.25)
+    np.testing.assert_allclose(points, drawn / 4, atol=1e-6)
+
+
 def test_structural_leaves_agent_and_food_and_the_tubes_alike():
     drawn = palettes(0.7)
     np.testing.assert_array_equal(drawn[:, spec.TUBE1], drawn[:, spec.TUBE2])

@@ -161,6 +161,16 @@ def test_the_screen_shows_a_horizontal_tool_in_its_color(game):
     assert {span.color for span in spans} == {tuple(BASE_COLORS[6].tolist())}
 
 
+@pytest.mark.parametrize("num_features", [1, 2, 5])
+def test_the_screen_shows_other_numbers_of_features_as_pictures_do(game, num_features):
+    features = np.arange(8 * num_features, dtype=np.uint8).reshape(8, num_features)
+    state = game.state.replace(palette=jnp.asarray(features))
+    spans = play.screen(play.Game("TrapTube-v0", 0, (state,)))
+    picture = np.asarray(tt.render(state, 1))
+    food = next(span for span in spans if span.text == "@@")
+    assert food.color == tuple(picture[tuple(state.food)].tolist())
+
+
 @pytest.mark.parametrize(
     ("rgb", "color"),
     [((0, 0, 0), 16), ((255, 0, 0), 196), ((255, 255, 255), 231), ((8, 8, 9), 232)],

@@ -66,6 +66,11 @@ def test_register_adds_a_set(own_registry):
     assert tt.make("Top-v0").transfers == (tt.structural, to_the_top)
 
 
+def test_register_takes_transfers_of_any_iterable(own_registry):
+    entry = tt.register("Once-v0", (each for each in (tt.structural, tt.symbolic)))
+    assert entry.transfers == tt.make("Once-v0").transfers == (tt.structural, tt.symbolic)
+
+
 def test_register_holds_base_state_and_step_limit(own_registry):
     base = tt.base_state(5).replace(agent=np.array((0, 0), np.int32))
     entry = tt.register("Own-v0", (), short="own", base=base, max_steps=20)
@@ -76,6 +81,11 @@ def test_register_holds_base_state_and_step_limit(own_registry):
     assert tt.make("own", base=tt.base_state()).num_features == 3
     assert_refused(["num_features=3", "5 features"], tt.make, "own", num_features=3)
     assert len({entry, *tt.PAPER_TASK_SETS}) == 9
+
+
+@pytest.mark.parametrize("options", [{"base": tt.base_state()}, {"max_steps": 20}])
+def test_other_tasks_than_the_papers_have_no_label_of_the_papers(own_registry, options):
+    assert tt.register("Own-v0", (tt.structural,), short="own", **options).label == "own"
 
 
 def test_register_takes_the_id_for_a_missing_short_name(own_registry):
@@ -115,6 +125,7 @@ def test_make_refuses(options, words):
         (7, (), None, ["non-empty string", "7"]),
         ("Mine-v0", (), 7, ["non-empty string", "7"]),
         ("Mine-v0", tt.symbolic, None, ["transfers", "sequence", "symbolic"]),
+        ("Mine-v0", None, None, ["transfers", "sequence", "None"]),
         ("Mine-v0", ("symbolic",), None, ["(key, state) -> state", "'symbolic'", "perceptual"]),
     ],
 )

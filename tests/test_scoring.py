@@ -13,7 +13,7 @@ from refusal import assert_refused
 import trap_tube_jax as tt
 from trap_tube_jax import registry
 from trap_tube_jax.scoring import benchmark
-from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, evaluation_tasks
+from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, evaluation_tasks, layout_numbers
 
 # Of the first 32 tasks of every set. Other tasks need another version of the protocol.
 DIGESTS = {
@@ -109,9 +109,31 @@ def test_a_policy_is_scored_on_the_fixed_tasks(scores):
     assert [score.tasks for score in scores.sets] == [20, 1]
     assert scores["near"].solved == solvable.sum()
     assert scores["near"].percent == 5 * solvable.sum()
-    assert scores["near"].interval is not None
     assert scores["near"].mean_steps == 3
     assert (scores["base"].solved, scores["base"].interval) == (0, None)
+
+
+def test_few_layouts_are_counted_in_place_of_an_interval(scores):
+    assert (scores["near"].interval, str(scores["near"].layouts)) == (None, "1 of 2")
+
+
+def test_few_layouts_are_those_that_return():
+    def in_row(rows):
+        rows = jnp.array(rows, jnp.int32)
+        tasks = jax.tree.map(lambda x: np.broadcast_to(x, (len(rows), *x.shape)), tt.base_state())
+        return tasks.replace(agent=jnp.stack([rows, rows], axis=1))
+
+    def numbers(name, rows):
+        layout = layout_numbers(name, in_row(rows))
+        return None if layout is None else layout.tolist()
+
+    assert numbers("own", [3, 1, 1, 3]) == [1, 0, 0, 1]
+    assert numbers("own", [7]) == [0]
+    assert numbers("own", [1, 2, 3]) is None, "no sign that they are few"
+    assert numbers("own", [0, 1, 2, 3, 4, 4]) == [0, 1, 2, 3, 4, 4]
+    assert numbers("own", [0, 1, 2, 3, 4, 5, 5]) is None
+    assert numbers("p", [1, 1]) is None
+    assert numbers("sy", [0, 1, 2]) == [0, 1, 2]
 
 
 def test_blocks_change_nothing(scores, monkeypatch):
@@ -192,3 +214,29 @@ def test_refusals():
 def test_single_actions_are_checked(action):
     words = ["(grasp, move)", "0 to 3", "0 to 15", repr(action)]
     assert_refused(words, tt.score_gymnasium, Single(action), ["base"])
+
+
+class Constant:
+    """Takes one action i32[2] three times, then others, i32[2] or i32[B, 2]."""
+
+    def __init__(self, action, later=None):
+        self.action, self.later = jnp.array(action), jnp.array(action if later is None else later)
+
+    def initial(self, batch):
+        return jnp.int32(0)
+
+    def act(self, observation, carry, key):
+        del key
+        action = jnp.where(carry < 3, self.action, self.later)
+        return jnp.broadcast_to(action, (len(observation), 2)), carry + 1
+
+
+def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
+    over = rightward_food(evaluation_tasks("near", 20))[:, None]
+    first, later = [UP, RIGHT], np.where(over, 9, RIGHT)
+    assert tt.score(Constant(first, later), ["near"], 20)["near"].solved == over.sum()
+    words = ["an action that is none", "(grasp, move)", "0 to 3"]
+    for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):
+        assert_refused(words, tt.score, action, ["near"], 20)
+    floats = Constant([0.0, 3.0])
+    assert_refused(["integer[2]", "float32[2]"], tt.score, floats, ["near"], 20)

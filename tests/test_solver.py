@@ -13,7 +13,7 @@ from PIL import Image
 
 import trap_tube_jax as tt
 from trap_tube_jax.objects import EXIT, MAX_STEPS, TOOL, TRAP, TUBE1, TUBE2
-from trap_tube_jax.solver.__main__ import main
+from trap_tube_jax.solver.__main__ import _distances_line, main
 from trap_tube_jax.solver.distance import count_reachable
 from trap_tube_jax.solver.search import take
 from trap_tube_jax.solver.survey import draw_tasks, survey
@@ -334,12 +334,20 @@ def test_command_line_draws_distances(tmp_path, capsys):
         assert image.format == "PNG"
 
 
+def test_the_command_line_says_that_no_state_leads_to_the_goal():
+    plan = tt.Plan(np.zeros((0, 2), np.int32), np.array(-1), np.array(False))
+    found = tt.Distances(from_start=np.arange(1234), to_goal=np.full(1234, -1))
+    line = "1,234 reachable states, none of them with a way to the goal; unsolvable from the start"
+    assert _distances_line(plan, found) == line
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--show", "p", "--distances", "p"], "exclude each other"),
         (["--show", "nowhere"], "unknown task set 'nowhere'"),
         (["--tasks", "0"], "tasks must be >= 1"),
+        (["--sets"], "--sets must name at least one task set"),
     ],
 )
 def test_command_line_refuses(arguments, message, capsys):

@@ -1,5 +1,8 @@
 """What the command lines share."""
 
+import contextlib
+import sys
+from collections.abc import Iterator
 from typing import Annotated
 
 import tyro
@@ -8,3 +11,16 @@ import tyro
 Imports = Annotated[
     tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import", metavar="MODULE")
 ]
+
+
+@contextlib.contextmanager
+def plain_errors() -> Iterator[None]:
+    """Ends the process with status 2 and one line, in place of a traceback.
+
+    For what the user gave: a ValueError, or an OSError such as a folder that cannot be written.
+    """
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error

@@ -4,7 +4,7 @@ Source: paper, section "Environments"; environment.md.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -23,6 +23,8 @@ from trap_tube_jax.objects import (
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State, TimeStep, base_state, check_structure, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
+
+LARGEST_TIME = 2**31 - 1  # `State.time` is an i32
 
 _TRUSTED_TRANSFERS = (perceptual, structural, symbolic)
 
@@ -53,7 +55,7 @@ class Environment:
 
     def __init__(
         self,
-        transfers: Sequence[Transfer] = (),
+        transfers: Iterable[Transfer] = (),
         *,
         base: State | None = None,
         max_steps: int = MAX_STEPS,
@@ -63,20 +65,24 @@ class Environment:
         Args:
           transfers: functions (key, state) -> state, applied in order at every reset, each
             with a typed key of its own (`compose`).
-          base: the state that the transfers start from; the base task if absent.
-          max_steps: steps after which an unsolved episode is truncated, at least 1.
+          base: the state that the transfers start from, at time 0; the base task if absent.
+          max_steps: steps after which an unsolved episode is truncated, 1 to 2**31 - 1.
 
         Raises:
           ValueError: naming the argument, its value and what is allowed.
         """
-        if callable(transfers):
-            raise ValueError(f"transfers must be a sequence of functions, got {transfers!r}")
-        if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer):
-            raise ValueError(f"max_steps must be an integer >= 1, got {max_steps!r}")
-        if max_steps < 1:
-            raise ValueError(f"max_steps must be >= 1, got {max_steps}")
+        if callable(transfers) or not isinstance(transfers, Iterable):
+            raise ValueError(
+                f"transfers must be a sequence of functions (key, state) -> state, "
+                f"got {transfers!r}"
+            )
+        is_integer = isinstance(max_steps, int | np.integer) and not isinstance(max_steps, bool)
+        if not is_integer or not 1 <= max_steps <= LARGEST_TIME:
+            raise ValueError(
+                f"max_steps must be an integer >= 1 and <= {LARGEST_TIME}, got {max_steps!r}"
+            )
         self.transfers = tuple(transfers)
-        self.base = base_state() if base is None else validate(base)
+        self.base = base_state() if base is None else _check_base(base)
         self.max_steps = int(max_steps)
         self._transfer = compose(*self.transfers)
         self._check_transfers()
@@ -114,7 +120,7 @@ class Environment:
         was_done = state.terminated | state.truncated
         state = dynamics.step(state, action)
         time = state.time + ~was_done
-        truncated = ~state.terminated & (time >= self.max_steps)
+        truncated = state.truncated | (~state.terminated & (time >= self.max_steps))
         state = state.replace(time=time, truncated=truncated)
         reward = (state.terminated & ~was_done).astype(jnp.float32)
         return state, _timestep(state, reward)
@@ -171,8 +177,12 @@ def _timestep(state: State, reward: jax.Array) -> TimeStep:
     )
 
 
-def _typed_key(key: Any) -> jax.Array:
-    """One PRNG key as a typed one: transfers get this type, whatever `reset` was given."""
+def check_key(key: Any) -> jax.Array:
+    """Returns `key` if it is one PRNG key, typed or u32[2].
+
+    Raises:
+      ValueError: it is not.
+    """
     is_typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     is_raw = getattr(key, "dtype", None) == jnp.uint32 and np.shape(key) == (2,)
     if not is_raw and not (is_typed and key.shape == ()):
@@ -180,7 +190,13 @@ def _typed_key(key: Any) -> jax.Array:
             f"reset takes one PRNG key, got {type(key).__name__} of shape {np.shape(key)}; "
             "make one with jax.random.key(seed), and jax.vmap over several"
         )
-    return jax.random.wrap_key_data(key) if is_raw else key
+    return key
+
+
+def _typed_key(key: Any) -> jax.Array:
+    """One PRNG key as a typed one: transfers get this type, whatever `reset` was given."""
+    key = check_key(key)
+    return jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
 def _check_action(action: Any) -> jax.Array:
@@ -196,6 +212,18 @@ def _check_action(action: Any) -> jax.Array:
             allowed = ", ".join(f"{code} {name}" for code, name in enumerate(DIRECTION_NAMES))
             raise ValueError(f"action ({grasp}, {move}) is out of range; allowed: {allowed}")
     return action.astype(jnp.int32)
+
+
+def _check_base(base: State) -> State:
+    """Returns `base` if an episode can start from it."""
+    validate(base)
+    time = int(base.time)
+    if time != 0:
+        raise ValueError(
+            f"the base state is at time {time}; allowed: time 0, as in "
+            "base.replace(time=np.int32(0))"
+        )
+    return base
 
 
 def _check_transfer(transfer: Transfer, base: State) -> None:

@@ -5,7 +5,6 @@ On the command line, `python -m trap_tube_jax.gallery --out figures --gifs`.
 
 import dataclasses
 import pathlib
-import sys
 from collections.abc import Sequence
 
 import jax
@@ -13,6 +12,7 @@ import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import BOARD_SIZE, NUM_OBJECTS, OBJECT_NAMES
 from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
@@ -170,7 +170,5 @@ def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 if __name__ == "__main__":
-    try:
+    with plain_errors():
         main(tyro.cli(Arguments))
-    except ValueError as error:
-        sys.exit(f"gallery: {error}")

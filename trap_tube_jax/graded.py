@@ -21,6 +21,7 @@ from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State, base_state
 from trap_tube_jax.transfers import Transfer, perceptual, recolor, sphere_points, structural
 
+CENTER = 1e-4  # a radius below is 0 but for rounding; that of other features is 1 / 255 or more
 TOLERANCE = 1e-9  # of a distance, against the rounding of strength * distance
 
 
@@ -76,7 +77,7 @@ def graded_structural(strength: float) -> Transfer:
 
     t being the unit vector orthogonal to b in the plane of b and u, on the side of u. So the
     direction goes the fraction s of the great circle from b to u. For N = 1, where there is
-    no circle, the point is (1 - s) r b + s u.
+    no circle, the point is (1 - s) r b + s u; for r = 0, where there is no b, it is s u.
 
     Args:
       strength: s, from 0, the palette as it is, to 1, `structural` itself.
@@ -105,7 +106,8 @@ def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Arr
     if own.shape[-1] == 1:
         return (1 - strength) * own + strength * drawn
     radius = jnp.linalg.norm(own, axis=-1, keepdims=True)
-    start = own / radius
+    is_center = radius < CENTER
+    start = jnp.where(is_center, drawn, own / jnp.where(is_center, 1, radius))
     cosine = jnp.sum(start * drawn, axis=-1, keepdims=True)
     across = drawn - cosine * start
     sine = jnp.linalg.norm(across, axis=-1, keepdims=True)

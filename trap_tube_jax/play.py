@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import tyro
 
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import (
     AGENT,
@@ -30,7 +30,7 @@ from trap_tube_jax.objects import (
 )
 from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import make, task_set
-from trap_tube_jax.rendering import episode_frames, save_gif
+from trap_tube_jax.rendering import episode_frames, rgb, save_gif
 from trap_tube_jax.solver import solve
 from trap_tube_jax.state import State
 
@@ -313,6 +313,7 @@ def _board(game: Game) -> list[Span]:
     """The board, two characters a cell, inside a frame."""
     state = jax.tree.map(np.asarray, game.state)
     objects = np.asarray(visible_objects(game.state))
+    colors = _colors(rgb(game.state.palette))
     signs = list(SIGNS)
     signs[AGENT] = AGENT_SIGNS[game.grasp]
     if state.tool_extent[1] > 1:
@@ -322,19 +323,24 @@ def _board(game: Game) -> list[Span]:
     for row in range(BOARD_SIZE):
         spans += [Span(2 + row, 1, "|"), Span(2 + row, 2 + 2 * BOARD_SIZE, "|")]
         spans += [
-            Span(2 + row, 2 + 2 * column, signs[code], _rgb(state.palette[code]))
+            Span(2 + row, 2 + 2 * column, signs[code], colors[code])
             for column, code in enumerate(objects[row])
         ]
     return spans
 
 
+def _colors(palette: Any) -> list[tuple[int, int, int]]:
+    """Of every object, RGB u8[8, 3] as plain numbers."""
+    return [(red, green, blue) for red, green, blue in np.asarray(palette).tolist()]
+
+
 def _legend() -> list[Span]:
     """The signs with their objects' base colours, in two lines of four."""
-    spans = []
+    spans, colors = [], _colors(BASE_COLORS)
     for code in range(NUM_OBJECTS):
         row, column = divmod(code, 4)
         spans += [
-            Span(16 + row, 1 + 12 * column, SIGNS[code], _rgb(BASE_COLORS[code])),
+            Span(16 + row, 1 + 12 * column, SIGNS[code], colors[code]),
             Span(16 + row, 4 + 12 * column, OBJECT_NAMES[code]),
         ]
     return spans
@@ -361,11 +367,6 @@ def _holds_tool(game: Game) -> bool:
         for cell in (agent, agent + DIRECTIONS[game.grasp])
     ]
     return on_tool == [False, True]
-
-
-def _rgb(features: np.ndarray) -> tuple[int, int, int]:
-    red, green, blue = features.tolist()
-    return red, green, blue
 
 
 def _run(window: Any, game: Game, folder: pathlib.Path) -> None:
@@ -422,7 +423,5 @@ def _attribute(color: tuple[int, int, int]) -> int:
 
 
 if __name__ == "__main__":
-    try:
+    with plain_errors():
         main(tyro.cli(Arguments))
-    except ValueError as error:
-        sys.exit(f"play: {error}")

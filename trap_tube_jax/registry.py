@@ -4,7 +4,7 @@ Source: paper, section "Experimental Setup"; environment.md, "Task sets"; contro
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 from trap_tube_jax.controls import CONTROLS, drawn_from
 from trap_tube_jax.environment import Environment
@@ -33,17 +33,17 @@ class TaskSet:
 
     @property
     def label(self) -> str:
-        """The set in the paper's notation, as in "{P, St}".
+        """The set in the paper's notation, as in "{P, St}"; without transfers, "base".
 
-        Without transfers: "base", or the short name if the set has a base state of its own.
+        The short name if the set has a base state or a step limit of its own.
         """
+        if self.base is not None or self.max_steps != MAX_STEPS:
+            return self.short
         symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
         names = (
             symbols.get(transfer, getattr(transfer, "__name__", "?")) for transfer in self.transfers
         )
-        if self.transfers:
-            return "{" + ", ".join(names) + "}"
-        return "base" if self.base is None else self.short
+        return "{" + ", ".join(names) + "}" if self.transfers else "base"
 
 
 PAPER_TASK_SETS = (
@@ -123,7 +123,7 @@ def make(
 
 def register(
     id: str,
-    transfers: Sequence[Transfer],
+    transfers: Iterable[Transfer],
     *,
     short: str | None = None,
     base: State | None = None,
@@ -135,8 +135,8 @@ def register(
       id: its name, not yet taken.
       transfers: functions (key, state) -> state, in the order in which they apply.
       short: its name in tables; the id if absent.
-      base: the state that the transfers start from; the base task if absent.
-      max_steps: steps after which an unsolved episode is truncated, at least 1.
+      base: the state that the transfers start from, at time 0; the base task if absent.
+      max_steps: steps after which an unsolved episode is truncated, 1 to 2**31 - 1.
 
     Raises:
       ValueError: a name is empty or taken, a transfer is not a function, the base state is
@@ -149,6 +149,6 @@ def register(
             raise ValueError(f"a task set's name must be a non-empty string, got {name!r}")
         if name in taken:
             raise ValueError(f"the name {name!r} is taken; taken are: {', '.join(sorted(taken))}")
-    Environment(transfers, base=base, max_steps=max_steps)
-    _task_sets[id] = TaskSet(id, short, tuple(transfers), base, int(max_steps))
+    env = Environment(transfers, base=base, max_steps=max_steps)
+    _task_sets[id] = TaskSet(id, short, env.transfers, base, env.max_steps)
     return _task_sets[id]

@@ -77,6 +77,16 @@ def render(
     return _render(state, grasp, cell_size=int(cell_size), grid=bool(grid))
 
 
+def rgb(features: jax.Array) -> jax.Array:
+    """The colours u8[..., 3] in which `render` shows features u8[..., N]."""
+    num_features = features.shape[-1]
+    if num_features == 1:
+        return jnp.repeat(features, 3, axis=-1)
+    if num_features == 2:
+        return jnp.pad(features, [*[(0, 0)] * (features.ndim - 1), (0, 1)])
+    return features[..., :3]
+
+
 def render_object(code: int, cell_size: int = 32) -> np.ndarray:
     """An object in its base colour with its sign, for legends. Host side.
 
@@ -179,7 +189,7 @@ def _render(
     state: State, grasp: jax.Array | int | None, *, cell_size: int, grid: bool
 ) -> jax.Array:
     objects = visible_objects(state)
-    image = _enlarge(_rgb(observe(state)), cell_size).astype(jnp.float32)
+    image = _enlarge(rgb(observe(state)), cell_size).astype(jnp.float32)
     ink = _ink(image)
     if cell_size >= SMALLEST_SIGN:
         is_tool = _enlarge(objects, cell_size) == TOOL
@@ -190,16 +200,6 @@ def _render(
     if grasp is not None and cell_size >= SMALLEST_SIGN:
         image = _draw_hand(image, state, jnp.asarray(grasp), cell_size)
     return _to_pixels(image)
-
-
-def _rgb(observation: jax.Array) -> jax.Array:
-    """u8[12, 12, 3] of features u8[12, 12, N]."""
-    num_features = observation.shape[-1]
-    if num_features == 1:
-        return jnp.repeat(observation, 3, axis=-1)
-    if num_features == 2:
-        return jnp.pad(observation, [(0, 0), (0, 0), (0, 1)])
-    return observation[..., :3]
 
 
 def _enlarge(cells: jax.Array, cell_size: int) -> jax.Array:

@@ -48,6 +48,8 @@ class VectorEnvironment:
     seed with most finished environments needs.)
     """
 
+    starts_over = True
+
     def __init__(self, env: Environment, *, chunk_size: int = 32):
         """Wraps the environment of one task set.
 

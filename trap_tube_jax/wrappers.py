@@ -6,18 +6,22 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from trap_tube_jax.environment import check_key
 from trap_tube_jax.prng import split
 from trap_tube_jax.state import TimeStep
 
 
 class EnvironmentLike(Protocol):
-    """What a wrapper takes, and what it is: an environment with a state of any type."""
+    """What a wrapper takes, and what it is: an environment with a state of any type.
 
-    def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
+    One that starts over by itself has an attribute `starts_over` that is true.
+    """
+
+    def reset(self, key: jax.Array, /) -> tuple[Any, TimeStep]:
         """Starts an episode."""
         ...
 
-    def step(self, state: Any, action: jax.Array) -> tuple[Any, TimeStep]:
+    def step(self, state: Any, action: jax.Array, /) -> tuple[Any, TimeStep]:
         """Takes one action."""
         ...
 
@@ -53,12 +57,24 @@ class AutoReset:
     the one to act on next. Every episode's task comes from a fresh key.
     """
 
+    starts_over = True
+
     def __init__(self, env: EnvironmentLike):
+        """Wraps an environment that does not start over by itself.
+
+        Raises:
+          ValueError: it does.
+        """
+        if _starts_over(env):
+            raise ValueError(
+                f"{type(env).__name__} starts over by itself already; allowed: an environment "
+                "that does not, such as a trap_tube_jax.Environment"
+            )
         self.env = env
 
     def reset(self, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
         """Starts the first episode. See `Environment.reset`."""
-        reset_key, next_key = split(key)
+        reset_key, next_key = split(check_key(key))
         inner, timestep = self.env.reset(reset_key)
         return AutoResetState(inner, next_key), _auto_reset_timestep(timestep, timestep.observation)
 
@@ -80,6 +96,8 @@ class AutoReset:
 class EpisodeStatisticsState(struct.PyTreeNode):
     """The state of an environment that keeps count of its episodes.
 
+    Around a `VectorEnvironment` of B environments the counts have the shape [B].
+
     Attributes:
       inner: the wrapped environment's state.
       running_return: f32[], rewards of the current episode so far.
@@ -100,26 +118,27 @@ class EpisodeStatisticsState(struct.PyTreeNode):
 
 
 class EpisodeStatistics:
-    """Counts return and length of every episode; wraps an `AutoReset` or a bare environment.
+    """Counts return and length of every episode of any environment, also a `VectorEnvironment`.
 
     Around a bare environment, steps after the end of the episode are not counted.
     """
 
     def __init__(self, env: EnvironmentLike):
         self.env = env
-        self._stays_done = not isinstance(env, AutoReset)
+        self.starts_over = _starts_over(env)
 
     def reset(self, key: jax.Array) -> tuple[EpisodeStatisticsState, TimeStep]:
         """Starts the first episode with all counts at zero."""
         inner, timestep = self.env.reset(key)
+        shape = timestep.reward.shape
         return EpisodeStatisticsState(
             inner=inner,
-            running_return=jnp.zeros((), jnp.float32),
-            running_length=jnp.zeros((), jnp.int32),
-            last_return=jnp.zeros((), jnp.float32),
-            last_length=jnp.zeros((), jnp.int32),
-            episodes=jnp.zeros((), jnp.int32),
-            over=jnp.zeros((), bool),
+            running_return=jnp.zeros(shape, jnp.float32),
+            running_length=jnp.zeros(shape, jnp.int32),
+            last_return=jnp.zeros(shape, jnp.float32),
+            last_length=jnp.zeros(shape, jnp.int32),
+            episodes=jnp.zeros(shape, jnp.int32),
+            over=jnp.zeros(shape, bool),
         ), timestep
 
     def step(
@@ -138,8 +157,12 @@ class EpisodeStatistics:
             last_return=jnp.where(finished, running_return, state.last_return),
             last_length=jnp.where(finished, running_length, state.last_length),
             episodes=state.episodes + finished,
-            over=timestep.done & self._stays_done,
+            over=timestep.done & (not self.starts_over),
         ), timestep
+
+
+def _starts_over(env: Any) -> bool:
+    return bool(getattr(env, "starts_over", False))
 
 
 def _auto_reset_timestep(timestep: TimeStep, observation: jax.Array) -> AutoResetTimeStep:

@@ -128,8 +128,9 @@ class _TrapTube(environment.Environment):
         return state.terminated
 
     def is_truncated(self, state: State, params: EnvParams) -> jax.Array:
-        """bool[]: the step limit is reached without success."""
-        return ~state.terminated & (state.time >= params.max_steps_in_episode)
+        """bool[]: the step limit is reached without success, or was."""
+        at_limit = state.time >= params.max_steps_in_episode
+        return state.truncated | (~state.terminated & at_limit)
 
     def action_space(self, params: EnvParams | None = None) -> Any:
         """`Discrete(16)`, or two `Discrete(4)`."""

@@ -30,6 +30,9 @@ from trap_tube_jax.state import State
 
 BLOCK = 1024  # tasks played at once: bounds the memory, whatever their number
 
+# Time, states, observations, the policy's carry, and whether all actions were in range so far.
+_Now = tuple[jax.Array, State, jax.Array, Any, jax.Array]
+
 # From a set and B of its tasks to solved bool[B] and the steps taken i32[B].
 Play = Callable[[TaskSet, State], tuple[np.ndarray, np.ndarray]]
 
@@ -75,7 +78,7 @@ def score(
       num_features: N, feature channels of the observation; see `make`.
 
     Raises:
-      ValueError: naming the argument and what is allowed.
+      ValueError: naming the argument and what is allowed, or an action is none.
     """
     for name in ("initial", "act"):
         if not callable(getattr(policy, name, None)):
@@ -95,8 +98,13 @@ def score(
             for start in range(0, total, block)
             for block_key in [jax.random.fold_in(key, start)]
         ]
-        solved, length = (np.concatenate(parts)[:total] for parts in zip(*played, strict=True))
-        return solved, length
+        solved, length, is_valid = zip(*played, strict=True)
+        if not np.all(is_valid):
+            raise ValueError(
+                f"the policy's act returned an action that is none; allowed: (grasp, move), each "
+                f"in 0 to {NUM_DIRECTIONS - 1}"
+            )
+        return np.concatenate(solved)[:total], np.concatenate(length)[:total]
 
     return _scores(play, sets, tasks, seed, optimality, num_features)
 
@@ -123,7 +131,7 @@ def score_gymnasium(
       num_features: as for `score`.
 
     Raises:
-      ValueError: naming the argument and what is allowed, or an action that is none.
+      ValueError: naming the argument and what is allowed, or an action is none.
     """
     act = getattr(agent, "predict", None) or getattr(agent, "act", None)
     if not callable(act):
@@ -173,22 +181,34 @@ def _scores(
 
 def _play(
     policy: Policy, env: Environment, states: State, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Plays B tasks side by side until all are over: solved bool[B] and steps i32[B]."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Plays B tasks side by side until all are over.
 
-    def step(now: tuple[jax.Array, State, jax.Array, Any]) -> tuple[Any, ...]:
-        time, states, observation, carry = now
+    Returns:
+      Solved bool[B], the steps taken i32[B], and whether all actions of episodes that were not
+      over were in range, bool[].
+    """
+
+    def step(now: _Now) -> _Now:
+        time, states, observation, carry, is_valid = now
+        over = states.terminated | states.truncated
         action, carry = policy.act(observation, carry, jax.random.fold_in(key, time))
         states, timestep = jax.vmap(env.step)(states, action)
-        return time + 1, states, timestep.observation, carry
+        in_range = jnp.all((action >= 0) & (action < NUM_DIRECTIONS), axis=-1)
+        return time + 1, states, timestep.observation, carry, is_valid & jnp.all(in_range | over)
 
-    def is_on(now: tuple[jax.Array, State, jax.Array, Any]) -> jax.Array:
+    def is_on(now: _Now) -> jax.Array:
         return ~jnp.all(now[1].terminated | now[1].truncated)
 
-    batch = len(states.time)
-    first = (jnp.int32(0), states, jax.vmap(observe)(states), policy.initial(batch))
-    _, states, _, _ = jax.lax.while_loop(is_on, step, first)
-    return states.terminated, states.time
+    first = (
+        jnp.int32(0),
+        states,
+        jax.vmap(observe)(states),
+        policy.initial(len(states.time)),
+        jnp.array(True),
+    )
+    _, states, _, _, is_valid = jax.lax.while_loop(is_on, step, first)
+    return states.terminated, states.time, is_valid
 
 
 def _play_one(

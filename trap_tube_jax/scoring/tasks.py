@@ -25,7 +25,8 @@ Purpose = Literal["test", "validation"]
 # The version of the fixed tasks: what is scored under different ones does not compare.
 PROTOCOL = 1
 ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
-# How many layouts a set has, whatever their colours, where these are few.
+FEW_LAYOUTS = 5  # of a set, whatever their colours: so many are few, more are not
+# How many layouts a set of the paper has, where these are few.
 NUM_LAYOUTS = {"base": 1, "st": 1, "sy": 5, "stsy": 5}
 
 # "trap" and "tube", or "trap" and "vali". The first word of every `jax.random.key(seed)` is
@@ -91,17 +92,20 @@ def _keys(root: jax.Array, number: jax.typing.ArrayLike, num_tasks: int) -> jax.
 def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
     """The layout i32[B] of each task, counted from 0; None unless the set has few.
 
-    A layout is a state without its colours.
+    A layout is a state without its colours. Sets other than the paper's have few if these tasks
+    hold at most `FEW_LAYOUTS` different ones, and some of them twice or one task only.
 
     Args:
       name: the set's short name.
       tasks: B states at time 0.
     """
-    if name not in NUM_LAYOUTS:
+    if name in ALL_SETS and name not in NUM_LAYOUTS:
         return None
     parts = (tasks.board, tasks.agent, tasks.tool, tasks.tool_extent, tasks.food)
     rows = np.concatenate([np.asarray(part).reshape(len(part), -1) for part in parts], axis=1)
-    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
+    found, layout = np.unique(rows, axis=0, return_inverse=True)
+    few = len(found) <= FEW_LAYOUTS and len(found) < max(len(rows), 2)
+    return layout.reshape(-1).astype(np.int32) if few or name in NUM_LAYOUTS else None
 
 
 def shortest_lengths(tasks: State) -> np.ndarray:

@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
-from trap_tube_jax.solver.distance import distances
+from trap_tube_jax.solver.distance import Distances, distances
 from trap_tube_jax.solver.search import Plan, solve
 from trap_tube_jax.solver.survey import QUANTILES, Survey, survey
 from trap_tube_jax.state import State
@@ -62,7 +62,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m trap_tube_jax.solver")
-    try:
+    with plain_errors():
         import_modules(options.imports)
         if options.show is not None and options.distances is not None:
             raise ValueError("--show and --distances exclude each other; allowed: one of them")
@@ -72,14 +72,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _distances(options, options.distances)
         else:
             _survey(options)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
 
 
 def _survey(options: Options) -> None:
     from trap_tube_jax.solver.pictures import save_histogram  # noqa: PLC0415  matplotlib is slow
 
+    if not options.sets:
+        raise ValueError("--sets must name at least one task set, such as base")
     sets = [task_set(name) for name in options.sets]
     graphs = min(options.graphs, options.tasks)
     messages = Console(stderr=True)
@@ -152,25 +151,31 @@ def _distances(options: Options, name: str) -> None:
 
     state = _task(name, options.seed)
     plan, found = solve(state), distances(state)
-    solvable = np.count_nonzero(found.to_goal >= 0)
     report = {
         "id": task_set(name).id,
         "seed": options.seed,
         "length": int(plan.length),
         "reachable": found.num_reachable,
-        "solvable": int(solvable),
+        "solvable": np.count_nonzero(found.to_goal >= 0),
         "farthest": int(found.to_goal.max()),
     }
     if options.json:
         print(json.dumps(report, indent=2))
     else:
-        print(
-            f"{report['reachable']:,} reachable states, {solvable:,} of them with a way to the "
-            f"goal, at most {report['farthest']} steps; {_outcome(plan)} from the start"
-        )
+        print(_distances_line(plan, found))
     path = options.output or Path("distances.png")
     save_distances(state, plan, found, path)
     print(f"picture: {path}", file=sys.stderr)
+
+
+def _distances_line(plan: Plan, found: Distances) -> str:
+    solvable = np.count_nonzero(found.to_goal >= 0)
+    way = f"{solvable:,} of them with a way to the goal, at most {found.to_goal.max()} steps"
+    return (
+        f"{found.num_reachable:,} reachable states, "
+        f"{way if solvable else 'none of them with a way to the goal'}; "
+        f"{_outcome(plan)} from the start"
+    )
 
 
 def _task(name: str, seed: int) -> State:

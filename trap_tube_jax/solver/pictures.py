@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.objects import BOARD_SIZE
-from trap_tube_jax.rendering import render, save_gif
+from trap_tube_jax.rendering import episode_frames, render, save_gif
 from trap_tube_jax.solver.distance import Distances
-from trap_tube_jax.solver.search import NO_DIRECTION, Plan
+from trap_tube_jax.solver.search import Plan
 from trap_tube_jax.solver.survey import Survey
 from trap_tube_jax.state import State
 
@@ -32,12 +32,7 @@ def replay(state: State, plan: Plan) -> list[State]:
 
 def save_plan(state: State, plan: Plan, path: str | os.PathLike[str]) -> None:
     """Writes a GIF of a plan; the agent's hand shows where each action is about to grasp."""
-    grasps = [*plan.actions[:, 0].tolist(), NO_DIRECTION]
-    frames = [
-        np.asarray(render(at, CELL_SIZE, grasp=grasp))
-        for at, grasp in zip(replay(state, plan), grasps, strict=True)
-    ]
-    save_gif(np.stack(frames), path, fps=4)
+    save_gif(episode_frames(state, plan.actions, CELL_SIZE), path, fps=4)
 
 
 def save_distances(
