@@ -32,7 +32,7 @@ sys.exit(pytest.main(["-x", "--no-header", "-p", "no:cacheprovider", "-n0", *sys
 # Of the exhaustive comparison the base task and its swaps are enough here.
 STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-12 and not psy-6")
 OBSERVE = ("tests/test_observation.py", "tests/test_golden.py")
-TIME = ("tests/test_environment.py", "-k", "last_step or limit_truncates or auto or statistics")
+TIME = ("tests/test_environment.py", "-k", "last_step or limit_trunc or larger or auto or statist")
 PERCEPTUAL = ("tests/test_transfers.py", "-k", "perceptual")
 STRUCTURAL = ("tests/test_transfers.py", "-k", "structural")
 SYMBOLIC = ("tests/test_transfers.py", "-k", "symbolic")
@@ -197,7 +197,14 @@ FAULTS = (
     Fault(
         "environment",
         "success at the limit is a truncation",
-        "truncated = ~state.terminated & ",
+        "(~state.terminated & (time >= self.max_steps))",
+        "(time >= self.max_steps)",
+        TIME,
+    ),
+    Fault(
+        "environment",
+        "a truncated state comes alive under a larger limit",
+        "truncated = state.truncated | ",
         "truncated = ",
         TIME,
     ),
