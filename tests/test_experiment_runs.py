@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -347,11 +348,12 @@ def test_the_best_parameters_of_the_last_checkpoint_outlive_a_kill(tmp_path, mon
     monkeypatch.setattr(pretrained, "save", lambda path, policy: path.write_text("x"))
 
     def played(iteration):
-        solved = np.arange(4) < 4 * shares[iteration]
-        return {"p": evaluation.Evaluation(solved, *[np.ones(4, np.int32)] * 3)}
+        solved: Any = np.arange(4) < 4 * shares[iteration]
+        steps: Any = np.ones(4, np.int32)
+        return {"p": evaluation.Evaluation(solved, steps, steps, steps)}
 
     def tracker():
-        made = tracking.Tracker(folder, run, {}, ranked=["p"])
+        made: Any = tracking.Tracker(folder, run, {}, ranked=["p"])
         made._evaluator = played
         return made
 
@@ -382,10 +384,10 @@ def test_the_best_parameters_are_found_by_their_iteration(tmp_path, monkeypatch,
     (tmp_path / "best-seed0-iteration4.npz").touch()  # after the metrics end
     rows = [{"seed": 0, "iteration": i, "greedy_overall": x} for i, x in ((1, 0.0), (2, 0.5))]
     entry = training.AlgorithmRun("ppo", RunFolder(tmp_path), Run(Config()), rows)
-    policy = Policy("x", Config(), "parameters", 2)
+    policy = Policy("x", Config(), {"parameters": 0}, 2)
     monkeypatch.setattr(pretrained, "load", {tmp_path / name: policy}.__getitem__)
     steps = reporting.best_steps(entry, 0, Protocol(), lambda params: {"p": [len(params)]})
-    assert steps == {"p": [10]}
+    assert steps == {"p": [1]}
 
 
 def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """How parameters are drawn."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -28,5 +30,5 @@ def test_layers_of_flax_start_as_flax_has_it():
     one, other = (init_module(mixed, key, jnp.ones((1, 3)))["params"] for key in keys)
     np.testing.assert_array_equal(one["layers_1"]["scale"], 1)
     assert not np.any(np.isclose(one["layers_2"]["kernel"], other["layers_2"]["kernel"]))
-    own = nn.Dense(4).init(keys[0], jnp.ones((1, 4)))["params"]["kernel"]
+    own: Any = nn.Dense(4).init(keys[0], jnp.ones((1, 4)))["params"]["kernel"]
     np.testing.assert_allclose(np.std(one["layers_2"]["kernel"]), np.std(own), rtol=0.5)

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from agents import evaluate, train
 from agents.config import PRESETS, Config
-from agents.ppo.learner import make_train
+from agents.ppo.learner import Learner, make_train
 from agents.runs import compilation_cache
 from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
@@ -374,21 +374,21 @@ def test_solved_seeds_stay_as_they_are():
     """Two seeds side by side, the second one solved."""
     config = Config(max_steps=6, filters=(2, 2), hidden=4, embedding=2, eval_episodes=2)
 
-    def iterate(state):
-        state = state._replace(
-            params=jax.tree.map(lambda x: x + 1, state.params),
-            iteration=state.iteration + 1,
-            episodes=state.episodes + 8,
-            transitions=state.transitions + 48,
-        )
-        return state, {"loss": jnp.float32(1)}
+    class Adding(Learner):
+        def iterate(self, state):
+            state = state._replace(
+                params=jax.tree.map(lambda x: x + 1, state.params),
+                iteration=state.iteration + 1,
+                episodes=state.episodes + 8,
+                transitions=state.transitions + 48,
+            )
+            return state, {"loss": jnp.float32(1)}
 
-    real = make_train(config)
+    train = Adding(**vars(make_train(config)))
     keys = jax.random.split(jax.random.key(0), 2)
-    shapes = jax.eval_shape(jax.vmap(real.init), keys)
+    shapes = jax.eval_shape(jax.vmap(train.init), keys)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
     state = zeros._replace(key=keys)
-    train = SimpleNamespace(**vars(real), iterate=iterate)
     after, metrics = jax.jit(make_advance(train, 2))(state, jnp.array([True, False]))
     assert after.iteration.tolist() == [1, 0]
     assert metrics["steps"].tolist() == [48, 48]

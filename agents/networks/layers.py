@@ -50,8 +50,8 @@ class Deviation(struct.PyTreeNode, meta.AxisMetadata):
     remove_axis = add_axis
 
 
-def variance_scaling(scale: float) -> Callable[..., Deviation]:
-    """An initialiser: the deviation sqrt(scale / fan-in) everywhere in a parameter."""
+def variance_scaling(scale: float) -> Callable[..., Any]:
+    """An initialiser of a `Deviation`, sqrt(scale / fan-in) everywhere in a parameter."""
 
     def init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Deviation:
         del key
