@@ -34,7 +34,8 @@ class Options:
 
     Everything lands in one folder: a run folder for each combination and seed, as agents.train
     makes them, and a table, a figure and the records of them all. The same command again
-    continues where it was stopped or killed; more values or seeds add to what is there.
+    continues where it was stopped or killed; more seeds, or more values of a setting that has
+    several, add to what is there.
 
     Attributes:
       settings: what varies, as NAME=VALUE,VALUE; a single value holds for all runs.
@@ -85,6 +86,8 @@ class Options:
         values = dict(map(_values, self.settings))
         if len(values) < len(self.settings):
             raise ValueError(f"a setting may be given only once, got {' '.join(self.settings)}")
+        if self.env is not None and "env_id" in values:
+            raise ValueError(f"give --env {self.env} or the setting env_id, not both")
         given: dict[str, Any] = {"imports": self.imports} if self.imports else {}
         given |= {} if self.env is None else {"env_id": self.env}
         configs = {}
