@@ -1,7 +1,6 @@
 """Evaluation from the command line: python -m agents.evaluate --help."""
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -16,11 +15,9 @@ from agents.pretrained import load_shipped
 from agents.runs import compilation_cache, report
 from agents.runs.folder import write_json
 from agents.runs.loading import load_policies
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.scoring.tasks import shortest_lengths
-
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments, prog="python -m agents.evaluate")
     if not options.no_cache:
         compilation_cache.enable()
-    try:
+    with plain_errors():
         evaluate(options)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
 
 
 def evaluate(options: Options) -> None:

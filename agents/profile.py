@@ -19,11 +19,10 @@ from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation_cache
 from agents.runs.folder import RunFolder, read_json
 from agents.runs.loading import load
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 
 PROGRAM = "python -m agents.profile"
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,11 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments, prog=PROGRAM)
     if not options.no_cache:
         compilation_cache.enable()
-    try:
+    with plain_errors():
         run(options, arguments)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
 
 
 def run(options: Options, arguments: Sequence[str]) -> None:

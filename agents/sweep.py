@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +22,7 @@ from agents.runs.folder import check_name, is_done, write_json
 from agents.runs.report import NOTHING
 from agents.runs.results import results
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Flag, Imports, plain_errors
 
 PERCENT = "percent_"
 
@@ -62,7 +61,7 @@ class Options:
     name: str | None = None
     out: Path = Path("runs")
     processes: int | None = None
-    no_cache: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    no_cache: Flag = False
 
     def __post_init__(self) -> None:
         """Checks the numbers and the name.
@@ -106,12 +105,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console = Console()
     stop = StopSignals(lambda: console.print(f"Finishing these iterations; {AGAIN}."))
     try:
-        options = tyro.cli(Options, args=arguments, prog="python -m agents.sweep")
-        jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
-        failed = run(options, console, stop)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
+        with plain_errors():
+            options = tyro.cli(Options, args=arguments, prog="python -m agents.sweep")
+            jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
+            failed = run(options, console, stop)
     except (Stopped, KeyboardInterrupt) as stopped:
         console.print("Stopped. The same command continues.")
         number = stopped.signal if isinstance(stopped, Stopped) else stop.received

@@ -22,7 +22,7 @@ from agents.runs import compilation_cache
 from agents.runs.folder import Run, RunFolder, check_name
 from agents.runs.session import Session
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 
 PROGRAM = "python -m agents.train"
@@ -55,7 +55,7 @@ class Selection(processes.Job):
     seeds: int = 1
     name: str | None = None
     out: Path = Path("runs")
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    resume: Flag = False
     devices: int | Literal["all"] | None = None
 
 
@@ -76,7 +76,7 @@ class Options(Selection):
 
     checkpoint_every: int = 10
     keep: int = 3
-    no_cache: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    no_cache: Flag = False
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
     def __post_init__(self) -> None:
@@ -106,10 +106,8 @@ def train(arguments: Sequence[str]) -> None:
       SystemExit: the command line is invalid, or training was stopped.
     """
     try:
-        session = start(arguments)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
+        with plain_errors():
+            session = start(arguments)
     except KeyboardInterrupt:
         processes.leave(128 + signal.SIGINT)
     except jax.errors.JaxRuntimeError as error:

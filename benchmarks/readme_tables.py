@@ -13,7 +13,6 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
@@ -22,12 +21,11 @@ import agents.profiles.tables
 from agents.experiments import figures, tables
 from agents.experiments.records import SCHEMA, Record, is_record, read_record
 from agents.profiles import measure
+from trap_tube_jax.command_line import Flag
 
 ROOT = Path(__file__).parent.parent
 PAGES = ("*.md", "agents/**/*.md", "benchmarks/**/*.md", "trap_tube_jax/**/*.md")
 BLOCK = re.compile(r"(?P<start><!-- table: (?P<name>\S+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
-
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,6 +31,7 @@ from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
 from agents.runs.session import make_advance
 from benchmarks import harness
+from trap_tube_jax.command_line import Flag
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 COUNTED_DEVICES = 8
@@ -62,7 +63,7 @@ class Options:
 
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "paper"
     env: str = "TrapTube-v0"
-    measure: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    measure: Flag = False
     latency: float = 10e-6
     bandwidth: float = 12.5e9
     output: Path | None = None

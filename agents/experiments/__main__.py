@@ -22,11 +22,9 @@ from agents.parallel.cores import become_devices
 from agents.runs import compilation_cache
 from agents.runs.folder import check_name, read_json
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
-from trap_tube_jax.command_line import Imports
+from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.registry import task_set
-
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,14 +161,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console = Console()
     stop = StopSignals(lambda: console.print(f"Finishing this iteration; {AGAIN}."))
     try:
-        options = tyro.cli(Options, args=arguments, prog=PROGRAM)
-        become_devices(options.devices)
-        if not options.no_cache:
-            compilation_cache.enable()
-        run(options, console, stop)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
+        with plain_errors():
+            options = tyro.cli(Options, args=arguments, prog=PROGRAM)
+            become_devices(options.devices)
+            if not options.no_cache:
+                compilation_cache.enable()
+            run(options, console, stop)
     except (KeyboardInterrupt, Stopped):
         again = f"{PROGRAM} {shlex.join(arguments)}"
         console.print(f"Stopped. Continue with: {again}", soft_wrap=True, highlight=False)

@@ -12,11 +12,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from typing import Annotated, NoReturn, TypeVar
+from typing import NoReturn, TypeVar
 
 import jax
 import numpy as np
-import tyro
+
+from trap_tube_jax.command_line import Flag
 
 Value = TypeVar("Value")
 
@@ -40,7 +41,7 @@ class Job:
         all others end.
     """
 
-    distributed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    distributed: Flag = False
     coordinator: str | None = None
     processes: int | None = None
     process_id: int | None = None

@@ -1,7 +1,6 @@
 """Exports a trained agent to a file of parameters: python -m agents.pretrained --help."""
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -12,10 +11,9 @@ from agents import pretrained
 from agents.acting.policy import Policy
 from agents.runs.folder import RunFolder, check_name
 from agents.runs.loading import load
+from trap_tube_jax.command_line import Flag, plain_errors
 
 PROGRAM = "python -m agents.pretrained"
-
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +57,7 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     command = tyro.cli(Command, args=arguments, prog=PROGRAM)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    try:
+    with plain_errors():
         if isinstance(command, Export):
             path = export(command)
             print(f"{path}: {path.stat().st_size:,} bytes")
@@ -67,9 +65,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for name in pretrained.names():
                 policy = pretrained.load_shipped(name)
                 print(f"{name}: {policy.config.env_id}, iteration {policy.iteration}")
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
 
 
 def export(options: Export) -> Path:

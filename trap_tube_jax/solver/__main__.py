@@ -5,7 +5,6 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import jax
 import numpy as np
@@ -15,7 +14,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
-from trap_tube_jax.command_line import Imports, plain_errors
+from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
@@ -24,8 +23,6 @@ from trap_tube_jax.solver.distance import Distances, distances
 from trap_tube_jax.solver.search import Plan, solve
 from trap_tube_jax.solver.survey import QUANTILES, Survey, survey
 from trap_tube_jax.state import State
-
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 @dataclasses.dataclass(frozen=True)
