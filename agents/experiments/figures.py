@@ -27,9 +27,11 @@ DIGEST = "Record"  # the key of a figure's metadata
 
 def save(record: Record, path: Path) -> None:
     """Draws the learning curves of a record as PNG, which carries the digest of its data."""
-    entries = record["algorithms"]
     curves = {
-        entry["name"]: [row for run in entry["runs"] for row in rows_of(run)] for entry in entries
+        tables.algorithm_label(record, entry): [
+            row for run in entry["runs"] for row in rows_of(run)
+        ]
+        for entry in record["algorithms"]
     }
     draw = save_rewards if record["experiment"] == "exp1" else _save_success
     draw(curves, path, tables.title(record), {DIGEST: digest(record)})
@@ -41,7 +43,7 @@ def digest(record: Record) -> str:
         record["experiment"],
         tables.title(record),
         [
-            [entry["name"], [run["curves"] for run in entry["runs"]]]
+            [tables.algorithm_label(record, entry), [run["curves"] for run in entry["runs"]]]
             for entry in record["algorithms"]
         ],
     ]

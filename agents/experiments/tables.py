@@ -127,7 +127,7 @@ def solved_table(record: Record) -> Table:
     for entry in record["algorithms"]:
         episodes = statistics.episodes_to_solve(entry)
         trials = f"{len(episodes)} / {len(entry['runs'])}"
-        rows.append((_label(record, entry), trials, _spread(Spread.of(episodes), ",.0f")))
+        rows.append((algorithm_label(record, entry), trials, _spread(Spread.of(episodes), ",.0f")))
     for name, paper in PAPER_SOLVED.items() if is_of_paper(record) else ():
         trials = f"{paper.solved} / {paper.trials}"
         rows.append((f"{LABELS[name]}, paper", trials, _spread(paper.episodes, ",.0f")))
@@ -149,7 +149,7 @@ def percent_table(record: Record) -> Table:
         labels |= {name: summary.label for name, summary in summaries.items()}
         cells = {name: _percent(summary.percent) for name, summary in summaries.items()}
         mean = _percent(statistics.mean_of_sets(record, entry))
-        columns[_label(record, entry)] = {**cells, MEAN_OF_SETS: mean}
+        columns[algorithm_label(record, entry)] = {**cells, MEAN_OF_SETS: mean}
     with_paper = record["experiment"] == "exp2" and is_of_paper(record)
     for name, paper in PAPER_PERCENT.items() if with_paper else ():
         columns[f"{LABELS[name]}, paper"] = {
@@ -168,7 +168,10 @@ def percent_table(record: Record) -> Table:
 
 def layouts_table(record: Record) -> Table:
     """The layouts solved of the sets that have few of them."""
-    entries = {_label(record, entry): statistics.by_set(record, entry) for entry in _tested(record)}
+    entries = {
+        algorithm_label(record, entry): statistics.by_set(record, entry)
+        for entry in _tested(record)
+    }
     rows: dict[str, list[str]] = {}
     for index, summaries in enumerate(entries.values()):
         for summary in summaries.values():
@@ -192,8 +195,9 @@ def quality_table(record: Record, entry: Record) -> Table:
         for summary in statistics.by_set(record, entry).values()
     ]
     heads = ("set", "tasks", "of solvable %", "optimality", "worst")
+    algorithm = algorithm_label(record, entry)
     heading = (
-        f"{_label(record, entry)}: optimality is shortest plan / steps taken, where solved; over "
+        f"{algorithm}: optimality is shortest plan / steps taken, where solved; over "
         "the first tasks of each set"
     )
     return Table(heading, heads, tuple(rows))
@@ -208,7 +212,7 @@ def cost_table(record: Record) -> Table:
         seconds = Spread.of([run["training_seconds"] for run in entry["runs"]])
         rows.append(
             (
-                _label(record, entry),
+                algorithm_label(record, entry),
                 str(len(entry["runs"])),
                 "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
                 NOTHING if transitions is None else f"{transitions.mean:,.0f}",
@@ -269,7 +273,8 @@ def _machine(machine: Record) -> str:
     return f"Ran on {where}; jax {machine['jax']}, commit `{commit}`."
 
 
-def _label(record: Record, entry: Record) -> str:
+def algorithm_label(record: Record, entry: Record) -> str:
+    """What tables and figures call an algorithm: the preset's name where it is trained as it is."""
     if entry["name"] == PRESET:
         return str(record["protocol"]["preset"])
     name = str(entry["name"])
