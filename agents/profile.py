@@ -98,6 +98,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run(options, arguments)
 
 
+def without_places(arguments: Sequence[str]) -> list[str]:
+    """The arguments but --out and --record: where results go says nothing of them."""
+    kept, given = [], iter(arguments)
+    for argument in given:
+        name, _, value = argument.partition("=")
+        if name not in ("--out", "--record"):
+            kept.append(argument)
+        elif not value:
+            next(given, None)
+    return kept
+
+
 def run(options: Options, arguments: Sequence[str]) -> None:
     """Measures as the options say, and shows and writes the results.
 
@@ -116,7 +128,7 @@ def run(options: Options, arguments: Sequence[str]) -> None:
             options.policies(),
             settings,
             console,
-            command=f"{PROGRAM} {shlex.join(arguments)}",
+            command=f"{PROGRAM} {shlex.join(without_places(arguments))}",
             machines=options.machines(),
             commit=options.commit,
         )

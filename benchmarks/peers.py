@@ -7,7 +7,6 @@ cannot be imported is skipped with its reason.
 
 import dataclasses
 import pathlib
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import env_throughput, harness
+from trap_tube_jax.command_line import plain_errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,8 +220,5 @@ def _split(key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
 
 
 if __name__ == "__main__":
-    try:
+    with plain_errors():
         main(tyro.cli(Arguments, description=__doc__))
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error

@@ -273,6 +273,12 @@ def test_a_profile_from_end_to_end(tiny, tmp_path, capsys):
     assert "| {P, St}, mine | 2 |" in text
 
 
+def test_a_recorded_command_names_no_place_of_results():
+    given = "runs/mine --out there --record=a.json --tasks 5 --record b.json --parts swaps"
+    kept = ["runs/mine", "--tasks", "5", "--parts", "swaps"]
+    assert command.without_places(given.split()) == kept
+
+
 def test_a_profile_holds_every_episode(tiny):
     (policy,) = tiny["policies"]
     for name, point in tiny["points"].items():

@@ -105,12 +105,13 @@ def by_set(record: Record, entry: Record) -> dict[str, SetSummary]:
 
 def mean_of_sets(record: Record, entry: Record) -> Spread | None:
     """Mean percent solved over the sets apart from base, each counting the same."""
-    means = []
-    for run in tested(entry):
-        scores = seed_scores(record, entry, run)
-        percents = [score.percent for name, score in scores.items() if name != "base"]
-        means.append(statistics.fmean(percents) if percents else None)
-    return Spread.of(means)
+    return Spread.of([mean_score(seed_scores(record, entry, run)) for run in tested(entry)])
+
+
+def mean_score(scores: Mapping[str, Score]) -> float | None:
+    """Mean percent solved of a seed over the sets apart from base; None without any."""
+    percents = [score.percent for name, score in scores.items() if name != "base"]
+    return statistics.fmean(percents) if percents else None
 
 
 def tested(entry: Record) -> list[Record]:

@@ -100,6 +100,7 @@ def tables(record: Record) -> list[Table]:
         made.append(layouts_table(record))
     if any(about["shortest"] for about in record["sets"].values()):
         made += [quality_table(record, entry) for entry in evaluated]
+    made += [seeds_table(record, entry) for entry in evaluated if len(entry["runs"]) > 1]
     return [*made, cost_table(record)]
 
 
@@ -201,6 +202,19 @@ def quality_table(record: Record, entry: Record) -> Table:
         "the first tasks of each set"
     )
     return Table(heading, heads, tuple(rows))
+
+
+def seeds_table(record: Record, entry: Record) -> Table:
+    """What each seed solves, and the environment steps that it took."""
+    rows, labels = [], []
+    for run in statistics.tested(entry):
+        scores = statistics.seed_scores(record, entry, run)
+        labels = [score.label for score in scores.values()]
+        percents = [*(score.percent for score in scores.values()), statistics.mean_score(scores)]
+        cells = [_number(percent, ".1f") for percent in percents]
+        rows.append((str(run["seed"]), *cells, f"{run['transitions']:,}"))
+    title = f"{algorithm_label(record, entry)}, seed by seed: tasks solved, %"
+    return Table(title, ("seed", *labels, MEAN_OF_SETS, "transitions"), tuple(rows))
 
 
 def cost_table(record: Record) -> Table:

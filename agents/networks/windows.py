@@ -33,7 +33,7 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 WINDOW = 4  # cells a side, of which the first pooling sees one 2x2 block of features
 BLOCKS = BOARD_SIZE // 2
-WINDOW_CHUNK = 128  # distinct windows that are encoded at once; changes speed, results by rounding
+WINDOW_CHUNK = 128  # distinct windows encoded at once; changes speed, and results only by rounding
 
 Weights = Any  # nested dictionaries of arrays: the parameters of `Encoder`, or of a layer in it
 

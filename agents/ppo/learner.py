@@ -36,7 +36,7 @@ from trap_tube_jax.registry import make
 
 Metrics = dict[str, jax.Array]
 
-MAX_STEPS = np.iinfo(np.int32).max  # of `TrainState.transitions`
+MAX_TRANSITIONS = np.iinfo(np.int32).max  # of `TrainState.transitions`
 
 
 class TrainState(NamedTuple):
@@ -409,10 +409,10 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
                 f"{getattr(config, name)}; they must agree"
             )
     steps = config.iterations * config.episodes * env.max_steps
-    if steps > MAX_STEPS:
+    if steps > MAX_TRANSITIONS:
         raise ValueError(
             f"iterations={config.iterations} of {config.episodes} episodes of {env.max_steps} "
-            f"steps are {steps:,} steps; allowed: at most {MAX_STEPS:,}"
+            f"steps are {steps:,} steps; allowed: at most {MAX_TRANSITIONS:,}"
         )
     curiosity = curiosities.make(config, env)
     return Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)

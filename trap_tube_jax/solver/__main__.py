@@ -152,9 +152,7 @@ def _distances(options: Options, name: str) -> None:
         "id": task_set(name).id,
         "seed": options.seed,
         "length": int(plan.length),
-        "reachable": found.num_reachable,
-        "solvable": np.count_nonzero(found.to_goal >= 0),
-        "farthest": int(found.to_goal.max()),
+        **_counts(found),
     }
     if options.json:
         print(json.dumps(report, indent=2))
@@ -165,14 +163,21 @@ def _distances(options: Options, name: str) -> None:
     print(f"picture: {path}", file=sys.stderr)
 
 
+def _counts(found: Distances) -> dict[str, int]:
+    """The states that can be reached, those with a way to the goal, and the longest way."""
+    return {
+        "reachable": found.num_reachable,
+        "solvable": int(np.count_nonzero(found.to_goal >= 0)),
+        "farthest": int(found.to_goal.max()),
+    }
+
+
 def _distances_line(plan: Plan, found: Distances) -> str:
-    solvable = np.count_nonzero(found.to_goal >= 0)
-    way = f"{solvable:,} of them with a way to the goal, at most {found.to_goal.max()} steps"
-    return (
-        f"{found.num_reachable:,} reachable states, "
-        f"{way if solvable else 'none of them with a way to the goal'}; "
-        f"{_outcome(plan)} from the start"
-    )
+    reachable, solvable, farthest = _counts(found).values()
+    way = "none of them with a way to the goal"
+    if solvable:
+        way = f"{solvable:,} of them with a way to the goal, at most {farthest} steps"
+    return f"{reachable:,} reachable states, {way}; {_outcome(plan)} from the start"
 
 
 def _task(name: str, seed: int) -> State:
