@@ -47,6 +47,9 @@ class Config:
       max_steps: steps after which an episode is truncated; None: as many as its set has.
 
       iterations: rollouts to train for, at most.
+      max_transitions: environment steps to train for, at most: an iteration that could take more
+        is not begun; None: no limit. What changes as training goes, as the step size in its
+        cooldown, follows `iterations`.
       stop_when_solved: stop early once the greedy policy solves this share of the
         evaluation tasks of `env_id`; 0 never stops early.
       eval_episodes: fixed evaluation tasks per task set.
@@ -104,7 +107,8 @@ class Config:
       facing: whether the board is turned and mirrored for the agent, once for each episode, so
         that the food lies ahead of it at the start.
       encoder: `paper`, or `objects`: cells of one colour make an object, and where each is
-        seen from agent and food is all that is encoded. Or a name that you registered.
+        seen from agent and food is all that is encoded. Or a name that you registered. A
+        curiosity that has encoders of its own has them of this kind.
       filters: channels of the first convolution, and of all later ones; units of the layers
         of `objects`.
       hidden: units of the GRU, of the layer before it and of the inverse model.
@@ -122,6 +126,7 @@ class Config:
     max_steps: int | None = _setting(None, 1, 10_000)
     # How long, and how it is judged.
     iterations: int = _setting(250, 1)
+    max_transitions: int | None = _setting(None, 1)
     stop_when_solved: float = _setting(0.0, 0, 1)
     eval_episodes: int = _setting(128, 1)
     # Episodes and gradient steps of an iteration.
@@ -192,6 +197,11 @@ class Config:
             raise ValueError(
                 f"replayed must leave at least one of {self.episodes} episodes to new tasks, got "
                 f"shares {self.replayed}, which are {sum(self.num_replayed)} episodes"
+            )
+        if self.max_transitions is not None and self.max_transitions < self.longest_iteration:
+            raise ValueError(
+                f"max_transitions must allow an iteration, which takes up to "
+                f"{self.longest_iteration:,} steps, or be None; got {self.max_transitions:,}"
             )
         if self.episodes % self.minibatch:
             divisors = [n for n in range(1, self.episodes + 1) if self.episodes % n == 0]
@@ -270,6 +280,11 @@ class Config:
         return self.episodes - sum(self.num_replayed)
 
     @property
+    def longest_iteration(self) -> int:
+        """The environment steps of an iteration in which no episode ends early."""
+        return self.episodes * self.step_limit(self.env_id)
+
+    @property
     def gradient_steps(self) -> int:
         """The number of gradient steps of one iteration."""
         return self.epochs * (self.episodes // self.minibatch)
@@ -298,6 +313,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "best": {
         "env_id": "pstsy",
         "iterations": 1150,
+        "max_transitions": 25_600_000,
         "episodes": 512,
         "epochs": 4,
         "minibatch": 64,

@@ -42,7 +42,8 @@ class Selection(processes.Job):
       name: the run's folder within --out; <preset>-<task set>-<seed> if absent.
       out: the folder of all runs.
       resume: continue the run of this name where its newest checkpoint ends; its settings
-        are the defaults then, and only --iterations and --stop-when-solved may change.
+        are the defaults then, and only --iterations, --max-transitions and
+        --stop-when-solved may change.
       devices: how many devices share the episodes and seeds, or `all` there are. On a CPU a
         device is a core, and up to 4 share them unless said otherwise; else one, or with several
         processes all of theirs.

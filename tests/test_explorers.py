@@ -109,6 +109,19 @@ def test_training_resumes_to_the_same_bits(name):
     assert digest(to_arrays(once)) != digest(to_arrays(start))
 
 
+@pytest.mark.parametrize("name", ["icm-detached", "rnd", "noveld", "ride", "e3b"])
+def test_encoders_of_a_curiosity_are_of_the_kind_of_the_policys(name):
+    own = {"curiosity": name, "encoder": "objects"}
+    train = make_train(Config.from_dict({**SETTINGS, **own}))
+    params = jax.eval_shape(train.init_params, jax.random.key(0))
+    policys = jax.tree.map(jnp.shape, params["encoder"]["params"])
+    trained = params["curiosity"]["params"]
+    found = [trained[part] for part in ("encoder", "target", "predictor") if part in trained]
+    assert len(found) == (2 if name in ("rnd", "noveld") else 1)
+    for encoder in found:
+        assert jax.tree.map(jnp.shape, encoder) == policys
+
+
 def test_every_name_makes_a_curiosity():
     names = registry.curiosities.names()
     assert {"noveld", "ride", "e3b"} <= set(names)

@@ -193,6 +193,17 @@ def test_a_flipped_bit_is_refused_unless_the_numbers_are_still_the_same(run_path
     assert refused > len(places) / 2
 
 
+def test_a_directory_at_a_wrong_place_is_refused(run_path, tmp_path):
+    path = tmp_path / "x.npz"
+    export(tmp_path, run_path)
+    good = bytearray(path.read_bytes())
+    offset = good.rfind(b"PK\x05\x06") + 16  # in the record at the archive's end
+    good[offset + 2] ^= 1  # 65,536 bytes on
+    path.write_bytes(good)
+    with pytest.raises(ValueError, match=r"x\.npz is damaged"):
+        pretrained.load(path)
+
+
 def test_files_that_hold_no_parameters_are_refused(run_path, tmp_path):
     path = tmp_path / "x.npz"
     export(tmp_path, run_path)

@@ -22,7 +22,7 @@ from agents.ppo.learner import Learner, make_train
 from agents.runs import compilation_cache
 from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
-from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, read_metrics
+from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, is_last, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.session import make_advance
 from agents.runs.stopping import StopSignals
@@ -194,7 +194,7 @@ def test_a_run_is_not_overwritten(capsys, whole):
     out = ["--no-cache", "--out", folder.parent, "--name", "whole"]
     assert "give --resume to continue the run in it, or another --name" in refused(capsys, *out)
     message = refused(capsys, *out, "--resume", "--hidden", 8)
-    assert "the run has hidden=4, not 8; only iterations and stop_when_solved" in message
+    assert "the run has hidden=4, not 8; only iterations, max_transitions and stop_when" in message
     assert "the run has seed=0, not 1" in refused(capsys, *out, "--resume", "--seed", 1)
 
 
@@ -297,7 +297,7 @@ def row_of(seed, iteration, evaluation):
 
 def test_another_threshold_is_applied_to_what_was_evaluated():
     """Stored under 0.5, which iteration 2 reached; only iteration 4 reaches 0.9."""
-    values = Progress(3, 1.0, 2.0, (None,)).to_dict()
+    values = Progress.start(Run(Config()))._replace(iteration=3).to_dict()
     assert "solved" not in values
     rows = [row_of(0, n, share) for n, share in ((1, 0.0), (2, 0.5), (3, 0.6), (4, 0.9))]
 
@@ -307,18 +307,18 @@ def test_another_threshold_is_applied_to_what_was_evaluated():
 
     progress, run = resumed(0.9)
     assert progress.solved == (None,)
-    assert progress.active(run.config).all()
+    assert progress.active.all()
     progress.check(run, np.array([3]))
     progress, run = resumed(0.9, done=4)
     assert progress.solved[0] is not None
     assert progress.solved[0].iteration == 4
     progress.check(run, np.array([4]))
-    assert not progress.active(run.config).any()
+    assert not progress.active.any()
 
 
 def test_runs_that_went_past_another_threshold_are_refused():
     rows = [row_of(0, n, share) for n, share in ((1, 0.0), (2, 0.5), (3, 0.6))]
-    values = Progress(3, 1.0, 2.0, (None,)).to_dict()
+    values = Progress.start(Run(Config()))._replace(iteration=3).to_dict()
     lower = Run(Config(iterations=10, stop_when_solved=0.5))
     with pytest.raises(ValueError, match=r"seed 0 would be after iteration 2, but it is after 3"):
         Progress.resumed(values, lower, rows).check(lower, np.array([3]))
@@ -398,14 +398,31 @@ def test_solved_seeds_stay_as_they_are():
 
 
 def test_training_goes_on_until_every_seed_is_solved():
-    config = Config(iterations=10, stop_when_solved=1.0)
-    first = FirstSolved(iteration=2, episodes=16, transitions=90, seconds=1.5)
-    progress = Progress(3, 1.0, 2.0, (None, first))
-    assert progress.active(config).tolist() == [True, False]
-    assert not progress._replace(solved=(first, first)).active(config).any()
-    assert not progress._replace(iteration=10).active(config).any()
-    never = dataclasses.replace(config, stop_when_solved=0.0)
-    assert progress.active(never).all()
+    run = Run(Config(iterations=10, stop_when_solved=1.0), seeds=2)
+    progress = Progress.start(run).after(run, [row_of(0, 1, 0.0), row_of(1, 1, 0.5)])
+    assert progress.active.tolist() == [True, True]
+    progress = progress.after(run, [row_of(0, 2, 0.0), row_of(1, 2, 1.0)])
+    assert progress.active.tolist() == [True, False]
+    assert progress.solved == (None, FirstSolved(2, 16, 96, 2.0))
+    assert not progress.after(run, [row_of(0, 3, 1.0)]).active.any()
+    assert not progress.after(run, [row_of(0, 10, 0.0)]).active.any()
+    never = dataclasses.replace(run, config=Config(iterations=10))
+    assert Progress.start(never).after(never, [row_of(1, 2, 1.0)]).active.all()
+
+
+def test_no_iteration_begins_that_could_take_too_many_steps():
+    """Iterations of 48 steps and at most 8 * 50 = 400."""
+    config = Config(iterations=10, episodes=8, minibatch=8, max_transitions=48 * 3 + 400)
+    assert [is_last(row_of(0, n, 0.0), config) for n in (1, 3, 4, 10)] == [False, False, True, True]
+    run = Run(config, seeds=2)
+    rows = [row_of(0, 4, 0.0), {**row_of(1, 4, 0.0), "transitions": 100}]
+    progress = Progress.start(run)._replace(iteration=4).after(run, rows)
+    assert progress.active.tolist() == [False, True]
+    progress._replace(iteration=5).check(run, np.array([4, 5]))
+    with pytest.raises(ValueError, match=r"max_transitions=544, seed 0 would be after iteration 4"):
+        progress._replace(iteration=5).check(run, np.array([5, 5]))
+    with pytest.raises(ValueError, match=r"takes up to 400 steps, or be None; got 399"):
+        dataclasses.replace(config, max_transitions=399)
 
 
 def test_cache_follows_the_environment(monkeypatch, tmp_path):

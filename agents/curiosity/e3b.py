@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.curiosity.models import InverseFeatures
+from agents.networks import make_encoder
 from agents.networks.layers import init_module
 
 RIDGE = 0.1  # lambda of the paper
@@ -24,14 +25,14 @@ class E3B(Curiosity):
     """
 
     def __init__(self, config: Config):
-        self._models = InverseFeatures(config.hidden, config.filters)
+        self._models = InverseFeatures(config.hidden, make_encoder(config))
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of the encoder and of the inverse model."""
         return init_module(self._models, key, board, board)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Features of its own encoder, f32[M, filters[1]]."""
+        """Features of its own encoder, f32[M, F]."""
         features: Any = self._models.apply(params, observation, method=InverseFeatures.encode)
         return features
 

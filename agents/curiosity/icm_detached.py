@@ -15,6 +15,7 @@ from agents.config import Config
 from agents.curiosity.base import Experience, Params
 from agents.curiosity.icm import ICM
 from agents.curiosity.models import ForwardModel, InverseFeatures
+from agents.networks import make_encoder
 from agents.networks.actions import ActionDistribution
 from agents.networks.layers import init_module
 from trap_tube_jax.objects import NUM_DIRECTIONS
@@ -30,7 +31,7 @@ class Models(InverseFeatures):
     detached: bool = True
 
     def setup(self) -> None:
-        """Declares the encoder and the two models."""
+        """Declares the two models."""
         super().setup()
         self.forward = ForwardModel()
 
@@ -63,14 +64,14 @@ class DetachedICM(ICM):
     detached = True
 
     def __init__(self, config: Config):
-        self._models = Models(config.hidden, config.filters, self.detached)
+        self._models = Models(config.hidden, make_encoder(config), self.detached)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of the encoder and of both models."""
         return init_module(self._models, key, board, board, jnp.zeros((1, 2), jnp.int32))
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Features of its own encoder, f32[M, filters[1]]."""
+        """Features of its own encoder, f32[M, F]."""
         features: Any = self._models.apply(params, observation, method=Models.encode)
         return features
 

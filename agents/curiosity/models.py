@@ -3,12 +3,13 @@
 Source: Pathak et al. (2017); agents/agent.md, "Network".
 """
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from agents.networks.actions import ActionDistribution
-from agents.networks.encoder import Encoder
 from agents.networks.layers import dense, output_dense
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
@@ -41,15 +42,14 @@ class InverseFeatures(nn.Module):
 
     Attributes:
       hidden: units of the inverse model.
-      filters: of the encoder.
+      encoder: from observations u8[M, 12, 12, N] to features f32[M, F].
     """
 
     hidden: int
-    filters: tuple[int, int]
+    encoder: nn.Module
 
     def setup(self) -> None:
-        """Declares the encoder and the inverse model."""
-        self.encoder = Encoder(self.filters)
+        """Declares the inverse model."""
         self.inverse = InverseModel(self.hidden)
 
     def __call__(self, observation: jax.Array, next_observation: jax.Array) -> ActionDistribution:
@@ -57,8 +57,9 @@ class InverseFeatures(nn.Module):
         return self.inverse(self.encode(observation), self.encode(next_observation))
 
     def encode(self, observation: jax.Array) -> jax.Array:
-        """Features f32[M, filters[1]] of u8[M, 12, 12, N]."""
-        return self.encoder(observation)
+        """Features f32[M, F] of u8[M, 12, 12, N]."""
+        features: Any = self.encoder(observation)
+        return features
 
     def infer(self, features: jax.Array, next_features: jax.Array) -> ActionDistribution:
         """The inferred action between two features f32[..., F]."""

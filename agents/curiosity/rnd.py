@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.networks.encoder import Encoder
+from agents.networks import make_encoder
 from agents.networks.layers import dense, init_module, output_dense
 
 
@@ -20,36 +20,34 @@ class Models(nn.Module):
 
     Attributes:
       hidden: units of the layer between the predictor's encoder and its output.
-      filters: of both encoders.
+      target: an encoder, u8[M, 12, 12, N] to f32[M, F].
+      predictor: the predictor's own.
     """
 
     hidden: int
-    filters: tuple[int, int]
+    target: nn.Module
+    predictor: nn.Module
 
-    def setup(self) -> None:
-        """Declares both encoders and the predictor's last layers."""
-        self.target = Encoder(self.filters)
-        self.predictor = Encoder(self.filters)
-        self.readout = nn.Sequential([dense(self.hidden), nn.swish, output_dense(self.filters[1])])
-
+    @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """The difference of prediction and target, f32[M, filters[1]]."""
-        target = jax.lax.stop_gradient(self.target(observation))
-        return self.readout(self.predictor(observation)) - target
+        """The difference of prediction and target, f32[M, F]."""
+        target: Any = jax.lax.stop_gradient(self.target(observation))
+        x = nn.swish(dense(self.hidden, name="hidden")(self.predictor(observation)))
+        return output_dense(target.shape[-1], name="output")(x) - target
 
 
 class RND(Curiosity):
     """reward: the squared error at the next observation, summed over units; loss: its mean."""
 
     def __init__(self, config: Config):
-        self._models = Models(config.hidden, config.filters)
+        self._models = Models(config.hidden, make_encoder(config), make_encoder(config))
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of target and predictor; the target's get no gradient."""
         return init_module(self._models, key, board)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """The difference of prediction and target, f32[M, filters[1]]."""
+        """The difference of prediction and target, f32[M, F]."""
         difference: Any = self._models.apply(params, observation)
         return difference
 

@@ -28,7 +28,7 @@ import numpy as np
 from agents.experiments.training import AlgorithmRun
 from agents.runs.folder import read_json, write_json
 from agents.runs.machine import DIRTY, machine
-from agents.runs.metrics import Row, first_solved
+from agents.runs.metrics import Row, first_solved, is_last
 from agents.runs.tracking import OVERALL, PREFIX
 
 SCHEMA = "trap-tube-jax experiment 1"
@@ -60,9 +60,6 @@ def seed_record(
     rows, config = of_seed(entry.rows, seed), entry.run.config
     last = rows[-1]
     (solved,) = first_solved(rows, [seed], config.stop_when_solved)
-    is_over = last["iteration"] >= config.iterations or (
-        config.stop_when_solved > 0 and solved is not None
-    )
     summary = read_json(entry.folder.summary) or {}
     used = read_json(entry.folder.machines) or []
     machines.extend(entry for entry in used if entry not in machines)
@@ -71,7 +68,7 @@ def seed_record(
         "seed": seed,
         "iterations": int(last["iteration"]),
         "of": config.iterations,
-        "finished": bool(is_over),
+        "finished": bool(is_last(last, config)),
         "episodes": int(last["episodes"]),
         "transitions": int(last["transitions"]),
         "training_seconds": round(float(last["seconds"]), 1),

@@ -1,12 +1,24 @@
 """The policy network; its encoders by the names that `Config.encoder` knows."""
 
+import flax.linen as nn
+
+from agents.config import Config
 from agents.networks.encoder import Encoder
 from agents.networks.object_encoder import ObjectEncoder
 from agents.registry import encoders
 
-__all__ = ["register"]
+__all__ = ["make_encoder", "register"]
 
 register = encoders.register
 
 register("paper", lambda config: Encoder(config.filters))
 register("objects", lambda config: ObjectEncoder(config.filters))
+
+
+def make_encoder(config: Config) -> nn.Module:
+    """A new encoder of the kind `config.encoder`.
+
+    Raises:
+      ValueError: there is no such kind.
+    """
+    return encoders.factory(config.encoder)(config)

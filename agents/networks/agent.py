@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from agents.config import Config
+from agents.networks import make_encoder
 from agents.networks.core import Core, Heads, Outputs
 from agents.networks.layers import draw
-from agents.registry import encoders
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
@@ -25,7 +25,7 @@ class Agent:
     """
 
     def __init__(self, config: Config):
-        self.encoder = encoders.factory(config.encoder)(config)
+        self.encoder = make_encoder(config)
         self.core = Core(config.hidden, config.embedding, config.recurrent)
         self.heads = Heads(config.streams)
         self.facing = config.facing

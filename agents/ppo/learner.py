@@ -36,7 +36,7 @@ from trap_tube_jax.registry import make
 
 Metrics = dict[str, jax.Array]
 
-MAX_TRANSITIONS = np.iinfo(np.int32).max  # of `TrainState.transitions`
+COUNTABLE = np.iinfo(np.int32).max  # by `TrainState.transitions`
 
 
 class TrainState(NamedTuple):
@@ -409,10 +409,10 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
                 f"{getattr(config, name)}; they must agree"
             )
     steps = config.iterations * config.episodes * env.max_steps
-    if steps > MAX_TRANSITIONS:
+    if min(steps, config.max_transitions or steps) > COUNTABLE:
         raise ValueError(
             f"iterations={config.iterations} of {config.episodes} episodes of {env.max_steps} "
-            f"steps are {steps:,} steps; allowed: at most {MAX_TRANSITIONS:,}"
+            f"steps are {steps:,} steps; allowed: at most {COUNTABLE:,}"
         )
     curiosity = curiosities.make(config, env)
     return Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)

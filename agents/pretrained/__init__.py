@@ -97,15 +97,16 @@ def _folder() -> Traversable:
 
 
 def _read(path: Path | Traversable) -> tuple[dict[str, Any], Arrays]:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        header = json.loads(str(arrays.pop(HEADER)))
-        known = isinstance(header, dict) and header.get("format") == FORMAT
-    except (ValueError, KeyError, EOFError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is not a file of parameters") from error
-    except (zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} is damaged, or not a file of parameters: {error}") from error
+    with path.open("rb") as file:
+        try:
+            with np.load(file, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            header = json.loads(str(arrays.pop(HEADER)))
+            known = isinstance(header, dict) and header.get("format") == FORMAT
+        except (ValueError, KeyError, EOFError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path} is not a file of parameters") from error
+        except (zipfile.BadZipFile, zlib.error, OSError) as error:
+            raise ValueError(f"{path} is damaged, or not a file of parameters: {error}") from error
     if not known or not set(HEADER_VALUES) <= set(header):
         raise ValueError(f"{path} is not a file of parameters")
     if digest(arrays) != header["digest"]:

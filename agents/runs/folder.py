@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from agents.config import PRESETS, Config
-from agents.runs.metrics import first_solved, read_metrics
+from agents.runs.metrics import is_last, read_metrics
 from trap_tube_jax._version import __version__
 
 CONFIG_FILE = "config.json"
 MAX_SEED = 2**31 - 1
 # Settings that may change when a run is resumed: they decide only where it ends.
-EXTENDABLE = ("iterations", "stop_when_solved")
+EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
 FIRST_VERSION = "0.1.0"  # wrote settings without a version
 # Settings of that version that are gone; all but `method` counted with another method than PPO.
 GONE = (
@@ -76,7 +76,7 @@ class Run:
             if name not in (*EXTENDABLE, "config") and new[name] != value:
                 raise ValueError(
                     f"the run has {name}={value}, not {new[name]}; only "
-                    f"{' and '.join(EXTENDABLE)} may change"
+                    f"{', '.join(EXTENDABLE[:-1])} and {EXTENDABLE[-1]} may change"
                 )
         for name in ("cooldown", "intrinsic_start"):
             if old[name] > 0 and new["iterations"] != old["iterations"]:
@@ -257,18 +257,15 @@ def check_name(name: str, what: str = "folder") -> None:
 
 def is_done(folder: RunFolder, run: Run) -> bool:
     """Whether a run has been trained and summarised in full."""
-    summary, config = read_json(folder.summary), run.config
+    summary = read_json(folder.summary)
     if summary is None:
         return False
-    if summary["iterations"] >= config.iterations:
-        return True
-    if config.stop_when_solved == 0:
-        return False
-    # The summary may be of another threshold, and the metrics of an iteration after it.
+    # The summary may be of other limits than those of now, the metrics of an iteration after it.
     rows = [
         row for row in read_metrics(folder.metrics) if row["iteration"] <= summary["iterations"]
     ]
-    return all(first_solved(rows, run.seed_range, config.stop_when_solved))
+    over = {row["seed"] for row in rows if is_last(row, run.config)}
+    return over.issuperset(run.seed_range)
 
 
 def write_json(path: Path, values: Any) -> None:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from agents.config import Config
+
 Row = Mapping[str, float | int]
 
 LEADING_COLUMNS = ("seed", "iteration", "episodes", "transitions")
@@ -104,6 +106,16 @@ def first_solved(
         if row["evaluation"] >= share:
             found.setdefault(int(row["seed"]), row)
     return tuple(FirstSolved.of(found[seed]) if seed in found else None for seed in seeds)
+
+
+def is_last(row: Row, config: Config) -> bool:
+    """Whether a seed trains no more after the iteration of this row."""
+    if row["iteration"] >= config.iterations:
+        return True
+    if config.stop_when_solved > 0 and row["evaluation"] >= config.stop_when_solved:
+        return True
+    limit = config.max_transitions
+    return limit is not None and row["transitions"] + config.longest_iteration > limit
 
 
 def _columns(row: Row) -> list[str]:

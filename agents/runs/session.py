@@ -23,7 +23,7 @@ from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.folder import Run, RunFolder, write_json
-from agents.runs.metrics import MetricsLog, Row, first_solved, read_metrics
+from agents.runs.metrics import MetricsLog, Row, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.stopping import Stopped, StopSignals
 from agents.runs.story import Story, resume_command
@@ -94,7 +94,7 @@ class Session:
             self._checkpoints.close()
 
     def train(self, stop: StopSignals, *, then_finish: bool = False) -> None:
-        """Trains until all seeds are solved or the iterations are over.
+        """Trains until every seed is solved, or has come to the limit of iterations or steps.
 
         Args:
           stop: tells when to stop early.
@@ -104,20 +104,19 @@ class Session:
           Stopped: on request; everything is saved.
           KeyboardInterrupt: on a second request; the current iteration is lost.
         """
-        config, total = self.run.config, self.run.config.iterations
-        if not self._progress.active(config).any():
+        if not self._progress.active.any():
             return
         advance = self._compile()
         if then_finish:
             self._prepare_results()
-        live = report.LiveReport(self.console, total, self.run.seeds)
+        live = report.LiveReport(self.console, self.run.config.iterations, self.run.seeds)
         with stop, live:
-            while self._progress.active(config).any():
+            while self._progress.active.any():
                 rows = self._iterate(advance)
                 live.update(rows, sum(first is not None for first in self._progress.solved))
                 # A signal may arrive at any time: what counts is what all agreed on here.
                 request = processes.agree(stop.received)
-                is_over = not self._progress.active(config).any()
+                is_over = not self._progress.active.any()
                 if is_over or request or self._progress.iteration % self._every == 0:
                     self._save()
                 if request:
@@ -201,7 +200,7 @@ class Session:
         found = processes.from_first(stored)
         if found is not None:
             return from_arrays(found[0], template), found[1]
-        return init(keys), Progress(0, 0.0, 0.0, (None,) * self.run.seeds)
+        return init(keys), Progress.start(self.run)
 
     def _compile(self) -> Any:
         started = time.perf_counter()
@@ -236,8 +235,7 @@ class Session:
         return evaluator, report_page.compile_pay(config, state, evaluator)
 
     def _iterate(self, advance: Advance) -> list[Row]:
-        config, progress = self.run.config, self._progress
-        active = progress.active(config)
+        progress, active = self._progress, self._progress.active
         started = time.perf_counter()
         self._state, metrics = advance(self._state, active)
         _wait(metrics)
@@ -256,12 +254,11 @@ class Session:
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        now = first_solved(rows, self.run.seed_range, config.stop_when_solved)
-        solved = tuple(first or new for first, new in zip(progress.solved, now, strict=True))
-        rows = self._track(rows, is_due=solved != progress.solved)
+        progress = progress._replace(iteration=iteration, seconds=seconds).after(self.run, rows)
+        rows = self._track(rows, is_due=progress.solved != self._progress.solved)
         if self._log is not None:
             self._log.append(rows)
-        self._progress = progress._replace(iteration=iteration, seconds=seconds, solved=solved)
+        self._progress = progress
         return rows
 
     def _track(self, rows: list[Row], *, is_due: bool) -> list[Row]:
