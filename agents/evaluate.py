@@ -30,7 +30,7 @@ class Options:
       sets: ids or short names of task sets; the paper's eight, and that of training, if absent.
       imports: modules of your own to import first, for the sets that they register; those of
         the run are known.
-      episodes: tasks per set; the run's `eval_episodes` if absent. The base set has one.
+      tasks: how many per set; the run's `eval_episodes` if absent. The base set has one.
       iteration: the checkpoint to evaluate; the newest if absent.
       gif: write the first solved episode to this file.
       json: write the results to this file.
@@ -44,7 +44,7 @@ class Options:
     pretrained: str | None = None
     sets: tuple[str, ...] | None = None
     imports: Imports = ()
-    episodes: int | None = None
+    tasks: int | None = None
     iteration: int | None = None
     gif: Path | None = None
     json: Path | None = None
@@ -85,11 +85,11 @@ def evaluate(options: Options) -> None:
     policies = options.policies()
     config = policies[0].config
     sets = own_and_paper_sets(config) if options.sets is None else options.sets
-    episodes = config.eval_episodes if options.episodes is None else options.episodes
-    evaluator = Evaluator.of_sets(config, sets, episodes)
+    tasks = config.eval_episodes if options.tasks is None else options.tasks
+    evaluator = Evaluator.of_sets(config, sets, tasks)
     shortest = None
     if options.optimality:
-        shortest = {name: shortest_lengths(tasks) for name, tasks in evaluator.tasks.items()}
+        shortest = {name: shortest_lengths(drawn) for name, drawn in evaluator.tasks.items()}
     played = {policy.name: evaluator(policy.params) for policy in policies}
     results = {
         name: scores(outcome, evaluator.tasks, evaluator.limits, shortest)

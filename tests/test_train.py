@@ -144,7 +144,7 @@ def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
 
 def test_evaluate_command_line(whole, tmp_path):
     folder, _ = whole
-    arguments = [folder, "--sets", "base", "StructuralTrapTube-v0", "--episodes", 3]
+    arguments = [folder, "--sets", "base", "StructuralTrapTube-v0", "--tasks", 3]
     output = run("agents.evaluate", *arguments, "--json", tmp_path / "x.json", "--optimality")
     (policy,) = json.loads((tmp_path / "x.json").read_text())
     assert policy["iteration"] == ITERATIONS

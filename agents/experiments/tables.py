@@ -205,16 +205,18 @@ def quality_table(record: Record, entry: Record) -> Table:
 
 
 def seeds_table(record: Record, entry: Record) -> Table:
-    """What each seed solves, and the environment steps that it took."""
+    """What each seed solves, when its policy was chosen, and all steps that it took."""
     rows, labels = [], []
     for run in statistics.tested(entry):
         scores = statistics.seed_scores(record, entry, run)
         labels = [score.label for score in scores.values()]
         percents = [*(score.percent for score in scores.values()), statistics.mean_score(scores)]
         cells = [_number(percent, ".1f") for percent in percents]
-        rows.append((str(run["seed"]), *cells, f"{run['transitions']:,}"))
+        chosen = f"{run['best']['iteration']:,} of {run['iterations']:,}"
+        rows.append((str(run["seed"]), *cells, chosen, f"{run['transitions']:,}"))
     title = f"{algorithm_label(record, entry)}, seed by seed: tasks solved, %"
-    return Table(title, ("seed", *labels, MEAN_OF_SETS, "transitions"), tuple(rows))
+    heads = ("seed", *labels, MEAN_OF_SETS, "chosen at iteration", "transitions")
+    return Table(title, heads, tuple(rows))
 
 
 def cost_table(record: Record) -> Table:
