@@ -201,6 +201,13 @@ def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
     assert figures.drawn_from(tmp_path / "none.png") is None
 
 
+def test_training_is_averaged_over_the_last_points_of_its_seed():
+    mixed = [*rows(0, [0.0, 1.0] * figures.SMOOTHED), *rows(1, [1.0]), {"seed": 1, "greedy_p": 1.0}]
+    first, second, *_, last = (row.get("success") for row in figures.smoothed(mixed)[:20])
+    assert (first, second, last) == (0.0, 0.25, 0.25)  # `rows` halves it
+    assert [row.get("success") for row in figures.smoothed(mixed)[20:]] == [0.5, None]
+
+
 def test_pages_and_figures_are_those_of_the_records():
     found = readme_tables.read_records(readme_tables.Arguments().results)
     assert not readme_tables.stale(readme_tables.ROOT, found)

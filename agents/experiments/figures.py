@@ -5,6 +5,7 @@ Source: the paper's figures of experiments 1 and 2.
 
 import hashlib
 import json
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ from agents.experiments import tables
 from agents.experiments.records import Record, rows_of
 from agents.runs.metrics import Row
 from agents.runs.tracking import OVERALL, PREFIX
-from trap_tube_jax.scoring.tasks import label
+from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
 Curves = Mapping[str, Sequence[Row]]  # by algorithm, the rows of all its seeds
 
 WIDTH = 3.2  # inches of a panel
 HEIGHT = 2.5
 DPI = 110
+SMOOTHED = 10  # points of a curve of training, over which `_save_success` takes means
 DIGEST = "Record"  # the key of a figure's metadata
 
 
@@ -71,12 +73,27 @@ def save_rewards(
 def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:
     """Experiment 2: mean ± sd and maximum over seeds, of training and of every set."""
     columns = dict.fromkeys(name for rows in curves.values() for row in rows for name in row)
-    sets = [name for name in columns if name.startswith(PREFIX) and name != OVERALL]
-    panels = {"training": "success", **{label(name.removeprefix(PREFIX)): name for name in sets}}
+    found = [name.removeprefix(PREFIX) for name in columns if name.startswith(PREFIX)]
+    sets = [name for name in ALL_SETS if name in found]
+    sets += [name for name in found if name not in ALL_SETS and PREFIX + name != OVERALL]
+    panels = {"training, running mean": "success", **{label(name): PREFIX + name for name in sets}}
     if OVERALL in columns:
         panels["overall"] = OVERALL
     title = f"{title}: mean, ± sd, maximum (dotted)"
-    _save(curves, panels, path, title, metadata, columns=5, draw=_draw_spread)
+    shown = {name: smoothed(rows) for name, rows in curves.items()}
+    _save(shown, panels, path, title, metadata, columns=5, draw=_draw_spread)
+
+
+def smoothed(rows: Sequence[Row]) -> list[Row]:
+    """The rows, success in training averaged over the last ones of its seed."""
+    newest: dict[float, deque[float]] = defaultdict(lambda: deque(maxlen=SMOOTHED))
+    made: list[Row] = []
+    for row in rows:
+        if "success" in row:
+            newest[row["seed"]].append(row["success"])
+            row = {**row, "success": float(np.mean(newest[row["seed"]]))}  # noqa: PLW2901
+        made.append(row)
+    return made
 
 
 def by_iteration(rows: Sequence[Row], metric: str) -> tuple[np.ndarray, np.ndarray]:
@@ -124,7 +141,8 @@ def _save(
         axis.set_xlabel("episodes")
         axis.xaxis.set_major_locator(MaxNLocator(5))
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes[0, 0].legend(fontsize="small")
+    lines, names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(lines, names, loc="outside lower center", ncols=len(names), fontsize="small")
     figure.savefig(path, format="png", dpi=DPI, metadata=dict(metadata))
 
 
