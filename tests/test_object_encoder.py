@@ -11,6 +11,7 @@ from agents.networks.agent import Agent
 from agents.networks.object_encoder import MAX_OBJECTS, describe_board
 from trap_tube_jax.objects import AGENT, FOOD
 
+describe = jax.jit(describe_board)
 PALETTE = np.asarray(tt.base_state().palette)
 
 
@@ -51,7 +52,7 @@ def described(board: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
 
 def test_objects_are_where_they_are(tasks):
     boards = np.asarray(jax.vmap(tt.observe)(tasks))
-    features, exists, places = map(np.asarray, describe_board(jnp.asarray(boards)))
+    features, exists, places = map(np.asarray, describe(jnp.asarray(boards)))
     for board, found, is_there, place in zip(boards, features, exists, places, strict=True):
         expected, expected_place = described(board)
         assert is_there.sum() == len(expected)
@@ -67,14 +68,14 @@ def test_colours_are_not_told(tasks):
         keys, jax.tree.map(lambda x: jnp.stack([x] * 32), tt.base_state())
     )
     recolored = jax.vmap(tt.structural)(keys, plain)
-    before, after = (describe_board(jax.vmap(tt.observe)(states)) for states in (plain, recolored))
+    before, after = (describe(jax.vmap(tt.observe)(states)) for states in (plain, recolored))
     for one, other in zip(before, after, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_what_cannot_be_seen_is_nowhere():
     board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
-    features, exists, places = describe_board(board)
+    features, exists, places = describe(board)
     assert exists[0].tolist() == [True] + [False] * (MAX_OBJECTS - 1)
     assert (features[0, 0, :24] == 1).all()
     assert (features[0, 0, 24:166] == 0).all()
@@ -84,7 +85,7 @@ def test_what_cannot_be_seen_is_nowhere():
 
 def test_objects_beyond_the_sixth_are_left_out():
     board = np.arange(144, dtype=np.uint8).reshape(1, 12, 12, 1)
-    features, exists, _ = describe_board(jnp.asarray(board))
+    features, exists, _ = describe(jnp.asarray(board))
     assert exists.all()
     assert np.argmax(np.asarray(features[0, :, 12:24]), axis=1).tolist() == list(range(6))
 
@@ -95,23 +96,23 @@ def test_any_number_of_features_will_do(num_features):
         num_features=num_features, encoder="objects", filters=(4, 6), hidden=4, curiosity="none"
     )
     agent = Agent(config)
-    params = agent.init(jax.random.key(0))
+    params, encode = jax.jit(agent.init)(jax.random.key(0)), jax.jit(agent.encode)
     board = tt.observe(tt.base_state(num_features))[None]
-    features = agent.encode(params, board)
+    features = encode(params, board)
     assert features.shape == (1, 12)
-    _, exists, _ = describe_board(board)
+    _, exists, _ = describe(board)
     assert exists.sum() == 5  # ground, trap, exit, tubes, tool
     moved = tt.observe(tt.base_state(num_features).replace(agent=jnp.array([0, 0])))[None]
-    assert (agent.encode(params, moved) != features).any()
+    assert (encode(params, moved) != features).any()
 
 
 def test_objects_that_are_not_there_do_not_count():
     """The features of a board do not depend on what the empty places are filled with."""
     config = Config(encoder="objects", filters=(4, 6), hidden=4, curiosity="none")
     agent = Agent(config)
-    params = agent.init(jax.random.key(0))
+    params, encode = jax.jit(agent.init)(jax.random.key(0)), jax.jit(agent.encode)
     boards = jnp.zeros((2, 12, 12, 3), jnp.uint8).at[1, 0, 0].set(200)
-    one, two = agent.encode(params, boards)
+    one, two = encode(params, boards)
     assert np.isfinite(one).all()
     assert np.abs(one).max() < 100
     assert (one != two).any()

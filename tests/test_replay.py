@@ -18,9 +18,12 @@ from agents.ppo.learner import Batch
 
 STEPS, CAPACITY = 4, 3
 CONFIG = Config(
-    max_steps=STEPS, filters=(2, 3), hidden=4, embedding=2, chunk=4, curiosity="none",
-    discount=0.5, imitation_coef=2.0, imitation_episodes=CAPACITY,
+    max_steps=STEPS, filters=(2, 3), hidden=4, embedding=2, chunk=4,
+    curiosity="none", discount=0.5, imitation_coef=2.0, imitation_episodes=CAPACITY,
 )  # fmt: skip
+
+
+remember = jax.jit(replay.remember)
 
 
 def played(marks: list[int], solved: list[bool]) -> Episodes:
@@ -54,18 +57,18 @@ def empty() -> Episodes:
 
 def test_solved_episodes_come_first_and_the_oldest_fall_out(empty):
     assert remembered(empty) == []
-    memory = replay.remember(empty, played([0, 1, 2], [False, False, False]))
+    memory = remember(empty, played([0, 1, 2], [False, False, False]))
     assert remembered(memory) == []
-    memory = replay.remember(memory, played([0, 1, 2], [False, True, False]))
+    memory = remember(memory, played([0, 1, 2], [False, True, False]))
     assert remembered(memory) == [1]
-    memory = replay.remember(memory, played([2, 3, 0], [True, False, False]))
+    memory = remember(memory, played([2, 3, 0], [True, False, False]))
     assert remembered(memory) == [2, 1]
-    memory = replay.remember(memory, played([0, 3, 3, 0], [True, True, False, False]))
+    memory = remember(memory, played([0, 3, 3, 0], [True, True, False, False]))
     assert remembered(memory) == [0, 3, 2]
 
 
 def test_more_successes_than_places(empty):
-    memory = replay.remember(empty, played([0, 1, 2, 3], [True] * 4))
+    memory = remember(empty, played([0, 1, 2, 3], [True] * 4))
     assert len(remembered(memory)) == CAPACITY
 
 
@@ -87,7 +90,7 @@ def learner() -> Any:
 
 def test_imitation_loss_is_the_weighted_log_likelihood(empty, learner):
     train, params, imitate = learner
-    memory = replay.remember(empty, played([3, 1], [True, False]))
+    memory = remember(empty, played([3, 1], [True, False]))
     loss, gradient = imitate(params, memory)
 
     boards = jax.vmap(lambda cells: tt.observe(place(tt.base_state(), cells)))(memory.cells[:, 0])
