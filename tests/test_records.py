@@ -96,8 +96,8 @@ def test_tables_hold_means_deviations_and_intervals(example):
     assert "| {P} | 55.6 ± 19.2 [7.7, 100.0] | 0.0 | 2.0 ± 3.0 |" in text
     assert "| mean of the sets apart from base | 55.6 ± 19.2 [7.7, 100.0] | – | – |" in text
     assert "| base | 1.0 of 1 |" in text
-    seed = tables.seeds_table(example, entry).rows[1]
-    assert (seed[0], seed[2], *seed[-3:-1]) == ("1", "66.7", "66.7", "1 of 3")
+    seed = tables.seeds_table(example).rows[1]
+    assert (*seed[:2], seed[3], *seed[-3:-1]) == ("PPO + ICM", "1", "66.7", "66.7", "1 of 3")
     assert "| {P} | 3 | 83.3 ± 28.9 [11.6, 100.0] | 0.458 ± 0.072 [0.279, 0.638] | 0.250 |" in text
     assert "Unfinished: ppo+icm, seed 0, 3 of 4 iterations." in text
     assert "Unfinished: ppo+icm, seed 1, 3 of 4 iterations." in text
@@ -187,6 +187,20 @@ def test_a_commit_is_dirty_where_code_changed(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "ROOT", tmp_path / "agents")
     assert machine.machine()["commit"] is None
     assert machine.machine("given")["commit"] == "given"
+
+
+def test_many_algorithms_are_rows(example):
+    (entry,) = example["algorithms"]
+    names = ("ppo+icm", "ppo+rnd", "ppo+ride")
+    example["algorithms"] = [{**entry, "name": name} for name in names]
+    table = tables.percent_table(example)
+    assert table.heads == ("algorithm", "base", "{P}", tables.MEAN_OF_SETS)
+    assert [row[0] for row in table.rows] == [
+        *("PPO + ICM", "ppo+rnd", "ppo+ride", "PPO, paper", "PPO + ICM, paper")
+    ]
+    assert table.rows[1][2:] == ("55.6 ± 19.2", "55.6 ± 19.2 [7.7, 100.0]")
+    assert table.rows[4][2:] == ("2.0 ± 3.0", "–")
+    assert len(tables.seeds_table(example).rows) == 9
 
 
 def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):

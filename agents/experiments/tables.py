@@ -3,7 +3,7 @@
 Source: paper Tables 1 and 2.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from rich.table import Table as RichTable
@@ -57,7 +57,9 @@ TITLES = {
     "exp2": "Experiment 2: train on {P, St, Sy}",
 }
 LABELS = {"ppo": "PPO", "ppo+icm": "PPO + ICM"}
-SPREAD = "mean ± sd [95 % confidence interval of the mean, Student t over seeds]"
+INTERVAL = "[95 % confidence interval of the mean, Student t over seeds]"
+SPREAD = f"mean ± sd {INTERVAL}"
+MOST_COLUMNS = 4  # of algorithms beside each other; more of them are rows
 MEAN_OF_SETS = "mean of the sets apart from base"
 
 
@@ -100,7 +102,8 @@ def tables(record: Record) -> list[Table]:
         made.append(layouts_table(record))
     if any(about["shortest"] for about in record["sets"].values()):
         made += [quality_table(record, entry) for entry in evaluated]
-    made += [seeds_table(record, entry) for entry in evaluated if len(entry["runs"]) > 1]
+    if any(len(entry["runs"]) > 1 for entry in evaluated):
+        made.append(seeds_table(record))
     return [*made, cost_table(record)]
 
 
@@ -141,30 +144,44 @@ def percent_table(record: Record) -> Table:
     """Percent of tasks solved of each set; for experiment 2 with the columns of Table 2.
 
     Of experiment 1 the paper says that agents solve what happens to equal the base task: the
-    share of such tasks stands beside theirs.
+    share of such tasks stands beside theirs. Many algorithms are rows instead of columns.
     """
-    columns: dict[str, dict[str, str]] = {}
+    columns: dict[str, Mapping[str, Spread | None]] = {}
     labels: dict[str, str] = {}
     for entry in _tested(record):
         summaries = statistics.by_set(record, entry)
         labels |= {name: summary.label for name, summary in summaries.items()}
-        cells = {name: _percent(summary.percent) for name, summary in summaries.items()}
-        mean = _percent(statistics.mean_of_sets(record, entry))
-        columns[algorithm_label(record, entry)] = {**cells, MEAN_OF_SETS: mean}
+        percents = {name: summary.percent for name, summary in summaries.items()}
+        mean = statistics.mean_of_sets(record, entry)
+        columns[algorithm_label(record, entry)] = {**percents, MEAN_OF_SETS: mean}
+    labels[MEAN_OF_SETS] = MEAN_OF_SETS
     with_paper = record["experiment"] == "exp2" and is_of_paper(record)
     for name, paper in PAPER_PERCENT.items() if with_paper else ():
-        columns[f"{LABELS[name]}, paper"] = {
-            name: _percent(spread) for name, spread in paper.items()
-        }
+        columns[f"{LABELS[name]}, paper"] = paper
     if record["experiment"] == "exp1":
         about = record["sets"].items()
-        columns["equal to base"] = {name: f"{each['equal_to_base']:.1f}" for name, each in about}
+        columns["equal to base"] = {name: Spread(each["equal_to_base"]) for name, each in about}
+    selection = _selection(record)
+    if len(columns) > MOST_COLUMNS:
+        return _algorithm_rows(columns, labels, selection)
     rows = [
-        (label, *(cells.get(name, NOTHING) for cells in columns.values()))
-        for name, label in {**labels, MEAN_OF_SETS: MEAN_OF_SETS}.items()
+        (text, *(_percent(cells.get(name)) for cells in columns.values()))
+        for name, text in labels.items()
     ]
-    heading = f"Tasks solved, %, {SPREAD}. {_selection(record)}"
-    return Table(heading, ("set", *columns), tuple(rows))
+    return Table(f"Tasks solved, %, {SPREAD}. {selection}", ("set", *columns), tuple(rows))
+
+
+def _algorithm_rows(
+    percents: Mapping[str, Mapping[str, Spread | None]], labels: Mapping[str, str], selection: str
+) -> Table:
+    """Percent solved with a row for each algorithm; an interval of the last column alone."""
+    rows = []
+    for algorithm, cells in percents.items():
+        *sets, mean = (cells.get(name) for name in labels)
+        short = [spread and spread._replace(margin=None) for spread in sets]
+        rows.append((algorithm, *map(_percent, (*short, mean))))
+    heading = f"Tasks solved, %, mean ± sd, of the last column {INTERVAL}. {selection}"
+    return Table(heading, ("algorithm", *labels.values()), tuple(rows))
 
 
 def layouts_table(record: Record) -> Table:
@@ -204,19 +221,22 @@ def quality_table(record: Record, entry: Record) -> Table:
     return Table(heading, heads, tuple(rows))
 
 
-def seeds_table(record: Record, entry: Record) -> Table:
+def seeds_table(record: Record) -> Table:
     """What each seed solves, when its policy was chosen, and all steps that it took."""
     rows, labels = [], []
-    for run in statistics.tested(entry):
-        scores = statistics.seed_scores(record, entry, run)
-        labels = [score.label for score in scores.values()]
-        percents = [*(score.percent for score in scores.values()), statistics.mean_score(scores)]
-        cells = [_number(percent, ".1f") for percent in percents]
-        chosen = f"{run['best']['iteration']:,} of {run['iterations']:,}"
-        rows.append((str(run["seed"]), *cells, chosen, f"{run['transitions']:,}"))
-    title = f"{algorithm_label(record, entry)}, seed by seed: tasks solved, %"
-    heads = ("seed", *labels, MEAN_OF_SETS, "chosen at iteration", "transitions")
-    return Table(title, heads, tuple(rows))
+    for entry in _tested(record):
+        for run in statistics.tested(entry):
+            scores = statistics.seed_scores(record, entry, run)
+            labels = [score.label for score in scores.values()]
+            percents: list[float | None] = [score.percent for score in scores.values()]
+            percents.append(statistics.mean_score(scores))
+            cells = [_number(percent, ".1f") for percent in percents]
+            chosen = f"{run['best']['iteration']:,} of {run['iterations']:,}"
+            transitions = f"{run['transitions']:,}"
+            name = algorithm_label(record, entry)
+            rows.append((name, str(run["seed"]), *cells, chosen, transitions))
+    heads = ("algorithm", "seed", *labels, MEAN_OF_SETS, "chosen at iteration", "transitions")
+    return Table("Seed by seed: tasks solved, %", heads, tuple(rows))
 
 
 def cost_table(record: Record) -> Table:
