@@ -10,6 +10,7 @@ from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
 from agents.experiments import records, training
 from agents.experiments.protocol import PROTOCOLS, QUICK, Protocol, algorithms
+from agents.experiments.tables import algorithm_label
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.metrics import MetricsLog
 from trap_tube_jax.scoring.tasks import ALL_SETS
@@ -37,6 +38,9 @@ def refused(capsys, *arguments):
         ("--settings hiden=4", "unknown setting 'hiden'; did you mean 'hidden'?"),
         ("--settings iterations=9", "iterations is none of --settings; give --iterations"),
         ("--settings eval_episodes=9", "eval_episodes is none of --settings; give --tasks"),
+        ("--algorithms ppo,iterations=9", "iterations is none of --settings; give --iterations"),
+        ("--algorithms ppo,hidden", "settings are given as NAME=VALUE, got 'hidden'"),
+        ("--algorithms ppo,hiden=4", "unknown setting 'hiden'; did you mean 'hidden'?"),
         ("--settings hidden", "settings are given as NAME=VALUE, got 'hidden'"),
         ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
         ("--report-only", "exp1-paper holds no experiment"),
@@ -133,6 +137,22 @@ def test_ppo_is_ppo_alone_in_every_preset(preset):
         assert config.curiosity == (name.partition("+")[2] or "none")
         assert config.learning_rate == whole.learning_rate
     assert not protocol.config("ppo").episodic_novelty
+
+
+def test_an_algorithm_may_change_settings():
+    protocol = Protocol(preset="best", train_set="pstsy", settings={"hidden": 32})
+    whole = protocol.config("preset")
+    changed = protocol.config("preset,encoder=paper,filters=[8,16],hidden=64")
+    fields = {"encoder": "paper", "filters": (8, 16), "hidden": 64}
+    assert changed == dataclasses.replace(whole, **fields)
+    plain = protocol.config("ppo,recurrent=false")
+    assert (plain.curiosity, plain.recurrent, plain.hidden) == ("none", False, 32)
+    names = ("preset", "preset,filters=[8,16]")
+    command = dataclasses.replace(protocol, algorithms=names).command("exp2", names)
+    assert "--algorithms preset 'preset,filters=[8,16]'" in command
+    record = {"protocol": dataclasses.asdict(protocol)}
+    assert algorithm_label(record, {"name": "preset,hidden=64"}) == "best, hidden=64"
+    assert algorithm_label(record, {"name": "ppo"}) == "PPO"
 
 
 def test_a_name_may_say_that_the_agent_imitates():

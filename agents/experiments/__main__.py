@@ -4,7 +4,6 @@ Source: paper section "Results".
 """
 
 import dataclasses
-import json
 import shlex
 import signal
 import sys
@@ -17,7 +16,7 @@ from rich.console import Console
 
 from agents.config import PRESETS
 from agents.experiments import records, reporting, training
-from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol
+from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol, parse_setting
 from agents.parallel.cores import become_devices
 from agents.runs import compilation_cache
 from agents.runs.folder import check_name, read_json
@@ -46,7 +45,8 @@ class Options:
       preset: the named settings; the paper's if absent.
       algorithms: ppo: the preset without curiosity and without imitation; ppo+icm,
         ppo+rnd and so on: with that curiosity; each followed by +imitation: with the
-        preset's imitation too; preset: as it is. ppo and ppo+icm if absent.
+        preset's imitation too; preset: as it is. Each may be followed by settings that it
+        changes, as in preset,recurrent=false. ppo and ppo+icm if absent.
       seeds: how many seeds, from --seed on; 5 if absent.
       seed: the first seed; 0 if absent.
       iterations: of training; 250 in exp1 and 500 in exp2 if absent.
@@ -151,7 +151,7 @@ class Options:
         if self.sets is not None:
             given["sets"] = tuple(task_set(name).short for name in self.sets)
         if self.settings is not None:
-            given["settings"] = dict(map(_setting, self.settings))
+            given["settings"] = dict(map(parse_setting, self.settings))
         return given
 
 
@@ -199,16 +199,6 @@ def run(options: Options, console: Console, stop: StopSignals) -> None:
         records.check_clean(record, options.commit)
         records.write_record(options.record, record)
         console.print(f"    record: {options.record}", soft_wrap=True, highlight=False)
-
-
-def _setting(text: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise ValueError(f"settings are given as NAME=VALUE, got {text!r}")
-    try:
-        return name, json.loads(value)
-    except ValueError:
-        return name, value
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ Source: paper section "Results"; its Tables 1 and 2.
 
 import dataclasses
 import json
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
@@ -34,6 +36,39 @@ def algorithms() -> dict[str, dict[str, Any]]:
     return {**pure, **imitating, PRESET: {}}
 
 
+def changes_of(algorithm: str) -> dict[str, Any]:
+    """What one algorithm changes in a preset.
+
+    Args:
+      algorithm: one of `algorithms()`, and settings after it, as in `preset,recurrent=false`.
+
+    Raises:
+      ValueError: there is no such algorithm, or a setting is not NAME=VALUE.
+    """
+    name, *settings = re.split(COMMA, algorithm)
+    if name not in algorithms():
+        raise ValueError(f"unknown algorithm {name!r}; allowed: {', '.join(algorithms())}")
+    return {**algorithms()[name], **dict(map(parse_setting, settings))}
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """The name and the value of a setting given as NAME=VALUE.
+
+    Raises:
+      ValueError: it is given otherwise, or has an option of its own.
+    """
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise ValueError(f"settings are given as NAME=VALUE, got {text!r}")
+    if name in OWN_OPTIONS:
+        raise ValueError(f"{name} is none of --settings; give {OWN_OPTIONS[name]}")
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
+
+
+COMMA = re.compile(r",(?![^\[]*\])")  # but not those in a list
 SELECTIONS = ("validation", "paper")
 # Settings of the config that a protocol has by other means, and the options that give them.
 OWN_OPTIONS = {
@@ -54,7 +89,7 @@ class Protocol:
       sets: the sets to evaluate on, by their short names.
       imports: modules of your own, imported first, for the names that they register.
       preset: the named settings.
-      algorithms: which of `algorithms()`.
+      algorithms: which of `algorithms()`, as `changes_of` reads them.
       seeds: how many, from `seed` on.
       iterations: of training, at most.
       tasks: tasks per set by which the best evaluation is chosen; the base set has one.
@@ -93,10 +128,8 @@ class Protocol:
             task_set(name)
         if not self.sets:
             raise ValueError(f"name at least one task set; allowed: {', '.join(ALL_SETS)}, ...")
-        allowed = ", ".join(algorithms())
         for name in self.algorithms:
-            if name not in algorithms():
-                raise ValueError(f"unknown algorithm {name!r}; allowed: {allowed}")
+            changes_of(name)
         for name in self.settings:
             if name in OWN_OPTIONS:
                 raise ValueError(f"{name} is none of --settings; give {OWN_OPTIONS[name]}")
@@ -104,7 +137,7 @@ class Protocol:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
         if not self.algorithms:
-            raise ValueError(f"name at least one algorithm; allowed: {allowed}")
+            raise ValueError(f"name at least one algorithm; allowed: {', '.join(algorithms())}")
         if self.selection not in SELECTIONS:
             raise ValueError(
                 f"selection must be one of {', '.join(SELECTIONS)}, got {self.selection!r}"
@@ -167,9 +200,9 @@ class Protocol:
             "eval_episodes": self.tasks,
             "stop_when_solved": self.stop_when_solved,
         }
-        changes = algorithms()[algorithm]
+        changes = changes_of(algorithm)
         config = Config.preset(self.preset, **{**self.settings, **fixed, **changes})
-        if algorithm.endswith(IMITATION) and not config.imitation_coef:
+        if re.split(COMMA, algorithm)[0].endswith(IMITATION) and not config.imitation_coef:
             raise ValueError(
                 f"algorithm {algorithm!r} imitates, but imitation_coef is 0 in preset "
                 f"{self.preset!r}; give --settings imitation_coef=..., or leave out {IMITATION!r}"
@@ -185,7 +218,7 @@ class Protocol:
             parts += ["--train-set", self.train_set]
         if self.sets != usual.sets:
             parts += ["--sets", *self.sets]
-        parts += ["--preset", self.preset, "--algorithms", *algorithms]
+        parts += ["--preset", self.preset, "--algorithms", *map(shlex.quote, algorithms)]
         names = ("seeds", "iterations", "tasks", "reported", "selection", "evaluate_every")
         for name in (*names, "stop_when_solved", "seed"):
             value = getattr(self, name)

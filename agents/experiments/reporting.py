@@ -52,7 +52,9 @@ def make_record(
         raise ValueError(f"{root} holds no run with a first iteration yet")
     tasks = draw_tasks(runs[0].run.config, protocol.sets, protocol.num_reported, "test")
     shortest = find_shortest(root / SHORTEST_FILE, tasks, console) if optimality else {}
-    names = [name for name in algorithms() if any(entry.algorithm == name for entry in runs)]
+    order = list(algorithms())
+    names = dict.fromkeys(entry.algorithm for entry in runs)
+    names = sorted(names, key=lambda name: order.index(name.partition(",")[0]))
     machines: list[Any] = []
     reached = []
     with console.status("Playing the reported tasks ..."):

@@ -311,10 +311,9 @@ def _machine(machine: Record) -> str:
 
 def algorithm_label(record: Record, entry: Record) -> str:
     """What tables and figures call an algorithm: the preset's name where it is trained as it is."""
-    if entry["name"] == PRESET:
-        return str(record["protocol"]["preset"])
-    name = str(entry["name"])
-    return LABELS.get(name, name)
+    name, comma, settings = str(entry["name"]).partition(",")
+    known = {**LABELS, PRESET: str(record["protocol"]["preset"])}
+    return f"{known.get(name, name)}{comma and ', '}{settings}"
 
 
 def _percent(spread: Spread | None) -> str:
