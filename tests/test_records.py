@@ -189,7 +189,7 @@ def test_a_commit_is_dirty_where_code_changed(tmp_path, monkeypatch):
     assert machine.machine("given")["commit"] == "given"
 
 
-def test_many_algorithms_are_rows(example):
+def test_many_algorithms_are_rows(example, tmp_path):
     (entry,) = example["algorithms"]
     names = ("ppo+icm", "ppo+rnd", "ppo+ride")
     example["algorithms"] = [{**entry, "name": name} for name in names]
@@ -201,6 +201,9 @@ def test_many_algorithms_are_rows(example):
     assert table.rows[1][2:] == ("55.6 ± 19.2", "55.6 ± 19.2 [7.7, 100.0]")
     assert table.rows[4][2:] == ("2.0 ± 3.0", "–")
     assert len(tables.seeds_table(example).rows) == 9
+    example["algorithms"].append({**entry, "name": "ppo"})
+    figures.save(example, tmp_path / "x.png")
+    assert figures.drawn_from(tmp_path / "x.png") == figures.digest(example)
 
 
 def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):

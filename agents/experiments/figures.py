@@ -23,6 +23,7 @@ Curves = Mapping[str, Sequence[Row]]  # by algorithm, the rows of all its seeds
 WIDTH = 3.2  # inches of a panel
 HEIGHT = 2.5
 DPI = 110
+MOST_SHADED = 3  # algorithms whose spread is shown too
 SMOOTHED = 10  # points of a curve of training, over which `_save_success` takes means
 DIGEST = "Record"  # the key of a figure's metadata
 
@@ -71,7 +72,10 @@ def save_rewards(
 
 
 def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:
-    """Experiment 2: mean ± sd and maximum over seeds, of training and of every set."""
+    """Experiment 2: mean ± sd and maximum over seeds, of training and of every set.
+
+    Of many algorithms the mean alone: spreads would cover each other.
+    """
     columns = dict.fromkeys(name for rows in curves.values() for row in rows for name in row)
     found = [name.removeprefix(PREFIX) for name in columns if name.startswith(PREFIX)]
     sets = [name for name in ALL_SETS if name in found]
@@ -79,9 +83,11 @@ def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str,
     panels = {"training, running mean": "success", **{label(name): PREFIX + name for name in sets}}
     if OVERALL in columns:
         panels["overall"] = OVERALL
-    title = f"{title}: mean, ± sd, maximum (dotted)"
+    is_few = len(curves) <= MOST_SHADED
+    title += ": mean, ± sd, maximum (dotted)" if is_few else ": mean over seeds"
+    draw = _draw_spread if is_few else _draw_mean
     shown = {name: smoothed(rows) for name, rows in curves.items()}
-    _save(shown, panels, path, title, metadata, columns=5, draw=_draw_spread)
+    _save(shown, panels, path, title, metadata, columns=5, draw=draw)
 
 
 def smoothed(rows: Sequence[Row]) -> list[Row]:
@@ -161,6 +167,11 @@ def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: An
                 alpha=0.35 if all_end_together else 0.7, label=label,
             )  # fmt: skip
             label = None
+
+
+def _draw_mean(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
+    shared, complete = _of_all_seeds(episodes, values)
+    axis.plot(shared, np.mean(complete, axis=0), linewidth=1.4, **style)
 
 
 def _draw_spread(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
