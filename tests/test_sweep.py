@@ -13,10 +13,10 @@ import pytest
 from rich.console import Console
 
 import agents
-from agents import Config, sweep
+from agents import Config, sweep, train
 from agents.experiments import workers
 from agents.experiments.training import plan_runs
-from agents.runs.folder import RunFolder, is_done, write_json
+from agents.runs.folder import Run, RunFolder, is_done, write_json
 from agents.runs.metrics import MetricsLog, read_metrics
 from agents.runs.stopping import Stopped, StopSignals
 
@@ -280,3 +280,13 @@ def test_stopped_sweeps_continue_to_the_same_result(tmp_path):
         assert untimed[0] == untimed[1]
         assert len(whole) == 40
     assert (root / "table.md").is_file()
+
+
+def test_a_worker_is_told_of_every_limit_that_may_have_changed(tmp_path):
+    before = Run(Config(episodes=8, minibatch=8, max_transitions=900))
+    folder = RunFolder.create(tmp_path / "x", before)
+    for limits in ({"max_transitions": None, "stop_when_solved": 0.5}, {"max_transitions": 4000}):
+        run = dataclasses.replace(before, config=dataclasses.replace(before.config, **limits))
+        _, _, _, *arguments = workers._command(folder, run, ["--no-cache"])
+        _, options = train.parse(train.select(arguments), arguments)
+        assert options.config == run.config

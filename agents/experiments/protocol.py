@@ -202,7 +202,7 @@ class Protocol:
         }
         changes = changes_of(algorithm)
         config = Config.preset(self.preset, **{**self.settings, **fixed, **changes})
-        if re.split(COMMA, algorithm)[0].endswith(IMITATION) and not config.imitation_coef:
+        if algorithm.partition(",")[0].endswith(IMITATION) and not config.imitation_coef:
             raise ValueError(
                 f"algorithm {algorithm!r} imitates, but imitation_coef is 0 in preset "
                 f"{self.preset!r}; give --settings imitation_coef=..., or leave out {IMITATION!r}"

@@ -1,5 +1,6 @@
 """Runs trained side by side, each by a process of its own on cores of its own."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -15,7 +16,7 @@ from rich.progress import TimeElapsedColumn as Elapsed
 
 from agents import train
 from agents.parallel.cores import available_cores
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import EXTENDABLE, Run, RunFolder
 from agents.runs.metrics import read_metrics
 from agents.runs.stopping import Stopped, StopSignals
 
@@ -105,10 +106,11 @@ def train_runs(
 
 
 def _command(folder: RunFolder, run: Run, arguments: Sequence[str]) -> list[str]:
-    path, config = folder.path, run.config
+    path = folder.path
+    limits = [(f"--{name.replace('_', '-')}", getattr(run.config, name)) for name in EXTENDABLE]
     parts = (
         *(sys.executable, "-m", __name__, "--resume", "--name", path.name, "--out", path.parent),
-        *("--iterations", config.iterations, "--stop-when-solved", config.stop_when_solved),
+        *itertools.chain.from_iterable(limits),
         *arguments,
     )
     return [str(part) for part in parts]
