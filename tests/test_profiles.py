@@ -20,7 +20,7 @@ from agents.profiles import figures, measure, mistakes, summary, tables
 from agents.profiles.mistakes import NEVER, Turns, subgoals, turns, walks_to_food
 from agents.profiles.oracle import LOST, Oracle, replayed
 from agents.profiles.pushes import NO_PUSH, Push, first_push
-from agents.profiles.tasks import STRENGTHS, points
+from agents.profiles.tasks import STRENGTHS, kinds, points
 from benchmarks import readme_tables
 from trap_tube_jax.controls import trap_and_exit_exchanged, trap_exchanged
 
@@ -167,6 +167,22 @@ def test_points_draw_what_their_names_say():
 
 
 @pytest.mark.parametrize(
+    ("agent", "extent", "exchanged", "kind"),
+    [
+        ((9, 1), (4, 1), False, "away, across"),  # the base task: the food leaves to the right
+        ((11, 5), (4, 1), False, "sideways, across"),
+        ((5, 1), (1, 4), False, "away, along"),
+        ((7, 11), (1, 4), False, "towards, along"),
+        ((7, 11), (1, 4), True, "away, along"),
+    ],
+)
+def test_kinds_of_tasks(agent, extent, exchanged, kind):
+    state = tt.base_state().replace(agent=jnp.array(agent), tool_extent=jnp.array(extent))
+    state = trap_and_exit_exchanged(state) if exchanged else state
+    assert kinds(jax.tree.map(lambda x: x[None], state)) == [kind]
+
+
+@pytest.mark.parametrize(
     ("parts", "strengths", "message"),
     [
         (("colour",), STRENGTHS, "unknown parts .*allowed: one or more of colours, layout"),
@@ -205,7 +221,14 @@ def test_counts_of_a_record_made_by_hand():
     }
     record = {
         "settings": {"episodes": 5},
-        "points": {"layout 1": {"axis": "layout", "value": 1.0, "shortest": [10, 8, 14, 11, -1]}},
+        "points": {
+            "layout 1": {
+                "axis": "layout",
+                "value": 1.0,
+                "shortest": [10, 8, 14, 11, -1],
+                "kinds": ["away, along", "towards, along", *["towards, across"] * 3],
+            }
+        },
         "pairs": {"{P}": ["a", "b"]},
         "policies": [policy],
     }
@@ -223,6 +246,12 @@ def test_counts_of_a_record_made_by_hand():
     assert list(summary.pair_counts(record, policy, "{P}").values()) == [1, 1, 1, 1]
     by_length = summary.by_length(record, policy)
     assert {length: each.tasks for length, each in by_length.items()} == {8.0: 1, 35 / 3: 3}
+    by_kind = summary.by_kind(record, policy)
+    assert {kind: (each.tasks, each.percent) for kind, each in by_kind.items()} == {
+        "away, along": (1, 100.0),
+        "towards, across": (3, 0.0),
+        "towards, along": (1, 100.0),
+    }
     outcome = summary.outcome(record, policy, "layout 1")
     assert (outcome.tasks, outcome.percent) == (5, 40.0)
     assert outcome.optimality is not None

@@ -131,7 +131,11 @@ def _panels(record: Record) -> list[Panel]:
             "length of the shortest plan",
             lambda p: summary.by_length(record, p),
         ),
-        ("base, one task a swap", "tool swapped with", lambda p: summary.swapped(record, p)),
+        (
+            "{P}, by way of the food",
+            "way of the food from the agent; tool along or across it",
+            lambda p: summary.by_kind(record, p),
+        ),
         ("{P, St}, by swap", "tool swapped with", lambda p: summary.swapped(record, p, "both 1")),
     ]
     return [panel for panel in panels if panel[2](record["policies"][0])]
@@ -160,7 +164,7 @@ def _draw_outcomes(
     x = list(outcomes)
     is_kinds = isinstance(x[0], str)
     if is_kinds:
-        solved.set_xticks(range(len(x)), x)
+        solved.set_xticks(range(len(x)), [kind.replace(", ", "\n") for kind in x])
         x = [at + 0.14 * place for at in range(len(x))]
     style |= {"markersize": 4.5, "linewidth": 0 if is_kinds else 1.4, "elinewidth": 1, "capsize": 2}
     found = list(outcomes.values())

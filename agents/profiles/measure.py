@@ -7,7 +7,7 @@ A record holds what was measured and nothing derived from it:
     settings    parts, strengths, tasks of a point, episodes looked into
     machines    hardware, versions and commit, of the profile and of the runs in it
     points      by name: axis and value, and of every task the length of its shortest plan, -1
-                where there is none
+                where there is none; of those of {P} also their kinds (see `tasks.kinds`)
     pairs       by name: the two points whose tasks differ in the trap alone, one by one
     policies    name, iteration and settings; by point the steps of every episode, 0 where it
                 did not solve the task, and in pairs and controls its first push (see
@@ -30,11 +30,11 @@ from agents.experiments.records import Record
 from agents.profiles.mistakes import SUBGOALS, Turns, subgoals, turns
 from agents.profiles.oracle import Oracle, replayed
 from agents.profiles.pushes import Push, first_push
-from agents.profiles.tasks import BASE, PAIRS, PARTS, STRENGTHS, SWAPS, points
+from agents.profiles.tasks import BASE, PAIRS, PARTS, STRENGTHS, SWAPS, WHOLE, kinds, points
 from agents.runs.machine import machine
 from trap_tube_jax.state import State
 
-SCHEMA = "trap-tube-jax profile 1"
+SCHEMA = "trap-tube-jax profile 2"
 # The points whose episodes are looked into, and those that are in pairs, where the parts hold them.
 LOOKED_INTO = ("colours 1", "layout 1", "both 1", *(f"both 1, swap {name}" for name in SWAPS))
 IN_PAIRS = {name for pair in PAIRS.values() for name in pair}
@@ -120,7 +120,12 @@ def profile(
         "settings": dataclasses.asdict(settings),
         "machines": [here, *(each for each in machines if each != here)],
         "points": {
-            name: {"axis": point.axis, "value": point.value, "shortest": shortest[name].tolist()}
+            name: {
+                "axis": point.axis,
+                "value": point.value,
+                "shortest": shortest[name].tolist(),
+                **({"kinds": kinds(tasks[name])} if name == WHOLE else {}),
+            }
             for name, point in drawn.items()
         },
         "pairs": {name: list(pair) for name, pair in pairs.items()},

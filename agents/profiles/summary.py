@@ -11,7 +11,7 @@ from agents.experiments.records import Record
 from agents.experiments.statistics import Spread
 from agents.profiles.mistakes import NEVER, SUBGOALS
 from agents.profiles.pushes import NO_PUSH
-from agents.profiles.tasks import BASE, GRADED, SWAPS
+from agents.profiles.tasks import BASE, GRADED, KINDS, SWAPS, WHOLE
 from trap_tube_jax.scoring.scores import wilson_interval
 
 BIN = 5  # steps, of the lengths of shortest plans
@@ -78,17 +78,30 @@ def on_axis(record: Record, policy: Record, axis: str) -> dict[float, Outcome]:
     return {value: outcome(record, policy, name) for value, name in named.items()}
 
 
-def by_length(record: Record, policy: Record, name: str = "layout 1") -> dict[float, Outcome]:
-    """The outcomes on a point's tasks by the length of the shortest plan, the mean of a bin."""
-    if name not in record["points"]:
+def by_length(record: Record, policy: Record) -> dict[float, Outcome]:
+    """The outcomes on {P} by the length of the shortest plan, the mean of a bin."""
+    if WHOLE not in record["points"]:
         return {}
-    shortest = np.array(record["points"][name]["shortest"])
-    steps = np.array(policy["steps"][name])
+    shortest = np.array(record["points"][WHOLE]["shortest"])
+    steps = np.array(policy["steps"][WHOLE])
     made = {}
     for start in sorted({length // BIN for length in shortest[shortest > 0].tolist()}):
         within = shortest // BIN == start
         made[float(shortest[within].mean())] = Outcome.of(steps[within], shortest[within])
     return made
+
+
+def by_kind(record: Record, policy: Record) -> dict[str, Outcome]:
+    """The outcomes on {P} by kind of task; see `tasks.kinds`."""
+    if WHOLE not in record["points"]:
+        return {}
+    point, steps = record["points"][WHOLE], np.array(policy["steps"][WHOLE])
+    shortest, known = np.array(point["shortest"]), np.array(point["kinds"])
+    return {
+        kind: Outcome.of(steps[known == kind], shortest[known == kind])
+        for kind in KINDS
+        if np.any(known == kind)
+    }
 
 
 def swapped(record: Record, policy: Record, whole: str = "") -> dict[str, Outcome]:

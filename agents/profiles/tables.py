@@ -31,6 +31,8 @@ def tables(record: Record) -> list[Table]:
     made.append(
         _outcomes(record, f"{{P}} by length of the shortest plan; {CELLS}", "steps", _by_length)
     )
+    heading = f"{{P}} by the way of the food, seen from the agent, and how the tool lies; {CELLS}"
+    made.append(_outcomes(record, heading, "kind", summary.by_kind))
     for whole, title in (("", "Base task"), ("both 1", "{P, St}")):
         heading = f"{title} by what the tool swaps its looks with, tool being no swap; {CELLS}"
         made.append(_outcomes(record, heading, "swap", _swapped(whole)))

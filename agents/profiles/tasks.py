@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import trap_tube_jax as tt
 from trap_tube_jax.controls import CONTROLS, trap_and_exit_exchanged
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import OBJECT_NAMES, TOOL
+from trap_tube_jax.objects import EXIT, OBJECT_NAMES, TOOL, TRAP
 from trap_tube_jax.scoring.tasks import fixed_tasks
 from trap_tube_jax.state import State
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS, Transfer, swap_with_tool
@@ -23,6 +24,9 @@ KEYS = "profile"
 BASE = "base"
 STRENGTHS = (0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 GRADED = ("colours", "layout", "both")
+WHOLE = "layout 1"  # the point of {P}
+WAYS, LIES = ("away", "sideways", "towards"), ("across", "along")
+KINDS = tuple(f"{way}, {lies}" for way in WAYS for lies in LIES)
 PARTS = (*GRADED, "swaps", "controls", "pairs")
 NEED_WHOLE = {"colours": (), "layout": ("pairs",), "both": ("pairs", "swaps")}  # strength 1
 SWAPS = {OBJECT_NAMES[code]: int(code) for code in SYMBOLIC_OBJECTS if code != TOOL}
@@ -43,6 +47,27 @@ class Point(NamedTuple):
     axis: str
     value: float | str
     tasks: State
+
+
+def kinds(tasks: State) -> list[str]:
+    """Which way the food leaves the tube in each of B tasks of {P}, and how the tool lies.
+
+    Returns:
+      Of each task first `away` from where the agent starts, `towards` it, or `sideways`; then
+      whether the tool lies `along` that way or `across` it.
+    """
+    board, extent = np.asarray(tasks.board), np.asarray(tasks.tool_extent)
+    found = []
+    for index, cells in enumerate(board):
+        trap, leaves = (np.argwhere(cells == code).mean(axis=0) for code in (TRAP, EXIT))
+        way = np.sign(leaves - trap)
+        offset = np.asarray(tasks.agent)[index] - (trap + leaves) / 2
+        ahead = offset @ way
+        beside = np.abs(offset).sum() - abs(ahead)
+        where = "sideways" if beside > abs(ahead) else "towards" if ahead > 0 else "away"
+        lies = "along" if extent[index] @ np.abs(way) > 1 else "across"
+        found.append(f"{where}, {lies}")
+    return found
 
 
 class Pair(NamedTuple):
