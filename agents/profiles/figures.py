@@ -164,7 +164,9 @@ def _draw_outcomes(
     x = list(outcomes)
     is_kinds = isinstance(x[0], str)
     if is_kinds:
-        solved.set_xticks(range(len(x)), [kind.replace(", ", "\n") for kind in x])
+        names = [kind.replace(", ", "\n") for kind in x]
+        for axis in (solved, optimal):
+            axis.set_xticks(range(len(x)), names, fontsize="x-small")
         x = [at + 0.14 * place for at in range(len(x))]
     style |= {"markersize": 4.5, "linewidth": 0 if is_kinds else 1.4, "elinewidth": 1, "capsize": 2}
     found = list(outcomes.values())
