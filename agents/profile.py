@@ -30,8 +30,8 @@ class Options:
     """Profiles trained agents: how success falls with the distance from the base task.
 
     Percent solved and optimality against the angle of the colours, the distance of the layout,
-    the length of the shortest plan, and by kind of symbolic swap; the controls of comparative
-    psychology; the paired test of the first push; and at which step and subgoal plans go wrong.
+    the length of the shortest plan, by the way that the food has to take, and by kind of symbolic
+    swap; the controls of comparative psychology; the paired test of the first push; and at which step and subgoal plans go wrong.
     All agents in one figure, and one more figure for each. Greedy play on tasks that training never
     draws, compared with exact shortest plans.
 
