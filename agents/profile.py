@@ -31,9 +31,9 @@ class Options:
 
     Percent solved and optimality against the angle of the colours, the distance of the layout,
     the length of the shortest plan, by the way that the food has to take, and by kind of symbolic
-    swap; the controls of comparative psychology; the paired test of the first push; and at which step and subgoal plans go wrong.
-    All agents in one figure, and one more figure for each. Greedy play on tasks that training never
-    draws, compared with exact shortest plans.
+    swap; the controls of comparative psychology; the paired test of the first push; and at which
+    step and subgoal plans go wrong. All agents in one figure, and one more figure for each.
+    Greedy play on tasks that training never draws, compared with exact shortest plans.
 
     Attributes:
       runs: folders of runs, or files of parameters; of a run its first seed.
