@@ -30,13 +30,13 @@ from agents.experiments.records import Record
 from agents.profiles.mistakes import SUBGOALS, Turns, subgoals, turns
 from agents.profiles.oracle import Oracle, replayed
 from agents.profiles.pushes import Push, first_push
-from agents.profiles.tasks import BASE, PAIRS, PARTS, STRENGTHS, SWAPS, WHOLE, kinds, points
+from agents.profiles.tasks import ALL_LAYOUTS, BASE, PAIRS, PARTS, STRENGTHS, SWAPS, kinds, points
 from agents.runs.machine import machine
 from trap_tube_jax.state import State
 
 SCHEMA = "trap-tube-jax profile 2"
 # The points whose episodes are looked into, and those that are in pairs, where the parts hold them.
-LOOKED_INTO = ("colours 1", "layout 1", "both 1", *(f"both 1, swap {name}" for name in SWAPS))
+LOOKED_INTO = ("colours 1", ALL_LAYOUTS, "both 1", *(f"both 1, swap {name}" for name in SWAPS))
 IN_PAIRS = {name for pair in PAIRS.values() for name in pair}
 
 Advance = Callable[[], None]
@@ -124,7 +124,7 @@ def profile(
                 "axis": point.axis,
                 "value": point.value,
                 "shortest": shortest[name].tolist(),
-                **({"kinds": kinds(tasks[name])} if name == WHOLE else {}),
+                **({"kinds": kinds(tasks[name])} if name == ALL_LAYOUTS else {}),
             }
             for name, point in drawn.items()
         },

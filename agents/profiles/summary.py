@@ -11,7 +11,7 @@ from agents.experiments.records import Record
 from agents.experiments.statistics import Spread
 from agents.profiles.mistakes import NEVER, SUBGOALS
 from agents.profiles.pushes import NO_PUSH
-from agents.profiles.tasks import BASE, GRADED, KINDS, SWAPS, WHOLE
+from agents.profiles.tasks import ALL_LAYOUTS, BASE, GRADED, KINDS, SWAPS
 from trap_tube_jax.scoring.scores import wilson_interval
 
 BIN = 5  # steps, of the lengths of shortest plans
@@ -27,7 +27,7 @@ TURNS = {
     "last_fell": "distance last fell",
     "lost": "goal out of reach",
 }
-LABELS = {"colours 1": "{St}", "layout 1": "{P}", "both 1": "{P, St}"}
+LABELS = {"colours 1": "{St}", ALL_LAYOUTS: "{P}", "both 1": "{P, St}"}
 
 
 class Outcome(NamedTuple):
@@ -80,10 +80,10 @@ def on_axis(record: Record, policy: Record, axis: str) -> dict[float, Outcome]:
 
 def by_length(record: Record, policy: Record) -> dict[float, Outcome]:
     """The outcomes on {P} by the length of the shortest plan, the mean of a bin."""
-    if WHOLE not in record["points"]:
+    if ALL_LAYOUTS not in record["points"]:
         return {}
-    shortest = np.array(record["points"][WHOLE]["shortest"])
-    steps = np.array(policy["steps"][WHOLE])
+    shortest = np.array(record["points"][ALL_LAYOUTS]["shortest"])
+    steps = np.array(policy["steps"][ALL_LAYOUTS])
     made = {}
     for start in sorted({length // BIN for length in shortest[shortest > 0].tolist()}):
         within = shortest // BIN == start
@@ -93,9 +93,9 @@ def by_length(record: Record, policy: Record) -> dict[float, Outcome]:
 
 def by_kind(record: Record, policy: Record) -> dict[str, Outcome]:
     """The outcomes on {P} by kind of task; see `tasks.kinds`."""
-    if WHOLE not in record["points"]:
+    if ALL_LAYOUTS not in record["points"]:
         return {}
-    point, steps = record["points"][WHOLE], np.array(policy["steps"][WHOLE])
+    point, steps = record["points"][ALL_LAYOUTS], np.array(policy["steps"][ALL_LAYOUTS])
     shortest, known = np.array(point["shortest"]), np.array(point["kinds"])
     return {
         kind: Outcome.of(steps[known == kind], shortest[known == kind])

@@ -24,7 +24,7 @@ KEYS = "profile"
 BASE = "base"
 STRENGTHS = (0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 GRADED = ("colours", "layout", "both")
-WHOLE = "layout 1"  # the point of {P}
+ALL_LAYOUTS = "layout 1"  # the point of {P}
 WAYS, LIES = ("away", "sideways", "towards"), ("across", "along")
 KINDS = tuple(f"{way}, {lies}" for way in WAYS for lies in LIES)
 PARTS = (*GRADED, "swaps", "controls", "pairs")
@@ -56,16 +56,16 @@ def kinds(tasks: State) -> list[str]:
       Of each task first `away` from where the agent starts, `towards` it, or `sideways`; then
       whether the tool lies `along` that way or `across` it.
     """
-    board, extent = np.asarray(tasks.board), np.asarray(tasks.tool_extent)
+    parts = map(np.asarray, (tasks.board, tasks.agent, tasks.tool_extent))
     found = []
-    for index, cells in enumerate(board):
+    for cells, agent, extent in zip(*parts, strict=True):
         trap, leaves = (np.argwhere(cells == code).mean(axis=0) for code in (TRAP, EXIT))
         way = np.sign(leaves - trap)
-        offset = np.asarray(tasks.agent)[index] - (trap + leaves) / 2
+        offset = agent - (trap + leaves) / 2
         ahead = offset @ way
         beside = np.abs(offset).sum() - abs(ahead)
         where = "sideways" if beside > abs(ahead) else "towards" if ahead > 0 else "away"
-        lies = "along" if extent[index] @ np.abs(way) > 1 else "across"
+        lies = "along" if extent @ np.abs(way) > 1 else "across"
         found.append(f"{where}, {lies}")
     return found
 
@@ -80,7 +80,7 @@ class Pair(NamedTuple):
 PAIRS = {
     "base": Pair(BASE, "control trap-exchanged"),
     "two traps": Pair("control two-traps", "control two-traps, other exit"),
-    "{P}": Pair("layout 1", "layout 1, exchanged"),
+    "{P}": Pair(ALL_LAYOUTS, f"{ALL_LAYOUTS}, exchanged"),
     "{P, St}": Pair("both 1", "both 1, exchanged"),
 }
 
@@ -114,7 +114,7 @@ def points(
     if wanted & {"controls", "pairs"}:
         made |= _controls(num_features)
     if "pairs" in wanted:
-        for name in ("layout 1", "both 1"):
+        for name in (ALL_LAYOUTS, "both 1"):
             twins = jax.vmap(trap_and_exit_exchanged)(made[name].tasks)
             made[f"{name}, exchanged"] = Point("twin", name, twins)
     return made
