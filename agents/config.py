@@ -117,6 +117,8 @@ class Config:
         and reward and no more.
       chunk: distinct observations that are encoded at once; changes speed, and results only by
         the order of float32 sums.
+      compile_quickly: whether a run's program compiles in half the time, for short runs on a CPU;
+        changes speed, and results only by rounding.
     """
 
     imports: tuple[str, ...] = _setting(())
@@ -168,6 +170,8 @@ class Config:
     embedding: int = _setting(8, 1, 65_536)
     recurrent: bool = _setting(True)
     chunk: int = _setting(64, 1)
+    # The machine.
+    compile_quickly: bool = _setting(False)
 
     def __post_init__(self) -> None:
         """Refuses settings that cannot be trained with.
@@ -307,6 +311,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "episodic_novelty": True,
         "intrinsic_scale": 0.3,
         "imitation_coef": 1.0,
+        "compile_quickly": True,
     },
     # Trained on {P, St, Sy}: new effects are paid, failed tasks played again, and the encoder
     # sees objects instead of colours, the food ahead.

@@ -12,7 +12,7 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets, scores
 from agents.acting.policy import Policy
 from agents.pretrained import load_shipped
-from agents.runs import compilation_cache, report
+from agents.runs import compilation, report
 from agents.runs.folder import write_json
 from agents.runs.loading import load_policies
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m agents.evaluate")
     if not options.no_cache:
-        compilation_cache.enable()
+        compilation.enable_cache()
     with plain_errors():
         evaluate(options)
 

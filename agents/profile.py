@@ -16,7 +16,7 @@ from agents.pretrained import load_shipped
 from agents.profiles import figures, tables
 from agents.profiles.measure import SCHEMA, Settings, profile
 from agents.profiles.tasks import PARTS, STRENGTHS
-from agents.runs import compilation_cache
+from agents.runs import compilation
 from agents.runs.folder import RunFolder, read_json
 from agents.runs.loading import load
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = tyro.cli(Options, args=arguments, prog=PROGRAM)
     if not options.no_cache:
-        compilation_cache.enable()
+        compilation.enable_cache()
     with plain_errors():
         run(options, arguments)
 

@@ -18,7 +18,7 @@ from agents.config import PRESETS, Config
 from agents.parallel import processes
 from agents.parallel.cores import become_devices
 from agents.parallel.sharding import Placement
-from agents.runs import compilation_cache
+from agents.runs import compilation
 from agents.runs.folder import Run, RunFolder, check_name
 from agents.runs.session import Session
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
@@ -147,7 +147,7 @@ def start(arguments: Sequence[str]) -> Session:
     options, folder, run = processes.from_first(lambda: open_run(selection, arguments))
     import_modules(run.config.imports)  # in the processes that were told of the run
     if not options.no_cache:
-        compilation_cache.enable()
+        compilation.enable_cache()
     session = Session(
         folder,
         run,

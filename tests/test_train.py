@@ -19,7 +19,7 @@ from rich.console import Console
 from agents import evaluate, train
 from agents.config import PRESETS, Config
 from agents.ppo.learner import Learner, make_train
-from agents.runs import compilation_cache
+from agents.runs import compilation
 from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, is_last, read_metrics
@@ -427,6 +427,6 @@ def test_no_iteration_begins_that_could_take_too_many_steps():
 
 def test_cache_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert compilation_cache.default_folder() == tmp_path / "trap_tube_jax" / "jax"
+    assert compilation.default_folder() == tmp_path / "trap_tube_jax" / "jax"
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert compilation_cache.default_folder() == Path.home() / ".cache" / "trap_tube_jax" / "jax"
+    assert compilation.default_folder() == Path.home() / ".cache" / "trap_tube_jax" / "jax"

@@ -18,7 +18,7 @@ from agents.config import PRESETS
 from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol, parse_setting
 from agents.parallel.cores import become_devices
-from agents.runs import compilation_cache
+from agents.runs import compilation
 from agents.runs.folder import check_name, read_json
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
@@ -165,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             options = tyro.cli(Options, args=arguments, prog=PROGRAM)
             become_devices(options.devices)
             if not options.no_cache:
-                compilation_cache.enable()
+                compilation.enable_cache()
             run(options, console, stop)
     except (KeyboardInterrupt, Stopped):
         again = f"{PROGRAM} {shlex.join(arguments)}"

@@ -16,6 +16,7 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, Evaluator, play_greedily
 from agents.config import Config
 from agents.ppo.learner import TrainState, make_train
+from agents.runs.compilation import compiled
 from agents.runs.report import FEW_LAYOUTS, NOTHING
 from trap_tube_jax import solver
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
@@ -232,7 +233,7 @@ def compile_pay(config: Config, state: TrainState, evaluator: Evaluator) -> Pay:
 
     shown = EPISODES_OF_A_SET * len(evaluator.tasks)
     tasks = jax.tree.map(lambda x: jax.ShapeDtypeStruct((shown, *x.shape), x.dtype), env.base)
-    return jax.jit(paid).lower(state, tasks).compile()
+    return compiled(jax.jit(paid).lower(state, tasks), config)
 
 
 def _episodes(

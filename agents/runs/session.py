@@ -22,6 +22,7 @@ from agents.parallel.sharding import DEFAULT_DEVICE, Placement
 from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
+from agents.runs.compilation import compiled
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.metrics import MetricsLog, Row, read_metrics
 from agents.runs.progress import Progress
@@ -98,7 +99,7 @@ class Session:
 
         Args:
           stop: tells when to stop early.
-          then_finish: `finish` will follow; what it needs compiles as training goes.
+          then_finish: `finish` will follow; what it needs compiles from the second iteration on.
 
         Raises:
           Stopped: on request; everything is saved.
@@ -107,13 +108,13 @@ class Session:
         if not self._progress.active.any():
             return
         advance = self._compile()
-        if then_finish:
-            self._prepare_results()
         live = report.LiveReport(self.console, self.run.config.iterations, self.run.seeds)
         with stop, live:
             while self._progress.active.any():
                 rows = self._iterate(advance)
                 live.update(rows, sum(first is not None for first in self._progress.solved))
+                if then_finish and self._results is None:
+                    self._prepare_results()
                 # A signal may arrive at any time: what counts is what all agreed on here.
                 request = processes.agree(stop.received)
                 is_over = not self._progress.active.any()
@@ -200,7 +201,8 @@ class Session:
         found = processes.from_first(stored)
         if found is not None:
             return from_arrays(found[0], template), found[1]
-        return init(keys), Progress.start(self.run)
+        begin = compiled(init.lower(keys), self.run.config)
+        return begin(keys), Progress.start(self.run)
 
     def _compile(self) -> Any:
         started = time.perf_counter()
@@ -211,13 +213,13 @@ class Session:
         active = np.ones(self.run.seeds, bool)
         per_device = make_advance(self._train, self._placement.local_seeds(self.run.seeds))
         advance = jax.jit(self._placement.shard(per_device), donate_argnums=0)
-        compiled = advance.lower(self._state, active).compile()
+        program = compiled(advance.lower(self._state, active), self.run.config)
         seconds = time.perf_counter() - started
         self._progress = self._progress._replace(
             compile_seconds=self._progress.compile_seconds + seconds
         )
         self.console.print(f"Compiled in {seconds:.1f} s.")
-        return compiled
+        return program
 
     def _prepare_results(self) -> None:
         """Compiles in the background what `finish` needs."""

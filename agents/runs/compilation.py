@@ -1,9 +1,17 @@
-"""The persistent compilation cache of the command lines."""
+"""How programs are compiled: kept from one process to the next, or quickly."""
 
 import os
 from pathlib import Path
 
 import jax
+
+from agents.config import Config
+
+# Leaves out XLA's newer code generator for fused loops, and what LLVM takes longest for.
+QUICKLY: dict[str, bool | str] = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_llvm_disable_expensive_passes": True,
+}
 
 
 def default_folder() -> Path:
@@ -12,7 +20,7 @@ def default_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "trap_tube_jax" / "jax"
 
 
-def enable(folder: Path | None = None) -> None:
+def enable_cache(folder: Path | None = None) -> None:
     """Keeps compiled programs from one process to the next.
 
     Args:
@@ -24,3 +32,16 @@ def enable(folder: Path | None = None) -> None:
     # By default only what took over a second is kept; a run compiles many smaller programs.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def compiled(lowered: jax.stages.Lowered, config: Config) -> jax.stages.Compiled:
+    """The program, compiled as `config.compile_quickly` says.
+
+    An XLA that does not know the options for it compiles as usual.
+    """
+    if config.compile_quickly:
+        try:
+            return lowered.compile(QUICKLY)
+        except jax.errors.JaxRuntimeError:
+            pass
+    return lowered.compile()
