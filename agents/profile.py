@@ -15,7 +15,6 @@ from agents.experiments.records import check_clean, read_record, write_record
 from agents.pretrained import load_shipped
 from agents.profiles import figures, tables
 from agents.profiles.measure import SCHEMA, Settings, profile
-from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation
 from agents.runs.folder import RunFolder, read_json
 from agents.runs.loading import load
@@ -26,7 +25,7 @@ PROGRAM = "python -m agents.profile"
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Settings):
     """Profiles trained agents: how success falls with the distance from the base task.
 
     Percent solved and optimality against the angle of the colours, the distance of the layout,
@@ -40,11 +39,6 @@ class Options:
       pretrained: names of shipped parameters.
       imports: modules of your own to import first, for what the agents' settings name; those of
         the runs are known.
-      parts: what to measure: some of colours, layout, both, swaps, controls, pairs.
-      strengths: how far colours and layouts are changed: above 0, the base task, to 1, the
-        paper's transfers.
-      tasks: of every point.
-      episodes: of how many of a point's episodes to find out where they go wrong.
       out: the folder of record, tables and figures.
       record: also write the record to this file; refused unless all is of committed code.
       commit: the commit to note where git does not tell it.
@@ -56,10 +50,6 @@ class Options:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     pretrained: tuple[str, ...] = ()
     imports: Imports = ()
-    parts: tuple[str, ...] = PARTS
-    strengths: tuple[float, ...] = STRENGTHS
-    tasks: int = Settings.tasks
-    episodes: int = Settings.episodes
     out: Path = Path("runs/profile")
     record: Path | None = None
     commit: str | None = None
@@ -120,23 +110,17 @@ def run(options: Options, arguments: Sequence[str]) -> None:
     import_modules(options.imports)
     drawn = None if options.draw is None else read_record(options.draw, SCHEMA)
     if options.record is not None:  # before measuring, which would be in vain
-        known = {"machines": options.machines()} if drawn is None else drawn
-        check_clean(known, options.commit)
-    if drawn is None:
-        settings = Settings(options.parts, options.strengths, options.tasks, options.episodes)
-        found = profile(
-            options.policies(),
-            settings,
-            console,
-            command=f"{PROGRAM} {shlex.join(without_places(arguments))}",
-            machines=options.machines(),
-            commit=options.commit,
-        )
-    else:
-        found = drawn
+        check_clean(drawn or {"machines": options.machines()}, options.commit)
+    found = drawn or profile(
+        options.policies(),
+        options,
+        console,
+        command=f"{PROGRAM} {shlex.join(without_places(arguments))}",
+        machines=options.machines(),
+        commit=options.commit,
+    )
     for table in tables.tables(found):
         console.print(table.to_rich())
-    options.out.mkdir(parents=True, exist_ok=True)
     write_record(options.out / "profile.json", found)
     (options.out / "tables.md").write_text(f"# Profile\n\n{tables.markdown(found)}\n")
     for name, save in figures.drawings(found, "profile").items():

@@ -52,16 +52,7 @@ def subject(task_set: str, *, plain: bool = False) -> harness.Subject:
     else:
         vector = VectorEnvironment(env)
         reset, step = vector.reset, vector.step
-
-    def observed_reset(keys):
-        state, timestep = reset(keys)
-        return state, timestep.observation
-
-    def observed_step(state, actions):
-        state, timestep = step(state, actions)
-        return state, timestep.observation
-
-    return harness.Subject(task_set, observed_reset, observed_step, sample_actions)
+    return harness.Subject(task_set, reset, step, sample_actions, lambda each: each.observation)
 
 
 def sample_actions(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:

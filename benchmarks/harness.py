@@ -1,7 +1,6 @@
 """What all benchmarks share: the machine's description, timing, and results as JSON."""
 
 import dataclasses
-import json
 import pathlib
 import statistics
 import time
@@ -11,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from agents.experiments.records import write_record
 from agents.runs.machine import machine
 
 
@@ -37,15 +37,17 @@ class Subject:
 
     Attributes:
       name: what the tables call it.
-      reset: keys [B] -> (state, observations [B, ...]).
-      step: (state, actions [B, ...]) -> (state, observations [B, ...]), with auto-reset.
+      reset: keys [B] -> (state, timestep).
+      step: (state, actions [B, ...]) -> (state, timestep), with auto-reset.
       sample_actions: (key, shape) -> actions [*shape, ...].
+      observe: timestep -> observations [B, ...]; the timestep itself if absent.
     """
 
     name: str
-    reset: Callable[[jax.Array], tuple[Any, jax.Array]]
-    step: Callable[[Any, jax.Array], tuple[Any, jax.Array]]
+    reset: Callable[[jax.Array], tuple[Any, Any]]
+    step: Callable[[Any, jax.Array], tuple[Any, Any]]
     sample_actions: Callable[[jax.Array, tuple[int, ...]], jax.Array]
+    observe: Callable[[Any], jax.Array] = lambda timestep: timestep
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,14 +113,15 @@ def measure_throughput(
     own_envs = num_envs // devices
 
     def reset(keys):
-        state, observation = subject.reset(keys)
+        state, timestep = subject.reset(keys)
+        observation = subject.observe(timestep)
         return state, jnp.zeros_like(_bits(observation)), observation
 
     def run(carry, actions):
         def step(carry, actions):
             state, folded = carry
-            state, observation = subject.step(state, actions)
-            return (state, folded ^ _bits(observation)), None
+            state, timestep = subject.step(state, actions)
+            return (state, folded ^ _bits(subject.observe(timestep))), None
 
         return jax.lax.scan(step, carry, actions)[0]
 
@@ -177,16 +180,14 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) ->
     return passes * num_bytes / measure(lambda: rewrite(source), repeats).median_s
 
 
-def write_json(path: str | pathlib.Path, results: Sequence[Any], **extra: Any) -> None:
+def write_json(path: pathlib.Path, results: Sequence[Any], **extra: Any) -> None:
     """Writes the machine, `extra` and a list of dataclass results to `path`."""
     record = {
         "machine": machine(),
         **extra,
         "results": [dataclasses.asdict(result) for result in results],
     }
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=2) + "\n")
+    write_record(path, record)
 
 
 def _bits(observation: jax.Array) -> jax.Array:

@@ -131,16 +131,10 @@ def jumanji_snake() -> harness.Subject:
     )
 
     env: Any = AutoResetWrapper(jumanji.make("Snake-v1"))
-
-    def reset(keys):
-        state, timestep = jax.vmap(env.reset)(keys)
-        return state, timestep.observation.grid
-
-    def step(state, actions):
-        state, timestep = jax.vmap(env.step)(state, actions)
-        return state, timestep.observation.grid
-
-    return harness.Subject("Jumanji Snake", reset, step, _actions(4))
+    reset, step = jax.vmap(env.reset), jax.vmap(env.step)
+    return harness.Subject(
+        "Jumanji Snake", reset, step, _actions(4), lambda each: each.observation.grid
+    )
 
 
 PEERS: tuple[tuple[str, Callable[[], harness.Subject]], ...] = (

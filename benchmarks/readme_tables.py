@@ -8,10 +8,9 @@ figure whose record is not there is left as it is.
 """
 
 import dataclasses
-import functools
 import re
-import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -19,12 +18,18 @@ import tyro
 import agents.profiles.figures
 import agents.profiles.tables
 from agents.experiments import figures, tables
-from agents.experiments.records import SCHEMA, Record, is_record, read_record
+from agents.experiments.records import SCHEMA, Record, read_record
 from agents.profiles import measure
-from trap_tube_jax.command_line import Flag
+from agents.runs.folder import read_json
+from trap_tube_jax.command_line import Flag, plain_errors
 
 ROOT = Path(__file__).parent.parent
 PAGES = ("*.md", "agents/**/*.md", "benchmarks/**/*.md", "trap_tube_jax/**/*.md")
+# By schema, what makes the tables and what draws the figures of a record.
+KINDS = {
+    SCHEMA: (tables, figures),
+    measure.SCHEMA: (agents.profiles.tables, agents.profiles.figures),
+}
 BLOCK = re.compile(r"(?P<start><!-- table: (?P<name>\S+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
 
 
@@ -54,8 +59,8 @@ def read_records(results: Path) -> dict[str, Record]:
     Raises:
       ValueError: a record is of another schema than this version's.
     """
-    paths = [path for path in sorted(results.glob("*.json")) if is_record(path)]
-    return {path.stem: read_record(path, SCHEMA, measure.SCHEMA) for path in paths}
+    paths = [path for path in sorted(results.glob("*.json")) if "schema" in read_json(path)]
+    return {path.stem: read_record(path, *KINDS) for path in paths}
 
 
 def generate(text: str, records: dict[str, Record]) -> str:
@@ -65,8 +70,8 @@ def generate(text: str, records: dict[str, Record]) -> str:
         record = records.get(match["name"])
         if record is None:
             return match[0]
-        markdown = agents.profiles.tables.markdown if _is_profile(record) else tables.markdown
-        return f"{match['start']}\n{markdown(record)}\n\n{match['end']}"
+        own_tables, _ = KINDS[record["schema"]]
+        return f"{match['start']}\n{own_tables.markdown(record)}\n\n{match['end']}"
 
     return BLOCK.sub(fill, text)
 
@@ -78,22 +83,20 @@ def stale(root: Path, records: dict[str, Record]) -> dict[Path, Callable[[], obj
         text = path.read_text()
         made = generate(text, records)
         if made != text:
-            found[path] = lambda path=path, made=made: path.write_text(made)
+            found[path] = partial(path.write_text, made)
     for name, record in records.items():
-        for file, draw in _drawings(record, name).items():
+        _, own_figures = KINDS[record["schema"]]
+        for file, draw in own_figures.drawings(record, name).items():
             path = root / "benchmarks" / "results" / "figures" / file
-            if figures.drawn_from(path) != _digest(record):
-                found[path] = lambda path=path, draw=draw: _draw(draw, path)
+            if figures.drawn_from(path) != figures.digest(record):
+                found[path] = partial(draw, path)
     return found
 
 
 def main(arguments: Arguments) -> None:
     """Compares, writes if asked to, and exits with 1 if it finds what is out of date."""
-    try:
+    with plain_errors():
         records = read_records(arguments.results)
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
     found = stale(arguments.root, records)
     for path, rewrite in found.items():
         if arguments.write:
@@ -103,27 +106,6 @@ def main(arguments: Arguments) -> None:
     if found and not arguments.write:
         print("give --write to bring these files up to date")
         raise SystemExit(1)
-
-
-def _is_profile(record: Record) -> bool:
-    return record["schema"] == measure.SCHEMA
-
-
-def _drawings(record: Record, name: str) -> dict[str, Callable[[Path], None]]:
-    """What draws each figure of a record, by the name of its file."""
-    if _is_profile(record):
-        return agents.profiles.figures.drawings(record, name)
-    return {f"{name}.png": functools.partial(figures.save, record)}
-
-
-def _digest(record: Record) -> str:
-    module = agents.profiles.figures if _is_profile(record) else figures
-    return module.digest(record)
-
-
-def _draw(draw: Callable[[Path], None], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draw(path)
 
 
 if __name__ == "__main__":

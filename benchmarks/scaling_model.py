@@ -26,6 +26,7 @@ import tyro
 
 from agents.acting.rollout import sample_action
 from agents.config import PRESETS, Config
+from agents.experiments.tables import Table, _number
 from agents.networks.actions import ActionDistribution
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
@@ -209,27 +210,22 @@ def exchange_seconds(
 
 def exchange_table(found: Sequence[Exchange]) -> str:
     """The collectives, in Markdown."""
-    lines = [
-        "| operation | times per iteration | bytes each | bytes per iteration |",
-        "|---|---|---|---|",
+    heads = ("operation", "times per iteration", "bytes each", "bytes per iteration")
+    rows = [
+        (each.kind, f"{each.calls:,}", f"{each.bytes:,}", f"{each.bytes * each.calls:,}")
+        for each in found
     ]
-    for exchange in found:
-        total = exchange.bytes * exchange.calls
-        lines.append(f"| {exchange.kind} | {exchange.calls:,} | {exchange.bytes:,} | {total:,} |")
-    return "\n".join(lines)
+    return Table("", heads, tuple(rows)).to_markdown()
 
 
 def speed_up_table(rows: Sequence[dict[str, float | int | None]]) -> str:
     """The model, in Markdown."""
+    heads = ("devices", "own share, s", "repeated, s", "exchange, s", "speed-up, one seed")
     names = ("share_s", "repeated_s", "exchange_s", "one_seed", "all_seeds")
-    head = ["devices", "own share, s", "repeated, s", "exchange, s", "speed-up, one seed"]
-    lines = [f"| {' | '.join(head)} | speed-up, {SEEDS} seeds |", "|---" * 6 + "|"]
-    for row in rows:
-        cells = [f"{row['devices']:,}"]
-        values = [row.get(name) for name in names]
-        cells += ["–" if value is None else f"{value:.3g}" for value in values]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    cells = [
+        (f"{row['devices']:,}", *(_number(row.get(name), ".3g") for name in names)) for row in rows
+    ]
+    return Table("", (*heads, f"speed-up, {SEEDS} seeds"), tuple(cells)).to_markdown()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

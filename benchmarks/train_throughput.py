@@ -23,13 +23,13 @@ from agents import Config, make_train
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import take
 from agents.acting.rollout import Trajectory
-from agents.config import PRESETS
 from agents.curiosity import Experience
 from agents.networks.agent import Params
 from agents.networks.windows import encode_rows
 from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
+from trap_tube_jax.command_line import plain_errors
 
 MATRIX = 4096
 
@@ -51,11 +51,6 @@ class Arguments:
     warm: int = 0
     repeats: int = 3
     json: pathlib.Path | None = None
-
-    def __post_init__(self) -> None:
-        """Refuses unknown presets."""
-        if self.preset not in PRESETS:
-            raise ValueError(f"unknown preset {self.preset!r}; allowed: {', '.join(PRESETS)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,4 +301,5 @@ def main(arguments: Arguments) -> list[Part]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    with plain_errors():
+        main(tyro.cli(Arguments, description=__doc__))

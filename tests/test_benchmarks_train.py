@@ -56,8 +56,3 @@ def test_points_are_drawn(tmp_path):
     path = tmp_path / "folder" / "scaling.png"
     scaling.save_figure(points, path)
     assert path.read_bytes().startswith(b"\x89PNG")
-
-
-def test_unknown_presets_are_refused():
-    with pytest.raises(ValueError, match="unknown preset 'slow'; allowed: paper, fast"):
-        train_throughput.Arguments(preset="slow")

@@ -10,7 +10,7 @@ import pytest
 
 import trap_tube_jax as tt
 from trap_tube_jax.controls import CONTROLS, drawn_from
-from trap_tube_jax.solver.pictures import replay
+from trap_tube_jax.solver.search import replay
 
 PAGE = pathlib.Path(tt.__file__).parent / "controls.md"
 DIRECTIONS = {(0, 1): "right", (0, -1): "left", (1, 0): "down", (-1, 0): "up"}

@@ -212,7 +212,7 @@ def test_the_record_says_how_good_the_best_evaluation_is(whole, record):
     assert record["machines"][trial["machines"][0]]["jax"] == jax.__version__
     assert (trial["best"]["iteration"], trial["best"]["selected_percent"]) == (4, 75)
     assert trial["best"]["steps"] == STEPS[0, 4]
-    scores = statistics.seed_scores(record, entry, trial)
+    scores = statistics.seed_scores(record, trial)
     base, p = scores["base"], scores["p"]
     assert (base.percent, base.interval, str(base.layouts)) == (100, None, "1 of 1")
     assert (p.percent, p.mean_steps, p.layouts) == (50, 2.5, None)
@@ -335,10 +335,10 @@ def test_a_folder_holds_one_experiment(capsys, whole):
 
 def test_runs_with_a_cooldown_are_not_extended(tmp_path):
     short = Protocol(algorithms=("ppo",), seeds=1, settings={"cooldown": 0.5}, iterations=4)
-    training.plan(tmp_path, short, side_by_side=False)
+    training.plan_runs(tmp_path, {"ppo": short.config("ppo")}, short.preset, range(1))
     longer = dataclasses.replace(short, iterations=8)
     with pytest.raises(ValueError, match=r"ppo-seed0: the run has cooldown=0.5 and iterations=4"):
-        training.plan(tmp_path, longer, side_by_side=False)
+        training.plan_runs(tmp_path, {"ppo": longer.config("ppo")}, longer.preset, range(1))
 
 
 def test_the_best_parameters_of_the_last_checkpoint_outlive_a_kill(tmp_path, monkeypatch):

@@ -16,10 +16,18 @@ from agents.config import Config
 from agents.experiments import figures as experiment_figures
 from agents.experiments import records
 from agents.networks.agent import Agent
-from agents.profiles import figures, measure, mistakes, summary, tables
-from agents.profiles.mistakes import NEVER, Turns, subgoals, turns, walks_to_food
+from agents.profiles import measure, mistakes, summary, tables
+from agents.profiles.mistakes import (
+    NEVER,
+    NO_PUSH,
+    Push,
+    Turns,
+    first_push,
+    subgoals,
+    turns,
+    walks_to_food,
+)
 from agents.profiles.oracle import LOST, Oracle, replayed
-from agents.profiles.pushes import NO_PUSH, Push, first_push
 from agents.profiles.tasks import STRENGTHS, kinds, points
 from benchmarks import readme_tables
 from trap_tube_jax.controls import trap_and_exit_exchanged, trap_exchanged
@@ -296,7 +304,7 @@ def test_a_profile_from_end_to_end(tiny, tmp_path, capsys):
     assert files == {"profile.json", "tables.md", "profile.png", "profile_mine.png"}
     for file in ("profile.png", "profile_mine.png"):
         drawn_from = experiment_figures.drawn_from(tmp_path / "out" / file)
-        assert drawn_from == figures.digest(tiny)
+        assert drawn_from == experiment_figures.digest(tiny)
     text = (tmp_path / "out" / "tables.md").read_text()
     assert "| trap-turned | 11 |" in text
     assert "| {P, St}, mine | 2 |" in text

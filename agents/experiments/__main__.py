@@ -129,13 +129,6 @@ class Options:
         name = "-".join([*parts, *(["quick"] if self.quick else [])])
         return self.out / (self.name or name)
 
-    @property
-    def resources(self) -> training.Resources:
-        """How runs are trained."""
-        return training.Resources(
-            self.side_by_side, self.devices, self.checkpoint_every, self.commit
-        )
-
     def given(self) -> dict[str, Any]:
         """The options that were given, by their names in the protocol.
 
@@ -190,7 +183,16 @@ def run(options: Options, console: Console, stop: StopSignals) -> None:
         root, experiment, options.defaults, options.given(), create=create
     )
     if create:
-        training.train_all(root, protocol, options.resources, console, stop)
+        training.train_all(
+            root,
+            protocol,
+            console,
+            stop,
+            side_by_side=options.side_by_side,
+            devices=options.devices,
+            checkpoint_every=options.checkpoint_every,
+            commit=options.commit,
+        )
     record = reporting.make_record(
         root, experiment, protocol, console, optimality=not options.no_optimality
     )

@@ -7,6 +7,7 @@ import hashlib
 import json
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from agents.experiments import tables
 from agents.experiments.records import Record, rows_of
 from agents.runs.metrics import Row
+from agents.runs.report import over_episodes
 from agents.runs.tracking import OVERALL, PREFIX
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
@@ -37,20 +39,24 @@ def save(record: Record, path: Path) -> None:
         for entry in record["algorithms"]
     }
     draw = save_rewards if record["experiment"] == "exp1" else _save_success
-    draw(curves, path, tables.title(record), {DIGEST: digest(record)})
+    draw(curves, path, tables.title(record), record)
+
+
+def drawings(record: Record, name: str) -> dict[str, Callable[[Path], None]]:
+    """What draws each figure of a record, by the name of its file."""
+    return {f"{name}.png": partial(save, record)}
+
+
+def write(figure: Any, path: Path, record: Record | None) -> None:
+    """Writes a figure as PNG, which carries the digest of the record that it shows."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {} if record is None else {DIGEST: digest(record)}
+    figure.savefig(path, format="png", dpi=DPI, metadata=metadata)
 
 
 def digest(record: Record) -> str:
-    """A SHA-256 of all that a figure shows."""
-    shown = [
-        record["experiment"],
-        tables.title(record),
-        [
-            [tables.algorithm_label(record, entry), [run["curves"] for run in entry["runs"]]]
-            for entry in record["algorithms"]
-        ],
-    ]
-    return hashlib.sha256(json.dumps(shown, sort_keys=True).encode()).hexdigest()
+    """A SHA-256 of a record."""
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def drawn_from(path: Path) -> str | None:
@@ -63,15 +69,13 @@ def drawn_from(path: Path) -> str | None:
         return picture.info.get(DIGEST)
 
 
-def save_rewards(
-    curves: Curves, path: Path, title: str, metadata: Mapping[str, str] | None = None
-) -> None:
+def save_rewards(curves: Curves, path: Path, title: str, record: Record | None = None) -> None:
     """As in experiment 1: training and evaluation reward over episodes, a thin line per seed."""
     panels = {"training reward": "success", "greedy evaluation reward": "evaluation"}
-    _save(curves, panels, path, title, metadata or {}, columns=2, draw=_draw_seeds)
+    _save(curves, panels, path, title, record, columns=2, draw=_draw_seeds)
 
 
-def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str, str]) -> None:
+def _save_success(curves: Curves, path: Path, title: str, record: Record) -> None:
     """Experiment 2: mean ± sd and maximum over seeds, of training and of every set.
 
     Of many algorithms the mean alone: spreads would cover each other.
@@ -85,9 +89,9 @@ def _save_success(curves: Curves, path: Path, title: str, metadata: Mapping[str,
         panels["overall"] = OVERALL
     is_few = len(curves) <= MOST_SHADED
     title += ": mean, ± sd, maximum (dotted)" if is_few else ": mean over seeds"
-    draw = _draw_spread if is_few else _draw_mean
+    draw = partial(_draw_spread, shaded=is_few)
     shown = {name: smoothed(rows) for name, rows in curves.items()}
-    _save(shown, panels, path, title, metadata, columns=5, draw=draw)
+    _save(shown, panels, path, title, record, columns=5, draw=draw)
 
 
 def smoothed(rows: Sequence[Row]) -> list[Row]:
@@ -102,7 +106,7 @@ def smoothed(rows: Sequence[Row]) -> list[Row]:
     return made
 
 
-def by_iteration(rows: Sequence[Row], metric: str) -> tuple[np.ndarray, np.ndarray]:
+def by_episodes(rows: Sequence[Row], metric: str) -> tuple[np.ndarray, np.ndarray]:
     """The episodes f64[n] and the values f64[S, n] of a metric; iterations without it left out.
 
     Seeds that have not come as far are NaN.
@@ -121,35 +125,20 @@ def _save(
     panels: Mapping[str, str],
     path: Path,
     title: str,
-    metadata: Mapping[str, str],
+    record: Record | None,
     *,
     columns: int,
     draw: Callable[..., None],
 ) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
-    from matplotlib.ticker import EngFormatter, MaxNLocator  # noqa: PLC0415
-
     columns = min(columns, len(panels))
-    height = -(-len(panels) // columns)
-    size = (max(WIDTH * columns, 2 * WIDTH), HEIGHT * height + 0.6)
-    figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(title)
-    axes = figure.subplots(height, columns, sharex=True, sharey=True, squeeze=False)
-    for axis in axes.flat[len(panels) :]:
-        axis.remove()
-    for axis, (name, metric) in zip(axes.flat, panels.items(), strict=False):
+    figure, axes = over_episodes([*panels], columns, (WIDTH, HEIGHT), title, sharey=True)
+    for axis, metric in zip(axes, panels.values(), strict=True):
         for index, (algorithm, rows) in enumerate(curves.items()):
-            draw(axis, *by_iteration(rows, metric), color=f"C{index}", label=algorithm)
-        axis.set_title(name, loc="left", fontsize="medium")
+            draw(axis, *by_episodes(rows, metric), color=f"C{index}", label=algorithm)
         axis.set_ylim(-0.03, 1.03)
-        axis.grid(alpha=0.3)
-    for axis in axes[-1]:
-        axis.set_xlabel("episodes")
-        axis.xaxis.set_major_locator(MaxNLocator(5))
-        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-    lines, names = axes[0, 0].get_legend_handles_labels()
+    lines, names = axes[0].get_legend_handles_labels()
     figure.legend(lines, names, loc="outside lower center", ncols=len(names), fontsize="small")
-    figure.savefig(path, format="png", dpi=DPI, metadata=dict(metadata))
+    write(figure, path, record)
 
 
 def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
@@ -169,18 +158,15 @@ def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: An
             label = None
 
 
-def _draw_mean(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
-    shared, complete = _of_all_seeds(episodes, values)
-    axis.plot(shared, np.mean(complete, axis=0), linewidth=1.4, **style)
-
-
-def _draw_spread(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:
-    """Mean as a line, one deviation on either side as a band, maximum dotted."""
+def _draw_spread(
+    axis: Any, episodes: np.ndarray, values: np.ndarray, *, shaded: bool, **style: Any
+) -> None:
+    """Mean as a line; if shaded one deviation on either side as a band, maximum dotted."""
     color = style["color"]
     shared, complete = _of_all_seeds(episodes, values)
     mean = np.mean(complete, axis=0)
     axis.plot(shared, mean, linewidth=1.6, **style)
-    if len(values) > 1:
+    if shaded and len(values) > 1:
         deviation = np.std(complete, axis=0, ddof=1)
         axis.fill_between(
             shared, mean - deviation, mean + deviation, color=color, alpha=0.2, linewidth=0

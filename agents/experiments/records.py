@@ -62,7 +62,7 @@ def seed_record(
     (solved,) = first_solved(rows, [seed], config.stop_when_solved)
     summary = read_json(entry.folder.summary) or {}
     used = read_json(entry.folder.machines) or []
-    machines.extend(entry for entry in used if entry not in machines)
+    machines.extend(each for each in used if each not in machines)
     best = best_row(rows)
     return {
         "seed": seed,
@@ -73,7 +73,7 @@ def seed_record(
         "transitions": int(last["transitions"]),
         "training_seconds": round(float(last["seconds"]), 1),
         "compile_seconds": summary.get("compile_seconds"),
-        "machines": [machines.index(entry) for entry in used],
+        "machines": [machines.index(each) for each in used],
         "first_solved": solved and dataclasses.asdict(solved),
         "best": None if best is None else _best(best, steps),
         "curves": curves(rows, config.iterations, evaluate_every),
@@ -105,7 +105,7 @@ def curves(
       evaluate_every: iterations from one evaluation on all sets to the next.
 
     Returns:
-      `training`, of every iteration, and `greedy`, of the evaluations on all sets.
+      `training`: of training; `greedy`: of the evaluations on all sets; both thinned.
     """
     evaluated = _evaluated(rows)
     names = [name for name in (evaluated or rows)[0] if name.startswith(PREFIX)]
@@ -178,12 +178,6 @@ def read_record(path: Path, *schemas: str) -> Record:
         allowed = ", ".join(map(repr, schemas))
         raise ValueError(f"{path} is of schema {record['schema']!r}; allowed: {allowed}")
     return record
-
-
-def is_record(path: Path) -> bool:
-    """Whether a file says that it is a record, of whatever schema."""
-    values = read_json(path)
-    return isinstance(values, dict) and "schema" in values
 
 
 def _evaluated(rows: Sequence[Row]) -> list[Row]:

@@ -3,7 +3,9 @@
 Source: paper Tables 1 and 2.
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from statistics import fmean
 from typing import NamedTuple
 
 from rich.table import Table as RichTable
@@ -16,19 +18,8 @@ from agents.runs.report import FEW_LAYOUTS, NOTHING, TABLE_STYLE, duration
 from trap_tube_jax.scoring.scores import Layouts
 from trap_tube_jax.scoring.tasks import label
 
-
-class PaperSolved(NamedTuple):
-    """A row of the paper's Table 1: trials that solved the task, and episodes to solve it."""
-
-    solved: int
-    trials: int
-    episodes: Spread | None
-
-
-PAPER_SOLVED = {
-    "ppo": PaperSolved(0, 5, None),
-    "ppo+icm": PaperSolved(5, 5, Spread(102_000, 60_000)),
-}
+# Table 1: trials that solved the task, and episodes to solve it.
+PAPER_SOLVED = {"ppo": ("0 / 5", None), "ppo+icm": ("5 / 5", Spread(102_000, 60_000))}
 
 # Table 2: percent of tasks solved.
 PAPER_PERCENT: dict[str, dict[str, Spread]] = {
@@ -109,20 +100,15 @@ def tables(record: Record) -> list[Table]:
 
 def title(record: Record) -> str:
     """What a record is of, for the head of a page or figure."""
-    what = f"Train on {label(train_set(record))}"
+    what = f"Train on {label(record['protocol']['train_set'])}"
     if is_of_paper(record):
         what = TITLES[record["experiment"]]
     return f"{what}, preset {record['protocol']['preset']}"
 
 
-def train_set(record: Record) -> str:
-    """The short name of the set that was trained on; records of earlier versions do not say."""
-    return record["protocol"].get("train_set", PROTOCOLS[record["experiment"]].train_set)
-
-
 def is_of_paper(record: Record) -> bool:
     """Whether a record is of what the paper trained on, so that its numbers stand beside it."""
-    return train_set(record) == PROTOCOLS[record["experiment"]].train_set
+    return record["protocol"]["train_set"] == PROTOCOLS[record["experiment"]].train_set
 
 
 def solved_table(record: Record) -> Table:
@@ -132,11 +118,10 @@ def solved_table(record: Record) -> Table:
         episodes = statistics.episodes_to_solve(entry)
         trials = f"{len(episodes)} / {len(entry['runs'])}"
         rows.append((algorithm_label(record, entry), trials, _spread(Spread.of(episodes), ",.0f")))
-    for name, paper in PAPER_SOLVED.items() if is_of_paper(record) else ():
-        trials = f"{paper.solved} / {paper.trials}"
-        rows.append((f"{LABELS[name]}, paper", trials, _spread(paper.episodes, ",.0f")))
+    for name, (trials, paper) in PAPER_SOLVED.items() if is_of_paper(record) else ():
+        rows.append((f"{LABELS[name]}, paper", trials, _spread(paper, ",.0f")))
     heads = ("algorithm", "trials solved", "episodes to solve")
-    what = "Base task" if is_of_paper(record) else label(train_set(record))
+    what = "Base task" if is_of_paper(record) else label(record["protocol"]["train_set"])
     return Table(f"{what} solved; episodes to solve it, {SPREAD}", heads, tuple(rows))
 
 
@@ -147,14 +132,12 @@ def percent_table(record: Record) -> Table:
     share of such tasks stands beside theirs. Many algorithms are rows instead of columns.
     """
     columns: dict[str, Mapping[str, Spread | None]] = {}
-    labels: dict[str, str] = {}
     for entry in _tested(record):
         summaries = statistics.by_set(record, entry)
-        labels |= {name: summary.label for name, summary in summaries.items()}
         percents = {name: summary.percent for name, summary in summaries.items()}
         mean = statistics.mean_of_sets(record, entry)
         columns[algorithm_label(record, entry)] = {**percents, MEAN_OF_SETS: mean}
-    labels[MEAN_OF_SETS] = MEAN_OF_SETS
+    labels = {**{name: label(name) for name in record["sets"]}, MEAN_OF_SETS: MEAN_OF_SETS}
     with_paper = record["experiment"] == "exp2" and is_of_paper(record)
     for name, paper in PAPER_PERCENT.items() if with_paper else ():
         columns[f"{LABELS[name]}, paper"] = paper
@@ -186,31 +169,30 @@ def _algorithm_rows(
 
 def layouts_table(record: Record) -> Table:
     """The layouts solved of the sets that have few of them."""
-    entries = {
+    found = {
         algorithm_label(record, entry): statistics.by_set(record, entry)
         for entry in _tested(record)
     }
-    rows: dict[str, list[str]] = {}
-    for index, summaries in enumerate(entries.values()):
-        for summary in summaries.values():
-            if summary.layouts is not None:
-                row = rows.setdefault(summary.label, [summary.label, *[NOTHING] * len(entries)])
-                row[1 + index] = _solved_layouts(summary.layouts)
+    rows = [
+        (label(name), *(_solved_layouts(each[name].layouts) for each in found.values()))
+        for name, about in record["sets"].items()
+        if about["layout"]
+    ]
     heading = f"Layouts solved, mean over seeds. {FEW_LAYOUTS}"
-    return Table(heading, ("set", *entries), tuple(map(tuple, rows.values())))
+    return Table(heading, ("set", *found), tuple(rows))
 
 
 def quality_table(record: Record, entry: Record) -> Table:
     """How good an algorithm's play is: solvable tasks solved, shortest plan / steps taken."""
     rows = [
         (
-            summary.label,
-            str(len(record["sets"][summary.name]["shortest"] or ())),
+            label(name),
+            str(len(record["sets"][name]["shortest"] or ())),
             _percent(summary.percent_of_solvable),
             _spread(summary.optimality, ".3f", high=1.0),
             _number(summary.worst, ".3f"),
         )
-        for summary in statistics.by_set(record, entry).values()
+        for name, summary in statistics.by_set(record, entry).items()
     ]
     heads = ("set", "tasks", "of solvable %", "optimality", "worst")
     algorithm = algorithm_label(record, entry)
@@ -223,11 +205,10 @@ def quality_table(record: Record, entry: Record) -> Table:
 
 def seeds_table(record: Record) -> Table:
     """What each seed solves, when its policy was chosen, and all steps that it took."""
-    rows, labels = [], []
+    rows = []
     for entry in _tested(record):
         for run in statistics.tested(entry):
-            scores = statistics.seed_scores(record, entry, run)
-            labels = [score.label for score in scores.values()]
+            scores = statistics.seed_scores(record, run)
             percents: list[float | None] = [score.percent for score in scores.values()]
             percents.append(statistics.mean_score(scores))
             cells = [_number(percent, ".1f") for percent in percents]
@@ -235,6 +216,7 @@ def seeds_table(record: Record) -> Table:
             transitions = f"{run['transitions']:,}"
             name = algorithm_label(record, entry)
             rows.append((name, str(run["seed"]), *cells, chosen, transitions))
+    labels = map(label, record["sets"])
     heads = ("algorithm", "seed", *labels, MEAN_OF_SETS, "chosen at iteration", "transitions")
     return Table("Seed by seed: tasks solved, %", heads, tuple(rows))
 
@@ -243,16 +225,16 @@ def cost_table(record: Record) -> Table:
     """How long the training was."""
     rows = []
     for entry in record["algorithms"]:
-        iterations = sorted({run["iterations"] for run in entry["runs"]})
-        transitions = Spread.of([run["transitions"] for run in entry["runs"]])
-        seconds = Spread.of([run["training_seconds"] for run in entry["runs"]])
+        runs = entry["runs"]
+        iterations = [run["iterations"] for run in runs]
+        ends = dict.fromkeys((min(iterations), max(iterations)))
         rows.append(
             (
                 algorithm_label(record, entry),
-                str(len(entry["runs"])),
-                "–".join(f"{count:,}" for count in dict.fromkeys((iterations[0], iterations[-1]))),
-                NOTHING if transitions is None else f"{transitions.mean:,.0f}",
-                NOTHING if seconds is None else duration(seconds.mean),
+                str(len(runs)),
+                "–".join(f"{count:,}" for count in ends),
+                f"{fmean(run['transitions'] for run in runs):,.0f}",
+                duration(fmean(run["training_seconds"] for run in runs)),
             )
         )
     heads = ("algorithm", "trials", "iterations", "transitions", "training time")
@@ -320,7 +302,7 @@ def _percent(spread: Spread | None) -> str:
     return _spread(spread, ".1f", high=100.0)
 
 
-def _spread(spread: Spread | None, form: str, high: float | None = None) -> str:
+def _spread(spread: Spread | None, form: str, high: float = math.inf) -> str:
     """Mean, deviation and interval, the last cut off at 0 and `high`, beyond which no mean lies."""
     if spread is None:
         return NOTHING
@@ -328,8 +310,7 @@ def _spread(spread: Spread | None, form: str, high: float | None = None) -> str:
     if spread.sd is not None:
         text += f" ± {spread.sd:{form}}"
     if spread.margin is not None:
-        ends = max(0.0, spread.mean - spread.margin), spread.mean + spread.margin
-        ends = ends[0], ends[1] if high is None else min(high, ends[1])
+        ends = max(0.0, spread.mean - spread.margin), min(high, spread.mean + spread.margin)
         text += f" [{ends[0]:{form}}, {ends[1]:{form}}]"
     return text
 

@@ -41,22 +41,6 @@ class AlgorithmRun(NamedTuple):
     rows: Sequence[Row]
 
 
-class Resources(NamedTuple):
-    """How runs are trained, which changes nothing of what they come to.
-
-    Attributes:
-      side_by_side: train all missing seeds of an algorithm at once.
-      devices: how many share a run's episodes and seeds, or `all`; see `Placement.of`.
-      checkpoint_every: iterations from one checkpoint to the next.
-      commit: the commit to note where git does not tell it.
-    """
-
-    side_by_side: bool = False
-    devices: int | str | None = None
-    checkpoint_every: int = 10
-    commit: str | None = None
-
-
 def open_experiment(
     root: Path, experiment: str, defaults: Protocol, given: Mapping[str, Any], *, create: bool
 ) -> Protocol:
@@ -98,33 +82,42 @@ def open_experiment(
 def train_all(
     root: Path,
     protocol: Protocol,
-    resources: Resources,
     console: Console,
     stop: StopSignals,
+    *,
+    side_by_side: bool,
+    devices: int | str | None,
+    checkpoint_every: int,
+    commit: str | None,
 ) -> None:
     """Trains what is missing, seed after seed, the algorithms in turn.
+
+    The last four are options of `python -m agents.experiments --help`: how runs are trained,
+    which changes nothing of what they come to.
 
     Raises:
       ValueError: a run in the folder has other settings.
       Stopped: on request; everything is saved.
     """
-    planned = plan(root, protocol, resources.side_by_side)
+    configs = {name: protocol.config(name) for name in protocol.algorithms}
+    seeds = range(protocol.seed, protocol.seed + protocol.seeds)
+    planned = plan_runs(root, configs, protocol.preset, seeds, side_by_side=side_by_side)
     todo = [(folder, run) for folder, run in planned if not is_done(folder, run)]
     if not todo:
         return
     tasks = draw_tasks(todo[0][1].config, protocol.sets, protocol.tasks, protocol.selects_on)
     for number, (folder, run) in enumerate(todo, 1):
         console.rule(f"run {number} of {len(todo)}: {folder.path.name}")
-        note_machine(folder, resources.commit)
+        note_machine(folder, commit)
         tracker = Tracker(folder, run, tasks, ranked=protocol.ranked, every=protocol.evaluate_every)
         session = Session(
             folder,
             run,
             console,
-            checkpoint_every=resources.checkpoint_every,
+            checkpoint_every=checkpoint_every,
             keep=2,
             tracker=tracker,
-            placement=Placement.of(resources.devices, run.config, run.seeds),
+            placement=Placement.of(devices, run.config, run.seeds),
         )
         folder.note(run)  # more iterations, once it has been taken up
         try:
@@ -132,17 +125,6 @@ def train_all(
             session.summarize()
         finally:
             session.close()
-
-
-def plan(root: Path, protocol: Protocol, side_by_side: bool) -> list[tuple[RunFolder, Run]]:
-    """The runs that hold the protocol's seeds; see `plan_runs`.
-
-    Raises:
-      ValueError: a run has other settings than the protocol.
-    """
-    configs = {name: protocol.config(name) for name in protocol.algorithms}
-    seeds = range(protocol.seed, protocol.seed + protocol.seeds)
-    return plan_runs(root, configs, protocol.preset, seeds, side_by_side=side_by_side)
 
 
 def plan_runs(

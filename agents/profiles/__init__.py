@@ -2,7 +2,6 @@
 
     tasks.py      the tasks, point by point
     oracle.py     distances to the goal along episodes
-    pushes.py     the first push of an episode
     mistakes.py   where an episode leaves the shortest way, and how far it comes
     measure.py    plays and compares all of it; the record
     summary.py    what a record comes to: percentages, intervals, counts

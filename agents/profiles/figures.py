@@ -1,16 +1,14 @@
 """The figures of a profile, from its record."""
 
-import functools
-import hashlib
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agents.experiments.figures import DIGEST, DPI
+from agents.experiments.figures import write
 from agents.experiments.records import Record
 from agents.profiles import summary
 from agents.profiles.mistakes import NEVER
@@ -43,17 +41,12 @@ BELOW: dict[str, Any] = {  # a legend's place and looks
 
 def drawings(record: Record, name: str) -> dict[str, Callable[[Path], None]]:
     """What draws each figure of a record, by the name of its file."""
-    made = {f"{name}.png": functools.partial(save_profile, record)} if _panels(record) else {}
+    made = {f"{name}.png": partial(save_profile, record)} if _panels(record) else {}
     for policy in record["policies"]:
         if policy["mistakes"]:
             file = f"{name}_{re.sub('[^A-Za-z0-9-]+', '_', policy['name'])}.png"
-            made[file] = functools.partial(save_mistakes, record, policy)
+            made[file] = partial(save_mistakes, record, policy)
     return made
-
-
-def digest(record: Record) -> str:
-    """A SHA-256 of all that the figures show."""
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def save_profile(record: Record, path: Path) -> None:
@@ -79,7 +72,7 @@ def save_profile(record: Record, path: Path) -> None:
             part.legend(
                 handles, labels, loc="outside upper center", ncols=len(labels), frameon=False
             )
-    _save(figure, record, path)
+    write(figure, path, record)
 
 
 def save_mistakes(record: Record, policy: Record, path: Path) -> None:
@@ -100,45 +93,33 @@ def save_mistakes(record: Record, policy: Record, path: Path) -> None:
             for name, pair in record["pairs"].items()
         }
         _draw_bars(axes[2], counts, PUSH_COLOURS, "first push in pairs that differ in the trap")
-    _save(figure, record, path)
+    write(figure, path, record)
+
+
+def _by_angle(record: Record, policy: Record) -> dict[float, Outcome]:
+    found = summary.on_axis(record, policy, "colours")
+    return {MEAN_ANGLE * strength: each for strength, each in found.items()}
 
 
 # Title, unit of x, and what finds the outcomes of a policy.
-Panel = tuple[str, str, Callable[[Record], Mapping[Any, Outcome]]]
+Panel = tuple[str, str, Callable[[Record, Record], Mapping[Any, Outcome]]]
+PANELS: tuple[Panel, ...] = (
+    ("other colours", "mean angle from base, degrees", _by_angle),
+    ("other layouts", "distance from base, strength", partial(summary.on_axis, axis="layout")),
+    ("other layouts and colours", "strength of both", partial(summary.on_axis, axis="both")),
+    ("{P}, by length of the plan", "length of the shortest plan", summary.by_length),
+    (
+        "{P}, by way of the food",
+        "way of the food from the agent; tool along or across it",
+        summary.by_kind,
+    ),
+    ("{P, St}, by swap", "tool swapped with", partial(summary.swapped, whole="both 1")),
+)
 
 
 def _panels(record: Record) -> list[Panel]:
     """Those with data."""
-
-    def angles(policy: Record) -> dict[float, Outcome]:
-        found = summary.on_axis(record, policy, "colours")
-        return {MEAN_ANGLE * strength: each for strength, each in found.items()}
-
-    panels = [
-        ("other colours", "mean angle from base, degrees", angles),
-        (
-            "other layouts",
-            "distance from base, strength",
-            lambda p: summary.on_axis(record, p, "layout"),
-        ),
-        (
-            "other layouts and colours",
-            "strength of both",
-            lambda p: summary.on_axis(record, p, "both"),
-        ),
-        (
-            "{P}, by length of the plan",
-            "length of the shortest plan",
-            lambda p: summary.by_length(record, p),
-        ),
-        (
-            "{P}, by way of the food",
-            "way of the food from the agent; tool along or across it",
-            lambda p: summary.by_kind(record, p),
-        ),
-        ("{P, St}, by swap", "tool swapped with", lambda p: summary.swapped(record, p, "both 1")),
-    ]
-    return [panel for panel in panels if panel[2](record["policies"][0])]
+    return [panel for panel in PANELS if panel[2](record, record["policies"][0])]
 
 
 def _draw_panel(record: Record, panel: Panel, solved: Any, optimal: Any) -> None:
@@ -146,7 +127,8 @@ def _draw_panel(record: Record, panel: Panel, solved: Any, optimal: Any) -> None
     for index, policy in enumerate(record["policies"]):
         style = {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)]}
         middle = (len(record["policies"]) - 1) / 2
-        _draw_outcomes(solved, optimal, find(policy), index - middle, label=policy["name"], **style)
+        found = find(record, policy)
+        _draw_outcomes(solved, optimal, found, index - middle, label=policy["name"], **style)
     solved.set_title(title, loc="left", fontsize="medium")
     optimal.set_xlabel(unit)
     for axis in (solved, optimal):
@@ -229,8 +211,3 @@ def _figure(width: float, height: float) -> Any:
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
 
     return Figure(figsize=(width, height), layout="constrained")
-
-
-def _save(figure: Any, record: Record, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png", dpi=DPI, metadata={DIGEST: digest(record)})

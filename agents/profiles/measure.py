@@ -10,9 +10,9 @@ A record holds what was measured and nothing derived from it:
                 where there is none; of those of {P} also their kinds (see `tasks.kinds`)
     pairs       by name: the two points whose tasks differ in the trap alone, one by one
     policies    name, iteration and settings; by point the steps of every episode, 0 where it
-                did not solve the task, and in pairs and controls its first push (see
-                `pushes`); of the first episodes of some points, as far as they are not as short
-                as can be, where they go wrong (see `mistakes`)
+                did not solve the task, and in pairs and controls its first push; of the first
+                episodes of some points, those longer than the shortest plan, where they go wrong
+                (see `mistakes`)
 """
 
 import dataclasses
@@ -27,9 +27,8 @@ from rich.progress import MofNCompleteColumn, Progress
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.acting.policy import Policy
 from agents.experiments.records import Record
-from agents.profiles.mistakes import SUBGOALS, Turns, subgoals, turns
+from agents.profiles.mistakes import SUBGOALS, Push, Turns, first_push, subgoals, turns
 from agents.profiles.oracle import Oracle, replayed
-from agents.profiles.pushes import Push, first_push
 from agents.profiles.tasks import ALL_LAYOUTS, BASE, PAIRS, PARTS, STRENGTHS, SWAPS, kinds, points
 from agents.runs.machine import machine
 from trap_tube_jax.state import State
@@ -47,8 +46,9 @@ class Settings:
     """What a profile measures.
 
     Attributes:
-      parts: some of `PARTS`.
-      strengths: the strengths of the graded axes, above 0, to 1.
+      parts: what to measure: some of colours, layout, both, swaps, controls, pairs.
+      strengths: how far colours and layouts are changed: above 0, the base task, to 1, the
+        paper's transfers.
       tasks: of every point that has more than one.
       episodes: of how many of a point's episodes to find out where they go wrong.
     """
@@ -117,7 +117,9 @@ def profile(
     return {
         "schema": SCHEMA,
         "command": command,
-        "settings": dataclasses.asdict(settings),
+        "settings": {
+            each.name: getattr(settings, each.name) for each in dataclasses.fields(Settings)
+        },
         "machines": [here, *(each for each in machines if each != here)],
         "points": {
             name: {
@@ -134,7 +136,10 @@ def profile(
 
 
 def _limited(policy: Policy) -> Policy:
-    """With the step limit of the base task, for points are no sets with a limit of their own."""
+    """With the step limit of the base task.
+
+    Points are not task sets, so they have no limit of their own.
+    """
     limit = policy.config.step_limit(BASE)
     return policy._replace(config=dataclasses.replace(policy.config, max_steps=limit))
 

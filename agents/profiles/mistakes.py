@@ -7,12 +7,14 @@ as it is, raises it, or makes it infinite: the food, or the agent, is where no p
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
-from agents.profiles.oracle import LOST
+from agents.profiles.oracle import LOST, Oracle
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
 from trap_tube_jax.state import State
 
 NEVER = -1
+NO_PUSH = -1
 INFINITE = 1_000_000  # more than any distance
 SUBGOALS = ("tool touched", "tool moved", "food moved", "food out")
 
@@ -33,6 +35,18 @@ class Turns(NamedTuple):
     nearest: int
 
 
+class Push(NamedTuple):
+    """The first push of an episode.
+
+    Attributes:
+      direction: where the food went, as in actions; `NO_PUSH` if it never moved.
+      right: whether the distance to the goal fell with it.
+    """
+
+    direction: int
+    right: bool
+
+
 def turns(distance: np.ndarray) -> Turns:
     """Those of an episode.
 
@@ -44,6 +58,19 @@ def turns(distance: np.ndarray) -> Turns:
     change, low = np.diff(finite), finite.min()
     nearest = _first(finite[1:] == low) if low < finite[0] else NEVER
     return Turns(_last(change < 0), _first(change > 0), _first(lost[1:]), nearest)
+
+
+def first_push(oracle: Oracle, layout: State, cells: np.ndarray) -> Push:
+    """The first push of an episode, from u8[T + 1, 3, 2], the cells of agent, tool and food."""
+    food = cells[:, 2].astype(np.int32)
+    moves = np.diff(food, axis=0)
+    pushes = np.flatnonzero(moves.any(axis=1))
+    if not len(pushes):
+        return Push(NO_PUSH, False)
+    step = int(pushes[0])
+    after = oracle.distance(layout, cells[step + 1])
+    right = after != LOST and after < oracle.distance(layout, cells[step])
+    return Push(int(np.argmax((DIRECTIONS == moves[step]).all(axis=1))), right)
 
 
 def subgoals(layout: State, cells: np.ndarray, actions: np.ndarray) -> tuple[int, ...]:
@@ -79,13 +106,9 @@ def walks_to_food(board: np.ndarray, extent: np.ndarray, cells: np.ndarray) -> n
     is_tool = _covers(tool[:, None, None], extent, every)
     is_food = (every == food[:, None, None]).all(axis=-1) & ~is_tool
     is_free = ((board == GROUND) & ~is_tool) | is_food
-    reached, before = (every == agent[:, None, None]).all(axis=-1), None
-    while before is None or (reached != before).any():
-        before = reached
-        wide = np.pad(reached, ((0, 0), (1, 1), (1, 1)))
-        beside = wide[:, :-2, 1:-1] | wide[:, 2:, 1:-1] | wide[:, 1:-1, :-2] | wide[:, 1:-1, 2:]
-        # The food in an exit is not walked through: the task is over there.
-        reached = reached | (beside & is_free)
+    start = (every == agent[:, None, None]).all(axis=-1)
+    beside = ndimage.generate_binary_structure(2, 1)[None]
+    reached = ndimage.binary_propagation(start, beside, mask=is_free)
     return np.any(reached & is_food, axis=(1, 2))
 
 

@@ -8,14 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from agents.acting.episodes import cells_of
 from trap_tube_jax import dynamics
 from trap_tube_jax.positions import position_id
-from trap_tube_jax.solver.search import NO_DIRECTION, solve
+from trap_tube_jax.solver.search import replay, solve
 from trap_tube_jax.state import State
 
-LOST = -1  # of a distance: no plan leads to the goal any more
-NO_PALETTE = np.zeros((0, 0), np.uint8)  # colours play no part
-PLAN_SIZE = 64  # plans are padded to a multiple of it, since each size is compiled once
+LOST = -1  # of a distance: no plan leads to the goal any more; the length of such a `Plan` too
 
 
 class Oracle:
@@ -40,9 +39,9 @@ class Oracle:
         here = int(position_id(state))
         if (where, here) not in self._known:
             plan = solve(state)
-            self._known[where, here] = int(plan.length) if plan.solvable else LOST
-            for step, position in enumerate(_on_plan(state, plan.actions)):
-                self._known[where, position] = len(plan.actions) - step
+            self._known[where, here] = int(plan.length)
+            for step, at in enumerate(replay(state, plan)[:-1]):
+                self._known[where, int(position_id(at))] = len(plan.actions) - step
         return self._known[where, here]
 
     def along(self, layout: State, cells: np.ndarray) -> np.ndarray:
@@ -65,15 +64,6 @@ class Oracle:
         return distances
 
 
-def _on_plan(state: State, actions: np.ndarray) -> list[int]:
-    """The positions of a plan's states but for the last, which is solved."""
-    missing = -len(actions) % PLAN_SIZE
-    padded = np.pad(actions, ((0, missing), (0, 0)), constant_values=NO_DIRECTION)
-    batch = jax.tree.map(lambda x: np.asarray(x)[None], state.replace(palette=NO_PALETTE))
-    cells = np.asarray(replayed(batch, padded[None]))[0, : len(actions)].astype(np.int32)
-    return [int(position_id(state.replace(agent=a, tool=t, food=f))) for a, t, f in cells]
-
-
 @jax.jit
 def replayed(tasks: State, actions: jax.Array) -> jax.Array:
     """u8[B, T + 1, 3, 2]: the cells of agent, tool and food along B episodes.
@@ -83,16 +73,9 @@ def replayed(tasks: State, actions: jax.Array) -> jax.Array:
       actions: i32[B, T, 2]; after the task is solved they change nothing.
     """
 
-    def episode(state: State, actions: jax.Array) -> jax.Array:
-        def step(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-            state = dynamics.step(state, action)
-            return state, _cells(state)
+    def step(states: State, action: jax.Array) -> tuple[State, jax.Array]:
+        states = jax.vmap(dynamics.step)(states, action)
+        return states, cells_of(states)
 
-        _, cells = jax.lax.scan(step, state, actions)
-        return jnp.concatenate([_cells(state)[None], cells])
-
-    return jax.vmap(episode)(tasks, actions)
-
-
-def _cells(state: State) -> jax.Array:
-    return jnp.stack([state.agent, state.tool, state.food]).astype(jnp.uint8)
+    _, cells = jax.lax.scan(step, tasks, actions.swapaxes(0, 1))
+    return jnp.concatenate([cells_of(tasks)[None], cells]).swapaxes(0, 1)

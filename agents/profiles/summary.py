@@ -2,15 +2,13 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from agents.experiments.records import Record
 from agents.experiments.statistics import Spread
-from agents.profiles.mistakes import NEVER, SUBGOALS
-from agents.profiles.pushes import NO_PUSH
+from agents.profiles.mistakes import NEVER, NO_PUSH, SUBGOALS
 from agents.profiles.tasks import ALL_LAYOUTS, BASE, GRADED, KINDS, SWAPS
 from trap_tube_jax.scoring.scores import wilson_interval
 
@@ -148,12 +146,6 @@ def stage(row: Record, before: float = math.inf) -> str:
     """The last subgoal that an episode reached before a step."""
     reached = [goal for goal in SUBGOALS if row[goal] != NEVER and row[goal] < before]
     return reached[-1] if reached else UNTOUCHED
-
-
-def median(values: Sequence[int]) -> float | None:
-    """That of the steps that came; None without any."""
-    known = [value for value in values if value != NEVER]
-    return float(np.median(known)) if known else None
 
 
 def pair_counts(record: Record, policy: Record, name: str) -> dict[str, int]:

@@ -3,11 +3,12 @@
 from collections import Counter
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
 from agents.experiments.records import Record
 from agents.experiments.tables import Table, provenance
 from agents.profiles import summary
-from agents.profiles.mistakes import NEVER, SUBGOALS
-from agents.profiles.pushes import NO_PUSH
+from agents.profiles.mistakes import NEVER, NO_PUSH, SUBGOALS
 from agents.profiles.summary import OUTCOMES, PUSHES, SOLVED, TURNS, UNTOUCHED, Outcome
 from agents.profiles.tasks import BASE
 from agents.runs.report import NOTHING
@@ -120,8 +121,8 @@ def _begin(row: Record) -> str:
 
 
 def _median(steps: list[int]) -> str:
-    middle = summary.median(steps)
-    return NOTHING if middle is None else f"{middle:.0f}"
+    known = [step for step in steps if step != NEVER]
+    return f"{np.median(known):.0f}" if known else NOTHING
 
 
 Find = Callable[[Record, Record], Mapping[str, Outcome]]

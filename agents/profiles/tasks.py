@@ -70,18 +70,12 @@ def kinds(tasks: State) -> list[str]:
     return found
 
 
-class Pair(NamedTuple):
-    """The points, by name, whose tasks differ in the trap alone, one by one."""
-
-    first: str
-    second: str
-
-
+# The names of two points whose tasks differ in the trap alone, one by one.
 PAIRS = {
-    "base": Pair(BASE, "control trap-exchanged"),
-    "two traps": Pair("control two-traps", "control two-traps, other exit"),
-    "{P}": Pair(ALL_LAYOUTS, f"{ALL_LAYOUTS}, exchanged"),
-    "{P, St}": Pair("both 1", "both 1, exchanged"),
+    "base": (BASE, "control trap-exchanged"),
+    "two traps": ("control two-traps", "control two-traps, other exit"),
+    "{P}": (ALL_LAYOUTS, f"{ALL_LAYOUTS}, exchanged"),
+    "{P, St}": ("both 1", "both 1, exchanged"),
 }
 
 

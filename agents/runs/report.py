@@ -239,31 +239,49 @@ def save_curves(rows: Sequence[Row], path: Path, title: str) -> None:
       path: the file to write.
       title: over all panels.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
-    from matplotlib.ticker import EngFormatter  # noqa: PLC0415
-
     panels = [
         (name, [metric for metric in metrics if metric in rows[0]], unit)
         for name, metrics, unit in PANELS
         if name != "intrinsic reward" or any(row.get("intrinsic_reward") for row in rows)
     ]
     panels = [panel for panel in panels if panel[1]]
-    height = -(-len(panels) // 2)
-    figure = Figure(figsize=(11, 2.6 * height), layout="constrained")
-    figure.suptitle(title)
-    axes = figure.subplots(height, 2, sharex=True, squeeze=False)
-    for axis in axes.flat[len(panels) :]:
-        axis.remove()
-    for axis, (name, metrics, unit) in zip(axes.flat, panels, strict=False):
+    figure, axes = over_episodes([name for name, _, _ in panels], 2, (5.5, 2.6), title)
+    for axis, (_, metrics, unit) in zip(axes, panels, strict=True):
         _draw_panel(axis, rows, metrics)
-        axis.set_title(name, loc="left", fontsize="medium")
         axis.set_ylabel(unit, fontsize="small")
         if unit.startswith("share"):
             axis.set_ylim(-0.03, 1.03)
-    for axis in axes[-1]:
-        axis.set_xlabel("episodes")
-        axis.xaxis.set_major_formatter(EngFormatter())
     figure.savefig(path, format="png", dpi=110)
+
+
+def over_episodes(
+    names: Sequence[str],
+    columns: int,
+    size: tuple[float, float],
+    title: str,
+    *,
+    sharey: bool = False,
+) -> tuple[Any, list[Any]]:
+    """A figure with a panel over episodes for each name, of `size` in inches, and the panels."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+    from matplotlib.ticker import EngFormatter, MaxNLocator  # noqa: PLC0415
+
+    height = -(-len(names) // columns)
+    figure = Figure(figsize=(size[0] * columns, size[1] * height + 0.6), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(height, columns, sharex=True, sharey=sharey, squeeze=False).flat
+    for axis in axes[len(names) :]:
+        axis.remove()
+    panels = list(axes[: len(names)])
+    for axis, name in zip(panels, names, strict=True):
+        axis.set_title(name, loc="left", fontsize="medium")
+        axis.grid(alpha=0.3)
+    for axis in panels[-columns:]:  # the lowest of each column
+        axis.set_xlabel("episodes")
+        axis.tick_params(labelbottom=True)
+        axis.xaxis.set_major_locator(MaxNLocator(5))
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    return figure, panels
 
 
 def _draw_panel(axis: Any, rows: Sequence[Row], metrics: Sequence[str]) -> None:
@@ -281,7 +299,6 @@ def _draw_panel(axis: Any, rows: Sequence[Row], metrics: Sequence[str]) -> None:
                 marker="." if len(of_seed) < 20 else None,
                 label=label,
             )
-    axis.grid(alpha=0.3)
     if len(metrics) > 1:
         axis.legend(fontsize="small")
 

@@ -20,7 +20,7 @@ from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
 from trap_tube_jax.solver.distance import Distances, distances
-from trap_tube_jax.solver.search import Plan, solve
+from trap_tube_jax.solver.search import Plan, replay, solve
 from trap_tube_jax.solver.survey import QUANTILES, Survey, survey
 from trap_tube_jax.state import State
 
@@ -129,7 +129,7 @@ def _number(value: float | None, digits: int, unit: int = 1) -> str:
 
 
 def _show(options: Options, name: str) -> None:
-    from trap_tube_jax.solver.pictures import replay, save_plan  # noqa: PLC0415
+    from trap_tube_jax.solver.pictures import save_plan  # noqa: PLC0415
 
     state = _task(name, options.seed)
     plan = solve(state)

@@ -3,31 +3,20 @@
 import os
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from trap_tube_jax import dynamics
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.rendering import episode_frames, render, save_gif
 from trap_tube_jax.solver.distance import Distances
-from trap_tube_jax.solver.search import Plan
+from trap_tube_jax.solver.search import Plan, replay
 from trap_tube_jax.solver.survey import Survey
 from trap_tube_jax.state import State
 
 CELL_SIZE = 32  # pixels
 MOMENTS = 4  # pictures of distances along a plan
-
-
-def replay(state: State, plan: Plan) -> list[State]:
-    """The L + 1 states of a plan, the first included."""
-    states = [state]
-    for action in plan.actions:
-        states.append(_step(states[-1], jnp.asarray(action)))
-    return states
 
 
 def save_plan(state: State, plan: Plan, path: str | os.PathLike[str]) -> None:
@@ -78,9 +67,6 @@ def save_histogram(surveys: Sequence[Survey], path: str | os.PathLike[str]) -> N
         axis.set_title(f"{survey.task_set.label}: {len(survey.length)} tasks", loc="left")
     axes[-1].set_xlabel("steps of the shortest plan (dashed: mean)")
     figure.savefig(path, format="png", dpi=100)
-
-
-_step = jax.jit(dynamics.step)
 
 
 def _draw_distances(axis: Axes, state: State, steps: np.ndarray, scale: Normalize) -> None:

@@ -109,6 +109,17 @@ def solve_batch(states: State) -> Plan:
     return Plan(actions, length, length >= 0)
 
 
+def replay(state: State, plan: Plan) -> list[State]:
+    """The L + 1 states of a plan, the first included."""
+    states = [state]
+    for action in plan.actions:
+        states.append(_step(states[-1], jnp.asarray(action)))
+    return states
+
+
+_step = jax.jit(dynamics.step)
+
+
 def checked(state: State) -> State:
     """Returns a valid state as NumPy arrays; raises ValueError as `solve` does."""
     return validate(_to_host(state))
