@@ -14,6 +14,7 @@ from rich.table import Table
 
 import trap_tube_jax as tt
 from benchmarks import harness
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
 from trap_tube_jax.vector import VectorEnvironment
 
@@ -63,16 +64,17 @@ def sample_actions(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 def main(arguments: Arguments) -> list[harness.Throughput]:
     """Measures, prints a table, and writes JSON if asked to."""
     harness.use_devices(arguments.devices)
+    subjects = [subject(name, plain=arguments.plain) for name in arguments.sets]
     console = Console()
     console.print(harness.machine())
     bandwidth = harness.copy_bandwidth()
     console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
     table = Table("set", "environments", "M steps/s", "x reference", "of copy", "compile, s")
     results = []
-    for name in arguments.sets:
+    for measured in subjects:
         for num_envs in arguments.num_envs:
             result = harness.measure_throughput(
-                subject(name, plain=arguments.plain),
+                measured,
                 num_envs,
                 num_steps=arguments.num_steps,
                 repeats=arguments.repeats,
@@ -80,7 +82,7 @@ def main(arguments: Arguments) -> list[harness.Throughput]:
             )
             results.append(result)
             table.add_row(
-                name,
+                measured.name,
                 f"{num_envs:,}",
                 f"{result.steps_per_s / 1e6:.3f}",
                 f"{result.steps_per_s / REFERENCE_STEPS_PER_S:,.0f}",
@@ -96,4 +98,5 @@ def main(arguments: Arguments) -> list[harness.Throughput]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    with plain_errors():
+        main(tyro.cli(Arguments, description=__doc__))

@@ -19,16 +19,21 @@ class Timing:
     """How long a compiled function takes.
 
     Attributes:
-      compile_s: seconds of the first call, tracing and compiling included.
+      first_s: seconds of the first call, tracing and compiling included.
       median_s: median seconds of the later calls.
       fastest_s: seconds of the fastest of them.
       slowest_s: seconds of the slowest of them.
     """
 
-    compile_s: float
+    first_s: float
     median_s: float
     fastest_s: float
     slowest_s: float
+
+    @property
+    def compile_s(self) -> float:
+        """Seconds of tracing and compiling: what the first call took more than the median."""
+        return self.first_s - self.median_s
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,6 +22,8 @@ from rich.table import Table
 from agents import Config, make_train
 from benchmarks import harness
 from benchmarks.env_throughput import subject
+from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.registry import task_set
 
 Kind = Literal["environment", "episodes", "seeds"]
 TITLES: dict[Kind, str] = {
@@ -81,8 +83,13 @@ def measure(kind: Kind, env: str, size: int) -> Point:
         steps_per_s, timing = result.steps_per_s, result.timing
     else:
         steps_per_s, timing = _measure_training(kind, env, size)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return Point(kind, env, size, steps_per_s, peak, timing.compile_s - timing.median_s)
+    return Point(kind, env, size, steps_per_s, peak_bytes(), timing.compile_s)
+
+
+def peak_bytes() -> int:
+    """The largest resident memory that this process has had."""
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, elsewhere KiB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def _measure_training(kind: Kind, env: str, size: int) -> tuple[float, harness.Timing]:
@@ -100,9 +107,16 @@ def _measure_training(kind: Kind, env: str, size: int) -> tuple[float, harness.T
 
 
 def _measure_apart(kind: Kind, env: str, size: int) -> Point:
-    """One point, in a fresh process."""
+    """One point, in a fresh process.
+
+    Raises:
+      ChildProcessError: the process failed; it has said why.
+    """
     command = [sys.executable, "-m", "benchmarks.scaling", "point", kind, env, str(size)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    try:
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    except subprocess.CalledProcessError as error:
+        raise ChildProcessError(f"{kind} {size:,} on {env}: {error}") from error
     return Point(**json.loads(done.stdout.splitlines()[-1]))
 
 
@@ -136,10 +150,11 @@ def save_figure(points: Sequence[Point], path: pathlib.Path) -> None:
 
 def main(arguments: Arguments) -> list[Point]:
     """Measures all points, prints tables, and writes what is asked for."""
+    sets = [task_set(name).short for name in arguments.sets]  # refuses unknown ones at once
     console = Console()
     console.print(harness.machine())
     wanted: list[tuple[Kind, str, int]] = [
-        *(("environment", env, size) for env in arguments.sets for size in arguments.num_envs),
+        *(("environment", env, size) for env in sets for size in arguments.num_envs),
         *(("episodes", "base", size) for size in arguments.episodes),
         *(("seeds", "base", size) for size in arguments.seeds),
     ]
@@ -164,8 +179,9 @@ def main(arguments: Arguments) -> list[Point]:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["point"]:
-        _kind, _env, _size = sys.argv[2:]
-        print(json.dumps(dataclasses.asdict(measure(_kind, _env, int(_size)))))  # type: ignore[arg-type]
-    else:
-        main(tyro.cli(Arguments, description=__doc__))
+    with plain_errors():
+        if sys.argv[1:2] == ["point"]:
+            _kind, _env, _size = sys.argv[2:]
+            print(json.dumps(dataclasses.asdict(measure(_kind, _env, int(_size)))))  # type: ignore[arg-type]
+        else:
+            main(tyro.cli(Arguments, description=__doc__))

@@ -2,14 +2,7 @@
 
 Counts the bytes that devices exchange per update in the compiled program, and, with
 --measure, times one device's share of the work for every number of devices. From both
-follows the time of an iteration on N devices,
-
-  t(N) = share(N) + (1 - 1 / N) repeated + exchange(N),
-
-where share(N) is measured: an iteration of episodes / N and minibatch / N on one device, and
-so is what every device repeats for all episodes. Seeds side by side exchange nothing. The
-links are assumed, by their latency and bandwidth: a ring moves 2 (N - 1) / N of the reduced
-bytes in 2 (N - 1) steps, and (N - 1) / N of the gathered ones in N - 1 steps.
+follows the speed-up, by the model in `benchmarks/results/scale.md`.
 """
 
 import dataclasses
@@ -26,14 +19,15 @@ import tyro
 
 from agents.acting.rollout import sample_action
 from agents.config import PRESETS, Config
-from agents.experiments.tables import Table, _number
+from agents.experiments.tables import Table, number
 from agents.networks.actions import ActionDistribution
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
 from agents.runs.session import make_advance
 from benchmarks import harness
-from trap_tube_jax.command_line import Flag
+from trap_tube_jax.command_line import Flag, plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
+from trap_tube_jax.registry import task_set
 
 COUNTED_DEVICES = 8
 SEEDS = 8  # trained side by side in the model's last column
@@ -180,7 +174,7 @@ def speed_up_rows(
         again = repeated * (1 - 1 / devices)
         times[devices] = share + again + exchange
         rows.append({"share_s": share, "repeated_s": again, "exchange_s": exchange})
-        print(f"{devices} devices: {share:.3f} s of {updates} updates", flush=True)
+        print(f"{devices} devices: {share:.3f} s for {updates} updates", flush=True)
     result: list[dict[str, float | int | None]] = []
     for devices in sorted({*counts, *(SEEDS * n for n in counts)}):
         shards = max(1, devices // SEEDS)
@@ -223,7 +217,7 @@ def speed_up_table(rows: Sequence[dict[str, float | int | None]]) -> str:
     heads = ("devices", "own share, s", "repeated, s", "exchange, s", "speed-up, one seed")
     names = ("share_s", "repeated_s", "exchange_s", "one_seed", "all_seeds")
     cells = [
-        (f"{row['devices']:,}", *(_number(row.get(name), ".3g") for name in names)) for row in rows
+        (f"{row['devices']:,}", *(number(row.get(name), ".3g") for name in names)) for row in rows
     ]
     return Table("", (*heads, f"speed-up, {SEEDS} seeds"), tuple(cells)).to_markdown()
 
@@ -231,7 +225,7 @@ def speed_up_table(rows: Sequence[dict[str, float | int | None]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m benchmarks.scaling_model")
-    config = Config.preset(options.preset, env_id=options.env)
+    config = Config.preset(options.preset, env_id=task_set(options.env).id)
     jax.config.update("jax_num_cpu_devices", COUNTED_DEVICES)
     found = compiled_exchanges(config, len(jax.devices()))
     print(exchange_table(found))
@@ -244,4 +238,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with plain_errors():
+        main()

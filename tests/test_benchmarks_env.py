@@ -1,12 +1,15 @@
 """The environment's benchmarks run, and their figures belong together."""
 
 import json
+import runpy
+import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import env_throughput, harness, peers
+from benchmarks import env_throughput, harness, peers, scaling, scaling_model, train_throughput
 
 
 def test_measures_the_fast_path_and_writes_json(tmp_path):
@@ -61,3 +64,33 @@ def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):
 def test_an_unknown_set_of_our_own_is_no_peer_to_skip():
     with pytest.raises(ValueError, match="unknown task set 'typo'"):
         peers.run(peers.Arguments(sets=("typo",)))
+
+
+@pytest.mark.parametrize(
+    ("module", "option"),
+    [
+        (env_throughput, "--sets"),
+        (peers, "--sets"),
+        (scaling, "--sets"),
+        (scaling_model, "--env"),
+        (train_throughput, "--env"),
+    ],
+)
+def test_an_unknown_set_ends_in_one_line(capsys, monkeypatch, module, option):
+    monkeypatch.setattr(sys, "argv", ["x", option, "typo"])
+    with pytest.raises(SystemExit) as exit_info:
+        runpy.run_path(module.__file__, run_name="__main__")
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err.startswith("error: unknown task set 'typo'; allowed: ")
+
+
+def test_compiling_is_what_the_first_call_took_more():
+    timing = harness.Timing(first_s=5.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
+    assert timing.compile_s == 3
+
+
+@pytest.mark.parametrize(("platform", "unit"), [("darwin", 1), ("linux", 1024)])
+def test_peak_memory_is_in_bytes(monkeypatch, platform, unit):
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(scaling.resource, "getrusage", lambda who: SimpleNamespace(ru_maxrss=7))
+    assert scaling.peak_bytes() == 7 * unit

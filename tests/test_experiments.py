@@ -3,13 +3,14 @@
 import dataclasses
 import json
 import re
+import shlex
 
 import pytest
 
 from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
 from agents.experiments import records, training
-from agents.experiments.protocol import PROTOCOLS, QUICK, Protocol, algorithms
+from agents.experiments.protocol import PROTOCOLS, QUICK, Protocol, algorithms, parse_setting
 from agents.experiments.tables import algorithm_label
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.metrics import MetricsLog
@@ -41,6 +42,9 @@ def refused(capsys, *arguments):
         ("--algorithms ppo,iterations=9", "iterations is none of --settings; give --iterations"),
         ("--algorithms ppo,hidden", "settings are given as NAME=VALUE, got 'hidden'"),
         ("--algorithms ppo,hiden=4", "unknown setting 'hiden'; did you mean 'hidden'?"),
+        ("--algorithms ppo,env_id=P", "env_id is none of --settings; give --train-set"),
+        ("--algorithms preset preset,max_steps=25", "max_steps is the same for all algorithms"),
+        ("--algorithms preset,num_features=4", "give it by --settings, not in 'preset,num_feat"),
         ("--settings hidden", "settings are given as NAME=VALUE, got 'hidden'"),
         ("--name a/b", "name must be the name of a folder, without a path, got 'a/b'"),
         ("--report-only", "exp1-paper holds no experiment"),
@@ -153,6 +157,13 @@ def test_an_algorithm_may_change_settings():
     record = {"protocol": dataclasses.asdict(protocol)}
     assert algorithm_label(record, {"name": "preset,hidden=64"}) == "best, hidden=64"
     assert algorithm_label(record, {"name": "ppo"}) == "PPO"
+
+
+def test_a_command_can_be_pasted_into_a_shell():
+    settings = {"encoder": "my encoder's", "filters": [8, 16], "recurrent": False}
+    words = shlex.split(Protocol(settings=settings).command("exp1", ["ppo"]))
+    given = words[words.index("--settings") + 1 :]
+    assert dict(map(parse_setting, given)) == settings
 
 
 def test_a_name_may_say_that_the_agent_imitates():

@@ -252,6 +252,8 @@ def test_counts_of_a_record_made_by_hand():
     }
     assert summary.stage(summary.mistakes(policy, "layout 1")[0], 3) == "tool moved"
     assert list(summary.pair_counts(record, policy, "{P}").values()) == [1, 1, 1, 1]
+    (row,) = tables.pairs_table(record).rows
+    assert row == ("{P}", "mine", "4", *["25.0"] * 4)
     by_length = summary.by_length(record, policy)
     assert {length: each.tasks for length, each in by_length.items()} == {8.0: 1, 35 / 3: 3}
     by_kind = summary.by_kind(record, policy)
@@ -307,7 +309,7 @@ def test_a_profile_from_end_to_end(tiny, tmp_path, capsys):
         assert drawn_from == experiment_figures.digest(tiny)
     text = (tmp_path / "out" / "tables.md").read_text()
     assert "| trap-turned | 11 |" in text
-    assert "| {P, St}, mine | 2 |" in text
+    assert "| {P, St} | mine | 2 |" in text
 
 
 def test_a_recorded_command_names_no_place_of_results():

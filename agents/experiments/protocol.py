@@ -43,12 +43,20 @@ def changes_of(algorithm: str) -> dict[str, Any]:
       algorithm: one of `algorithms()`, and settings after it, as in `preset,recurrent=false`.
 
     Raises:
-      ValueError: there is no such algorithm, or a setting is not NAME=VALUE.
+      ValueError: there is no such algorithm, or a setting is not NAME=VALUE or none that an
+        algorithm may change.
     """
     name, *settings = re.split(COMMA, algorithm)
     if name not in algorithms():
         raise ValueError(f"unknown algorithm {name!r}; allowed: {', '.join(algorithms())}")
-    return {**algorithms()[name], **dict(map(parse_setting, settings))}
+    own = dict(map(parse_setting, settings))
+    for setting in OF_TASKS:
+        if setting in own:
+            raise ValueError(
+                f"{setting} is the same for all algorithms; give it by --settings, "
+                f"not in {algorithm!r}"
+            )
+    return {**algorithms()[name], **own}
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
@@ -69,6 +77,8 @@ def parse_setting(text: str) -> tuple[str, Any]:
 
 
 COMMA = re.compile(r",(?![^\[]*\])")  # but not those in a list
+# Settings of the tasks, on which all algorithms of an experiment are compared.
+OF_TASKS = ("max_steps", "num_features")
 SELECTIONS = ("validation", "paper")
 # Settings of the config that a protocol has by other means, and the options that give them.
 OWN_OPTIONS = {
@@ -82,24 +92,16 @@ OWN_OPTIONS = {
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """How an experiment is run.
+    """How an experiment is run: the options of `python -m agents.experiments --help`.
+
+    What differs from there:
 
     Attributes:
-      train_set: the set to train on, by its short name.
-      sets: the sets to evaluate on, by their short names.
-      imports: modules of your own, imported first, for the names that they register.
-      preset: the named settings.
-      algorithms: which of `algorithms()`, as `changes_of` reads them.
-      seeds: how many, from `seed` on.
-      iterations: of training, at most.
-      tasks: tasks per set by which the best evaluation is chosen; the base set has one.
-      reported: tasks per set that the tables report.
-      selection: `validation`: the best evaluation is chosen on validation tasks, and other
-        tasks are reported. `paper`: it is chosen and reported on the same tasks.
-      evaluate_every: iterations from one evaluation on all sets to the next.
-      stop_when_solved: as in the config.
-      settings: settings of the config that differ from the preset's.
-      seed: the first seed.
+      train_set: by its short name.
+      sets: by their short names.
+      algorithms: as `changes_of` reads them.
+      selection: one of `SELECTIONS`.
+      settings: by name, their values parsed.
     """
 
     train_set: str = "base"
@@ -209,22 +211,23 @@ class Protocol:
     def command(self, experiment: str, algorithms: Sequence[str]) -> str:
         """What to type for the same runs in a new folder."""
         usual = PROTOCOLS[experiment]
-        parts = [PROGRAM, experiment]
+        parts = [experiment]
         parts += [part for name in self.imports for part in ("--import", name)]
         if self.train_set != usual.train_set:
             parts += ["--train-set", self.train_set]
         if self.sets != usual.sets:
             parts += ["--sets", *self.sets]
-        parts += ["--preset", self.preset, "--algorithms", *map(shlex.quote, algorithms)]
+        parts += ["--preset", self.preset, "--algorithms", *algorithms]
         names = ("seeds", "iterations", "tasks", "reported", "selection", "evaluate_every")
         for name in (*names, "stop_when_solved", "seed"):
             value = getattr(self, name)
             if value != getattr(usual, name):
                 parts += [f"--{name.replace('_', '-')}", str(value)]
         if self.settings:
-            pairs = [f"{name}={json.dumps(value)}" for name, value in self.settings.items()]
-            parts += ["--settings", *(pair.replace(" ", "") for pair in pairs)]
-        return " ".join(parts)
+            parts.append("--settings")
+        for name, value in self.settings.items():
+            parts.append(f"{name}={json.dumps(value, separators=(',', ':'))}")
+        return f"{PROGRAM} {shlex.join(parts)}"
 
 
 # Nothing of these may differ between the runs of one folder.

@@ -190,7 +190,7 @@ def quality_table(record: Record, entry: Record) -> Table:
             str(len(record["sets"][name]["shortest"] or ())),
             _percent(summary.percent_of_solvable),
             _spread(summary.optimality, ".3f", high=1.0),
-            _number(summary.worst, ".3f"),
+            number(summary.worst, ".3f"),
         )
         for name, summary in statistics.by_set(record, entry).items()
     ]
@@ -211,7 +211,7 @@ def seeds_table(record: Record) -> Table:
             scores = statistics.seed_scores(record, run)
             percents: list[float | None] = [score.percent for score in scores.values()]
             percents.append(statistics.mean_score(scores))
-            cells = [_number(percent, ".1f") for percent in percents]
+            cells = [number(percent, ".1f") for percent in percents]
             chosen = f"{run['best']['iteration']:,} of {run['iterations']:,}"
             transitions = f"{run['transitions']:,}"
             name = algorithm_label(record, entry)
@@ -261,6 +261,11 @@ def markdown(record: Record) -> str:
     """All tables and notes in Markdown."""
     parts = [f"**{table.title}**\n\n{table.to_markdown()}" for table in tables(record)]
     return "\n\n".join([*parts, *notes(record)])
+
+
+def number(value: float | None, form: str) -> str:
+    """A number as text; `NOTHING` where there is none."""
+    return NOTHING if value is None else format(value, form)
 
 
 def _tested(record: Record) -> list[Record]:
@@ -319,7 +324,3 @@ def _solved_layouts(layouts: Sequence[Layouts]) -> str:
     mean = sum(each.solved for each in layouts) / len(layouts)
     form = ".0f" if len(layouts) == 1 else ".1f"
     return f"{mean:{form}} of {layouts[0].total}"
-
-
-def _number(value: float | None, form: str) -> str:
-    return NOTHING if value is None else format(value, form)

@@ -70,9 +70,9 @@ def pairs_table(record: Record) -> Table:
             counts = summary.pair_counts(record, policy, name)
             total = sum(counts.values())
             cells = (f"{100 * count / total:.1f}" for count in counts.values())
-            rows.append((f"{name}, {policy['name']}", str(total), *cells))
+            rows.append((name, policy["name"], str(total), *cells))
     title = "First push in pairs of tasks that differ in the trap alone, % of pairs"
-    return Table(title, ("pairs", "number", *PUSHES), tuple(rows))
+    return Table(title, ("pair", "agent", "number", *PUSHES), tuple(rows))
 
 
 def mistakes_table(record: Record, policy: Record) -> Table:
