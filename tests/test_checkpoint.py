@@ -11,7 +11,6 @@ from agents.runs.checkpoint import (
     Checkpoints,
     digest,
     from_arrays,
-    subtree,
     to_arrays,
 )
 
@@ -98,12 +97,6 @@ def test_saved_arrays_do_not_share_memory_with_what_is_donated():
     jax.jit(lambda x: x + 1, donate_argnums=0)(state).block_until_ready()
     np.testing.assert_array_equal(arrays["x"], np.zeros(1000))
     assert arrays["x"].base is None
-
-
-def test_parameters_can_be_read_without_the_classes(saved):
-    with Checkpoints(saved) as checkpoints:
-        params = subtree(checkpoints.load()[0], "params")
-    assert_same_bits(params, jax.tree.map(np.asarray, example(4).params))
 
 
 def test_reading_makes_nothing(tmp_path):

@@ -160,7 +160,7 @@ def test_impossible_requests_are_refused(run_path, tmp_path):
         ValueError, match=r"none holds no run; runs in .*; shipped parameters: base"
     ):
         agents.load(tmp_path / "none")
-    with pytest.raises(ValueError, match="iteration names a checkpoint of a run: base is none"):
+    with pytest.raises(ValueError, match="of a run: base is not a run"):
         agents.load("base", iteration=5)
-    with pytest.raises(ValueError, match="seed names a policy of a run: base is none"):
+    with pytest.raises(ValueError, match="base has no seed 0; allowed: none"):
         agents.load("base", seed=0)

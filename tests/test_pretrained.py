@@ -13,7 +13,7 @@ from agents.networks.agent import Agent
 from agents.pretrained.__main__ import main
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.folder import Run, RunFolder
-from agents.runs.loading import load, load_policies
+from agents.runs.loading import load_policies
 
 CONFIG = Config(
     env_id="SymbolicTrapTube-v0",
@@ -148,8 +148,6 @@ def test_a_folder_that_is_no_run_does_not_hide_shipped_parameters(tmp_path, monk
     assert load_policies("base") == ["shipped base"]
     with pytest.raises(ValueError, match=r"holds no run; .*shipped parameters: base"):
         load_policies("./base/.")
-    with pytest.raises(ValueError, match="seed names a policy of a run: base is none"):
-        load("base", seed=1)
 
 
 def test_unknown_parameters_are_refused(run_path, shipped, capsys):

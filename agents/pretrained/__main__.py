@@ -87,15 +87,12 @@ def find_policy(options: Export) -> Policy:
     Raises:
       ValueError: there is no such run, seed or checkpoint.
     """
-    folder, run = RunFolder.open(options.run)
-    seed = run.seed if options.seed is None else options.seed
-    if seed not in run.seed_range:
-        allowed = ", ".join(map(str, run.seed_range))
-        raise ValueError(f"{options.run} has no seed {seed}; allowed: {allowed}")
     if not options.best:
-        return load(options.run, seed=seed, iteration=options.iteration)
+        return load(options.run, seed=options.seed, iteration=options.iteration)
     if options.iteration is not None:
         raise ValueError("--best and --iteration name different parameters; give one")
+    folder, run = RunFolder.open(options.run)
+    seed = run.seed if options.seed is None else options.seed
     kept = list(folder.kept_best(seed).values())
     if not kept:
         raise ValueError(

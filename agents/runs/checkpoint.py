@@ -182,20 +182,6 @@ def from_arrays(arrays: Arrays, template: Tree) -> Tree:
     )
 
 
-def subtree(arrays: Arrays, *path: str) -> dict[str, Any]:
-    """The nested dictionary that lay at `path`; its names come from dictionaries only."""
-    prefix = "".join(name + SEPARATOR for name in path)
-    result: dict[str, Any] = {}
-    for name, array in arrays.items():
-        if name.startswith(prefix):
-            *parents, last = name.removeprefix(prefix).split(SEPARATOR)
-            node = result
-            for parent in parents:
-                node = node.setdefault(parent, {})
-            node[last] = array
-    return result
-
-
 def digest(arrays: Arrays) -> str:
     """A SHA-256 over names, types, shapes and values."""
     total = hashlib.sha256()

@@ -1,16 +1,17 @@
 """Trained policies from wherever they lie: a run, a file of parameters, the shipped ones."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
 from agents import pretrained
 from agents.acting.policy import Policy
 from agents.ppo.learner import make_train
-from agents.runs import checkpoint
-from agents.runs.folder import RunFolder
+from agents.runs.checkpoint import Checkpoints, from_arrays
+from agents.runs.folder import Run, RunFolder
+
+SEED = "seed "  # before its number, the name of a run's policy
 
 
 def load(
@@ -35,16 +36,12 @@ def load(
     Raises:
       ValueError: there is no such policy, or it cannot be read.
     """
-    policies = load_policies(source, iteration)
-    if seed is None:
-        return policies[0]._replace(greedy=greedy)
-    if not _is_run(source):
-        raise ValueError(f"seed names a policy of a run: {source} is none")
-    _, run = RunFolder.open(Path(source))
-    if seed not in run.seed_range:
-        allowed = ", ".join(map(str, run.seed_range))
-        raise ValueError(f"{source} has no seed {seed}; allowed: {allowed}")
-    return policies[run.seed_range.index(seed)]._replace(greedy=greedy)
+    found = {policy.name: policy for policy in load_policies(source, iteration)}
+    name = next(iter(found)) if seed is None else f"{SEED}{seed}"
+    if name not in found:
+        seeds = [each.removeprefix(SEED) for each in found if each.startswith(SEED)]
+        raise ValueError(f"{source} has no seed {seed}; allowed: {', '.join(seeds) or 'none'}")
+    return found[name]._replace(greedy=greedy)
 
 
 def load_policies(source: str | Path, iteration: int | None = None) -> list[Policy]:
@@ -58,7 +55,7 @@ def load_policies(source: str | Path, iteration: int | None = None) -> list[Poli
       ValueError: there is no such policy, or it cannot be read.
     """
     path = Path(source)
-    if _is_run(source):
+    if RunFolder(path).config.is_file():  # another folder does not hide shipped parameters
         return load_run(path, iteration)
     is_file = path.is_file()
     if not is_file and str(source) not in pretrained.names():
@@ -68,7 +65,7 @@ def load_policies(source: str | Path, iteration: int | None = None) -> list[Poli
             shipped = ", ".join(pretrained.names()) or "none"
             raise ValueError(f"{error}; shipped parameters: {shipped}") from error
     if iteration is not None:
-        raise ValueError(f"iteration names a checkpoint of a run: {source} is none")
+        raise ValueError(f"iteration names a checkpoint of a run: {source} is not a run")
     return [pretrained.load(path) if is_file else pretrained.load_shipped(str(source))]
 
 
@@ -83,22 +80,32 @@ def load_run(path: Path, iteration: int | None = None) -> list[Policy]:
       ValueError: there is no run or no such checkpoint, or it cannot be read.
     """
     folder, run = RunFolder.open(path)
-    with checkpoint.Checkpoints(folder.checkpoints) as checkpoints:
+    keys = jax.random.split(jax.random.key(0), run.seeds)
+    expected = {"params": jax.eval_shape(jax.vmap(make_train(run.config).init_params), keys)}
+    with Checkpoints(folder.checkpoints) as checkpoints:
         arrays, record = checkpoints.load(iteration)
-        params = jax.tree.map(jnp.asarray, checkpoint.subtree(arrays, "params"))
-        expected = jax.eval_shape(make_train(run.config).init_params, jax.random.key(0))
+        stored = {name: array for name, array in arrays.items() if name.startswith("params/")}
         try:
-            seeds = [jax.tree.map(lambda x, i=i: x[i], params) for i in range(run.seeds)]
-            checkpoint.from_arrays(checkpoint.to_arrays(seeds[0]), expected)
-        except (ValueError, IndexError) as error:
+            params = from_arrays(stored, expected)["params"]
+        except ValueError as error:
             raise checkpoints.refuse_misfit(record, error) from error
-    iterations = np.broadcast_to(arrays["iteration"], (run.seeds,))
+    return policies(run, params, arrays["iteration"])
+
+
+def policies(run: Run, params: Any, iterations: Any) -> list[Policy]:
+    """The policies of a run, one per seed.
+
+    Args:
+      run: the run.
+      params: the parameters [S, ...] of all seeds.
+      iterations: i32[S], the iterations that they are after.
+    """
     return [
-        Policy(f"seed {seed}", run.config, policy, int(done))
-        for seed, policy, done in zip(run.seed_range, seeds, iterations, strict=True)
+        Policy(
+            f"{SEED}{seed}",
+            run.config,
+            jax.tree.map(lambda x, index=index: x[index], params),
+            int(iterations[index]),
+        )
+        for index, seed in enumerate(run.seed_range)
     ]
-
-
-def _is_run(source: str | Path) -> bool:
-    """Whether it is a run's folder; one of another kind does not hide shipped parameters."""
-    return RunFolder(Path(source)).config.is_file()

@@ -24,6 +24,7 @@ from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
 from agents.runs.compilation import compiled
 from agents.runs.folder import Run, RunFolder, write_json
+from agents.runs.loading import policies
 from agents.runs.metrics import MetricsLog, Row, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.stopping import Stopped, StopSignals
@@ -129,8 +130,8 @@ class Session:
         self.console.print("Evaluating on all task sets ...")
         evaluator, pay = self._ready() if self._results is None else self._results.result()
         state = jax.tree.map(lambda x: x[0], self._placement.local(self._state))
-        policies = self._policies()
-        played = {policy.name: evaluator(policy.params) for policy in policies}
+        trained = self._policies()
+        played = {policy.name: evaluator(policy.params) for policy in trained}
         self.summarize()
         if self._log is None:
             return
@@ -138,7 +139,7 @@ class Session:
             name: scores(outcome, evaluator.tasks, evaluator.limits)
             for name, outcome in played.items()
         }
-        write_json(folder.evaluation, report.results_json(policies, results))
+        write_json(folder.evaluation, report.results_json(trained, results))
         env = tt.task_set(run.config.env_id)
         folder.animation.unlink(missing_ok=True)
         report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
@@ -270,9 +271,9 @@ class Session:
             return rows
         if not (is_due or tracker.is_due(int(rows[0]["iteration"]))):
             return [{**row, **tracker.skip()} for row in rows]
-        policies = dict(zip(self.run.seed_range, self._policies(), strict=True))
+        trained = dict(zip(self.run.seed_range, self._policies(), strict=True))
         by_seed = {int(row["seed"]): row for row in rows}
-        return [{**row, **tracker.evaluate(seed, policies[seed])} for seed, row in by_seed.items()]
+        return [{**row, **tracker.evaluate(seed, trained[seed])} for seed, row in by_seed.items()]
 
     def _save(self) -> None:
         record = {**self._progress.to_dict(), "run": self.run.to_dict(), "version": tt.__version__}
@@ -285,16 +286,7 @@ class Session:
 
     def _policies(self) -> list[Policy]:
         state = self._placement.local(self._state)
-        iterations = np.asarray(state.iteration)
-        return [
-            Policy(
-                f"seed {seed}",
-                self.run.config,
-                jax.tree.map(lambda x, index=index: x[index], state.params),
-                int(iterations[index]),
-            )
-            for index, seed in enumerate(self.run.seed_range)
-        ]
+        return policies(self.run, state.params, np.asarray(state.iteration))
 
     def _summary(self) -> dict[str, Any]:
         state = self._placement.local(self._state)
