@@ -15,7 +15,8 @@ MAX_SEED = 2**31 - 1
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
 FIRST_VERSION = "0.1.0"  # wrote settings without a version
-# Settings of that version that are gone; all but `method` counted with another method than PPO.
+# Settings of that version that are gone. All but `method` had an effect only with another method
+# than PPO.
 GONE = (
     *("method", "task_sets", "tasks", "walkers", "walk_rounds", "walk_steps", "agent_rounds"),
     *("restarts", "advised", "advice", "dataset", "mirrored"),
@@ -63,7 +64,7 @@ class Run:
         return dataclasses.asdict(self)
 
     def check_continues(self, before: "Run") -> None:
-        """Checks that this run, resumed, ends as if it had never been another one.
+        """Checks that continuing `before` as this run gives what this run alone would have given.
 
         Args:
           before: the stored run.
@@ -87,14 +88,16 @@ class Run:
                 )
 
     def _shaping(self) -> dict[str, Any]:
-        """All values, the step limit as it is for what is trained on."""
+        """All values, flat; `max_steps` is the limit that holds for the training set."""
         config = self.config
         limit = config.step_limit(config.env_id)
         return {**self.to_dict(), **config.to_dict(), "max_steps": limit}
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
-        """The inverse of `to_dict`; settings of PPO that are missing or gone since are the paper's.
+        """The inverse of `to_dict`.
+
+        Missing settings are the paper's; those that are gone are dropped if PPO trained the run.
 
         Raises:
           ValueError: a value is missing, unknown or not allowed.
@@ -110,30 +113,37 @@ class Run:
         return cls(**{**values, "config": Config.from_dict(config)})
 
 
-@dataclasses.dataclass(frozen=True)
 class RunFolder:
     """The files of a run.
 
     Attributes:
       path: the folder.
+      config: the settings.
+      metrics: a row per seed and iteration.
+      outcomes: a row per evaluation on several sets: the steps of every task.
+      checkpoints: one folder per checkpoint, named after its iteration.
+      log: what its training showed, where it ran beside others.
+      curves: the learning curves.
+      page: all of it on one page, to open in a browser.
+      evaluation: greedy evaluation on all task sets.
+      summary: when each seed was first solved, and what that took.
+      machines: what it ran on, as far as an experiment noted it.
+      animation: a solved episode.
     """
 
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        """The settings."""
-        return self.path / CONFIG_FILE
-
-    @property
-    def metrics(self) -> Path:
-        """A row per seed and iteration."""
-        return self.path / "metrics.csv"
-
-    @property
-    def outcomes(self) -> Path:
-        """A row per evaluation on several sets: the steps of every task."""
-        return self.path / "outcomes.csv"
+    def __init__(self, path: Path):
+        self.path = path
+        self.config = path / CONFIG_FILE
+        self.metrics = path / "metrics.csv"
+        self.outcomes = path / "outcomes.csv"
+        self.checkpoints = path / "checkpoints"
+        self.log = path / "log.txt"
+        self.curves = path / "curves.png"
+        self.page = path / "report.html"
+        self.evaluation = path / "evaluation.json"
+        self.summary = path / "summary.json"
+        self.machines = path / "machines.json"
+        self.animation = path / "solved.gif"
 
     def best(self, seed: int, iteration: int) -> Path:
         """The parameters of a seed's evaluation on several sets that was the best until then."""
@@ -142,7 +152,7 @@ class RunFolder:
     def kept_best(self, seed: int) -> dict[int, Path]:
         """The files of these parameters that there are, by iteration, in order; the last is best.
 
-        That of an earlier version, which had one without an iteration in its name, is at 0.
+        An earlier version kept one file without an iteration in its name; its key is 0.
         """
         prefix = f"best-seed{seed}-iteration"
         paths = self.path.glob(f"{prefix}*.npz")
@@ -155,46 +165,6 @@ class RunFolder:
     def tested(self, seed: int) -> Path:
         """The steps that these parameters take in the tasks that are reported."""
         return self.path / f"tested-seed{seed}.json"
-
-    @property
-    def checkpoints(self) -> Path:
-        """One folder per checkpoint, named after its iteration."""
-        return self.path / "checkpoints"
-
-    @property
-    def log(self) -> Path:
-        """What its training showed, where it ran beside others."""
-        return self.path / "log.txt"
-
-    @property
-    def curves(self) -> Path:
-        """The learning curves."""
-        return self.path / "curves.png"
-
-    @property
-    def page(self) -> Path:
-        """All of it on one page, to open in a browser."""
-        return self.path / "report.html"
-
-    @property
-    def evaluation(self) -> Path:
-        """Greedy evaluation on all task sets."""
-        return self.path / "evaluation.json"
-
-    @property
-    def summary(self) -> Path:
-        """When each seed was first solved, and what that took."""
-        return self.path / "summary.json"
-
-    @property
-    def machines(self) -> Path:
-        """What it ran on, as far as an experiment noted it."""
-        return self.path / "machines.json"
-
-    @property
-    def animation(self) -> Path:
-        """A solved episode."""
-        return self.path / "solved.gif"
 
     @classmethod
     def create(cls, path: Path, run: Run) -> Self:
@@ -246,7 +216,7 @@ class RunFolder:
 
 
 def check_name(name: str, what: str = "folder") -> None:
-    """Checks that a name is that of a folder, or of another thing, within some folder.
+    """Checks that a name is a plain name, not a path.
 
     Raises:
       ValueError: it is empty, or a path.
@@ -260,7 +230,7 @@ def is_done(folder: RunFolder, run: Run) -> bool:
     summary = read_json(folder.summary)
     if summary is None:
         return False
-    # The summary may be of other limits than those of now, the metrics of an iteration after it.
+    # The summary may have been written under other limits, and the metrics may go on after it.
     rows = [
         row for row in read_metrics(folder.metrics) if row["iteration"] <= summary["iterations"]
     ]

@@ -3,9 +3,9 @@
 import dataclasses
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -34,51 +34,27 @@ FEW_LAYOUTS = (
 )
 
 
-class LiveColumn(NamedTuple):
-    """A column of the live table.
-
-    Attributes:
-      title: its head.
-      metric: the metric that it shows, averaged over seeds.
-      show: number to text.
-    """
-
-    title: str
-    metric: str
-    show: Callable[[float], str]
-
-
-def _integer(value: float) -> str:
-    return f"{value:,.0f}"
-
-
-def _percent(value: float) -> str:
-    return f"{100 * value:.2f}"
-
-
-def _decimal(value: float) -> str:
-    return f"{value:.3g}"
-
-
+# Of the live table: head, metric, and the format of its mean over seeds.
 LIVE_COLUMNS = (
-    LiveColumn("iter", "iteration", _integer),
-    LiveColumn("episodes", "episodes", _integer),
-    LiveColumn("steps/s", "transitions_per_second", _integer),
-    LiveColumn("solved%", "success", _percent),
-    LiveColumn("greedy%", "evaluation", _percent),
-    LiveColumn("intrins.", "intrinsic_reward", _decimal),
-    LiveColumn("policy", "policy_loss", _decimal),
-    LiveColumn("value", "value_loss", _decimal),
-    LiveColumn("forward", "forward_loss", _decimal),
-    LiveColumn("inverse", "inverse_loss", _decimal),
-    LiveColumn("entropy", "entropy", _decimal),
+    ("iter", "iteration", ",.0f"),
+    ("episodes", "episodes", ",.0f"),
+    ("steps/s", "transitions_per_second", ",.0f"),
+    ("solved%", "success", ".2%"),
+    ("greedy%", "evaluation", ".2%"),
+    ("intrins.", "intrinsic_reward", ".3g"),
+    ("policy", "policy_loss", ".3g"),
+    ("value", "value_loss", ".3g"),
+    ("forward", "forward_loss", ".3g"),
+    ("inverse", "inverse_loss", ".3g"),
+    ("entropy", "entropy", ".3g"),
 )
 
 
 class LiveReport:
     """Shows training as it goes: a live table on a terminal, else a line per iteration.
 
-    A context manager. Numbers are means over the seeds that still train.
+    A context manager. Numbers are means over the seeds that still train;
+    steps/s is their sum.
     """
 
     def __init__(self, console: Console, total_iterations: int, num_seeds: int):
@@ -114,21 +90,20 @@ class LiveReport:
         self._shown_at = now
         mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
         mean["transitions_per_second"] *= len(rows)
-        is_first = not self._rows
         self._rows.append(mean)
         if self._live is None:
-            self._print_line(mean, is_first, num_solved)
+            self._print_line(mean, num_solved)
         else:
             self._live.update(Group(self._table(), self._status(mean, num_solved)), refresh=True)
 
-    def _columns(self) -> list[LiveColumn]:
-        return [entry for entry in LIVE_COLUMNS if entry.metric in self._rows[0]]
+    def _columns(self) -> list[tuple[str, str, str]]:
+        return [column for column in LIVE_COLUMNS if column[1] in self._rows[0]]
 
-    def _print_line(self, mean: Row, is_first: bool, num_solved: int) -> None:
+    def _print_line(self, mean: Row, num_solved: int) -> None:
         columns = self._columns()
-        if is_first:
-            self._line([entry.title for entry in columns])
-        self._line([entry.show(mean[entry.metric]) for entry in columns], self._left(num_solved))
+        if len(self._rows) == 1:
+            self._line([head for head, _, _ in columns])
+        self._line(_cells(mean, columns), self._left(num_solved))
 
     def _line(self, cells: Sequence[str], rest: str = "") -> None:
         text = " ".join(f"{cell:>9}" for cell in cells)
@@ -137,10 +112,10 @@ class LiveReport:
     def _table(self) -> Table:
         columns = self._columns()[: self._console.width // LIVE_WIDTH]
         table = Table(**TABLE_STYLE)
-        for entry in columns:
-            table.add_column(entry.title, justify="right", no_wrap=True)
+        for head, _, _ in columns:
+            table.add_column(head, justify="right", no_wrap=True)
         for row in self._rows:
-            table.add_row(*(entry.show(row[entry.metric]) for entry in columns))
+            table.add_row(*_cells(row, columns))
         return table
 
     def _status(self, mean: Row, num_solved: int) -> Text:
@@ -152,6 +127,11 @@ class LiveReport:
         seconds = remaining * float(np.mean(self._durations))
         text = f"{duration(seconds)} left at most"
         return text if self._num_seeds == 1 else f"{num_solved}/{self._num_seeds} solved, {text}"
+
+
+def _cells(mean: Row, columns: Sequence[tuple[str, str, str]]) -> list[str]:
+    """Where these are percentages, the head says so."""
+    return [format(mean[metric], form).removesuffix("%") for _, metric, form in columns]
 
 
 def duration(seconds: float) -> str:
