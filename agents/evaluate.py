@@ -25,7 +25,7 @@ class Options:
     """Evaluates a trained agent greedily, on fixed tasks drawn with keys that training never draws.
 
     Attributes:
-      run: a run's folder, or a file of parameters.
+      run: a run's folder, a file of parameters, or the name of shipped ones.
       pretrained: the name of shipped parameters, instead of a run.
       sets: ids or short names of task sets; the paper's eight, and that of training, if absent.
       imports: modules of your own to import first, for the sets that they register; those of
@@ -96,10 +96,14 @@ def evaluate(options: Options) -> None:
         for name, outcome in played.items()
     }
     console = Console()
-    source = "pretrained" if options.run is None else options.run.name
+    source = "pretrained" if options.run is None else options.run.resolve().name
     for policy in policies:
         title = f"{source}, {policy.name}, iteration {policy.iteration}"
-        console.print(report.evaluation_table(results[policy.name], title))
+        console.print(report.evaluation_table(results[policy.name], title).to_rich())
+        if options.optimality:
+            console.print(report.optimality_table(results[policy.name], title).to_rich())
+    if any(score.layouts for result in results.values() for score in result):
+        console.print(report.FEW_LAYOUTS)
     if options.json is not None:
         write_json(options.json, report.results_json(policies, results))
         console.print(f"results: {options.json}", soft_wrap=True)

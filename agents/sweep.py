@@ -15,13 +15,12 @@ import trap_tube_jax as tt
 from agents.config import PRESETS, Config
 from agents.experiments import figures, workers
 from agents.experiments.statistics import Spread
-from agents.experiments.tables import Table
 from agents.experiments.training import FOLDER_NAME, find_runs, plan_runs
 from agents.ppo.learner import make_train
 from agents.runs.folder import check_name, is_done, write_json
-from agents.runs.report import NOTHING
 from agents.runs.results import results
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
+from agents.runs.table import NOTHING, Table
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
 
 PERCENT = "percent_"

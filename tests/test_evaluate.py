@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 import trap_tube_jax as tt
 from agents import make_train
@@ -246,7 +247,7 @@ def test_a_page_needs_no_network_and_holds_the_settings(page):
     text = page[0].read_text()
     assert "<h1>&lt;mine&gt;</h1>" in text
     assert "<td>hidden</td><td>4</td>" in text
-    assert "<td>{P}</td><td>2</td>" in text
+    assert "<td>{P} (p)</td><td>2</td>" in text
     assert not re.search(r"https?:|(src|href)=\"(?!data:)", text)
 
 
@@ -380,6 +381,22 @@ def test_few_layouts_are_counted_and_have_no_interval():
     assert (score.percent, score.interval, score.layouts) == (60.0, None, Layouts(1, 2))
     assert str(score.layouts) == "1 of 2"
     assert Score.of("p", "{P}", solved, np.full(5, 9)).layouts is None
+
+
+def test_a_narrow_terminal_shows_tables_whole():
+    solved, length = np.arange(1000) < 999, np.full(1000, 33)
+    compared, layout = Optimality(999, 100.0, 0.9876, 0.1234), np.arange(1000) % 5
+    scores = [
+        Score.of("stsy", "{St, Sy}", solved, length, layout=layout),
+        Score.of("pstsy", "{P, St, Sy}", solved, length, optimality=compared),
+    ]
+    console = Console(record=True, width=80)
+    for table in (report.evaluation_table(scores, "x"), report.optimality_table(scores, "x")):
+        console.print(table.to_rich())
+    lines = [line.split() for line in console.export_text().splitlines()]
+    assert ["{St,", "Sy}", "(stsy)", "1000", "99.9", "5", "of", "5", "–", "33.0"] in lines
+    assert ["{P,", "St,", "Sy}", "(pstsy)", "1000", "99.9", "–", "99.4–100.0", "33.0"] in lines
+    assert ["{P,", "St,", "Sy}", "(pstsy)", "100.0", "0.988", "0.123"] in lines
 
 
 def test_refusals():

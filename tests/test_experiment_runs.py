@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from test_experiments import refused
+from test_train import TIMING_COLUMNS
 
 import trap_tube_jax as tt
 from agents import pretrained
@@ -32,7 +33,7 @@ from agents.ppo.learner import make_train
 from agents.runs import report, session, stopping, tracking
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays
 from agents.runs.folder import Run, RunFolder
-from agents.runs.metrics import TIMING_COLUMNS, MetricsLog, read_metrics
+from agents.runs.metrics import MetricsLog, read_metrics
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
 ROOT = Path(__file__).parent.parent

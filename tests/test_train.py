@@ -22,7 +22,7 @@ from agents.ppo.learner import Learner, make_train
 from agents.runs import compilation
 from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
-from agents.runs.metrics import TIMING_COLUMNS, FirstSolved, MetricsLog, is_last, read_metrics
+from agents.runs.metrics import FirstSolved, MetricsLog, is_last, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.session import make_advance
 from agents.runs.stopping import StopSignals
@@ -35,6 +35,7 @@ TINY = [
     *("--filters", "2", "2", "--hidden", "4", "--embedding", "2", "--eval-episodes", "2"),
 ]
 ITERATIONS = 30
+TIMING_COLUMNS = ("seconds", "transitions_per_second")  # of the metrics, differ each time
 
 
 def start(module, *arguments, cwd=ROOT):

@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import NamedTuple
 
-from rich.table import Table as RichTable
-
 from agents.experiments import statistics
 from agents.experiments.protocol import PRESET, PROTOCOLS
 from agents.experiments.records import Record
 from agents.experiments.statistics import Spread
-from agents.runs.report import FEW_LAYOUTS, NOTHING, TABLE_STYLE, duration
+from agents.runs.report import FEW_LAYOUTS, duration
+from agents.runs.table import NOTHING, Table, number
 from trap_tube_jax.scoring.scores import Layouts
 from trap_tube_jax.scoring.tasks import label
 
@@ -52,35 +51,6 @@ INTERVAL = "[95 % confidence interval of the mean, Student t over seeds]"
 SPREAD = f"mean ± sd {INTERVAL}"
 MOST_COLUMNS = 4  # of algorithms beside each other; more of them are rows
 MEAN_OF_SETS = "mean of the sets apart from base"
-
-
-class Table(NamedTuple):
-    """A table of text.
-
-    Attributes:
-      title: above it.
-      heads: of the columns.
-      rows: cells, as many as heads; the first one names the row.
-    """
-
-    title: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    def to_markdown(self) -> str:
-        """The table in Markdown, without its title."""
-        rule = ("---", *["---:"] * (len(self.heads) - 1))
-        return "\n".join(f"| {' | '.join(row)} |" for row in (self.heads, rule, *self.rows))
-
-    def to_rich(self) -> RichTable:
-        """The table for a terminal."""
-        table = RichTable(title=self.title, title_justify="left", **TABLE_STYLE)
-        for index, head in enumerate(self.heads):
-            width = max(map(len, head.split()))
-            table.add_column(head, justify="right" if index else "left", min_width=width)
-        for row in self.rows:
-            table.add_row(*row)
-        return table
 
 
 def tables(record: Record) -> list[Table]:

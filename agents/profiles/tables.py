@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from agents.experiments.records import Record
-from agents.experiments.tables import Table, provenance
+from agents.experiments.tables import provenance
 from agents.profiles import summary
 from agents.profiles.mistakes import NEVER, NO_PUSH, SUBGOALS
 from agents.profiles.summary import OUTCOMES, PUSHES, SOLVED, TURNS, UNTOUCHED, Outcome
 from agents.profiles.tasks import BASE
-from agents.runs.report import NOTHING
+from agents.runs.table import NOTHING, Table
 from trap_tube_jax.objects import DIRECTION_NAMES
 
 AXES = {

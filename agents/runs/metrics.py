@@ -8,14 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from agents.config import Config
 
 Row = Mapping[str, float | int]
-
-LEADING_COLUMNS = ("seed", "iteration", "episodes", "transitions")
-TIMING_COLUMNS = ("seconds", "transitions_per_second")
 
 
 class MetricsLog:
@@ -45,9 +40,9 @@ class MetricsLog:
     def _write(self, file: Any, rows: Sequence[Row]) -> None:
         writer = csv.writer(file, lineterminator="\n")
         if rows and not self._columns:
-            self._columns = _columns(rows[0])
+            self._columns = list(rows[0])
             writer.writerow(self._columns)
-        writer.writerows([_text(row.get(name, math.nan)) for name in self._columns] for row in rows)
+        writer.writerows([row.get(name, math.nan) for name in self._columns] for row in rows)
         self.rows.extend(rows)
 
 
@@ -118,27 +113,8 @@ def is_last(row: Row, config: Config) -> bool:
     return limit is not None and row["transitions"] + config.longest_iteration > limit
 
 
-def _columns(row: Row) -> list[str]:
-    inner = sorted(set(row) - {*LEADING_COLUMNS, *TIMING_COLUMNS})
-    return [
-        *(name for name in LEADING_COLUMNS if name in row),
-        *inner,
-        *(name for name in TIMING_COLUMNS if name in row),
-    ]
-
-
-def _text(value: float | int) -> str:
-    """The shortest text that reads back as the same number."""
-    return str(value)
-
-
 def _number(text: str) -> float | int:
     try:
         return int(text)
     except ValueError:
         return float(text)
-
-
-def column(rows: Iterable[Row], name: str) -> np.ndarray:
-    """The values f64[n] of one column."""
-    return np.array([row[name] for row in rows], np.float64)

@@ -9,27 +9,24 @@ from typing import Any, Self
 
 import jax
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.acting.policy import Policy
-from agents.runs.metrics import FirstSolved, Row, column
+from agents.runs.metrics import FirstSolved, Row
+from agents.runs.table import NOTHING, STYLE, Table, number
 from trap_tube_jax.gallery import episode_frames
 from trap_tube_jax.rendering import save_gif
 from trap_tube_jax.scoring.scores import Score
-from trap_tube_jax.state import State
 
-TABLE_STYLE: dict[str, Any] = {"box": SIMPLE_HEAD, "padding": (0, 0, 0, 1), "pad_edge": False}
 LIVE_ROWS = 10
 LIVE_WIDTH = 10  # characters of a column; a narrow terminal shows the first columns only
 CELL_SIZE = 24  # pixels
-NOTHING = "–"
 FEW_LAYOUTS = (
-    "Sets without {P} have one or five layouts, in one or any colours: for these the table "
+    "Sets without {P} have one or five layouts, whose colours may vary: for these the table "
     "counts the layouts solved in more than half of their draws, and gives no interval."
 )
 
@@ -109,9 +106,9 @@ class LiveReport:
         text = " ".join(f"{cell:>9}" for cell in cells)
         self._console.print(Text(f"{text}  {rest}".rstrip()), soft_wrap=True)
 
-    def _table(self) -> Table:
+    def _table(self) -> RichTable:
         columns = self._columns()[: self._console.width // LIVE_WIDTH]
-        table = Table(**TABLE_STYLE)
+        table = RichTable(**STYLE)
         for head, _, _ in columns:
             table.add_column(head, justify="right", no_wrap=True)
         for row in self._rows:
@@ -143,60 +140,52 @@ def duration(seconds: float) -> str:
 
 def evaluation_table(scores: Sequence[Score], title: str) -> Table:
     """The scores of a policy, one set per row."""
-    table = Table(title=f"Greedy evaluation: {title}", title_justify="left", **TABLE_STYLE)
-    table.add_column("set", no_wrap=True)
-    heads = ["tasks", "solved %", "95 % interval", "steps"]
-    with_layouts = any(score.layouts is not None for score in scores)
-    if with_layouts:
-        heads.insert(2, "layouts solved")
-    with_optimality = any(score.optimality is not None for score in scores)
-    if with_optimality:
-        heads += ["of solvable", "optimal", "worst"]
-    for head in heads:
-        # Heads break between words; nothing in a narrow terminal breaks within one.
-        table.add_column(head, justify="right", min_width=max(map(len, head.split())))
-    for score in scores:
-        table.add_row(*_score_cells(score, with_layouts, with_optimality))
-    if with_layouts:
-        table.caption = FEW_LAYOUTS
-        table.caption_justify = "left"
-    return table
-
-
-def _score_cells(score: Score, with_layouts: bool, with_optimality: bool) -> list[str]:
-    interval = NOTHING if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval)
-    cells = [
-        f"{score.label} ({score.set})" if score.label != score.set else score.label,
-        str(score.tasks),
-        f"{score.percent:.1f}",
+    rows = [
+        (
+            _set_name(score),
+            str(score.tasks),
+            f"{score.percent:.1f}",
+            NOTHING if score.layouts is None else str(score.layouts),
+            NOTHING if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval),
+            number(score.mean_steps, ".1f"),
+        )
+        for score in scores
     ]
-    if with_layouts:
-        cells.append(NOTHING if score.layouts is None else str(score.layouts))
-    cells += [interval, _optional(score.mean_steps, ".1f")]
-    if with_optimality and score.optimality is not None:
-        found = score.optimality
-        cells.append(_optional(found.percent_of_solvable, ".1f"))
-        cells += [_optional(found.mean, ".3f"), _optional(found.worst, ".3f")]
-    return cells
+    heads = ("set", "tasks", "solved %", "layouts solved", "95 % interval", "steps")
+    return Table(f"Greedy evaluation: {title}", heads, tuple(rows))
 
 
-def _optional(value: float | None, form: str) -> str:
-    return NOTHING if value is None else format(value, form)
+def optimality_table(scores: Sequence[Score], title: str) -> Table:
+    """How the play of a policy compares with shortest plans, where that was searched for."""
+    rows = [
+        (
+            _set_name(score),
+            number(found.percent_of_solvable, ".1f"),
+            number(found.mean, ".3f"),
+            number(found.worst, ".3f"),
+        )
+        for score in scores
+        if (found := score.optimality) is not None
+    ]
+    heads = ("set", "of solvable %", "optimality", "worst")
+    return Table(f"Shortest plan / steps taken, where solved: {title}", heads, tuple(rows))
+
+
+def _set_name(score: Score) -> str:
+    return f"{score.label} ({score.set})" if score.label != score.set else score.label
 
 
 def summary_table(solved: Mapping[int, FirstSolved | None], env: str) -> Table:
     """When each seed was first solved."""
-    table = Table(title=f"First solved on {env}", title_justify="left", **TABLE_STYLE)
-    for head in ("seed", "iteration", "episodes", "transitions", "training time"):
-        table.add_column(head, justify="right")
+    rows: list[tuple[str, ...]] = []
     for seed, first in solved.items():
-        if first is None:
-            table.add_row(str(seed), *["–"] * 4)
-        else:
+        cells = [NOTHING] * 4
+        if first is not None:
             counts = (first.iteration, first.episodes, first.transitions)
-            cells = [f"{count:,}" for count in counts]
-            table.add_row(str(seed), *cells, duration(first.seconds))
-    return table
+            cells = [*(f"{count:,}" for count in counts), duration(first.seconds)]
+        rows.append((str(seed), *cells))
+    heads = ("seed", "iteration", "episodes", "transitions", "training time")
+    return Table(f"First solved on {env}", heads, tuple(rows))
 
 
 PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
@@ -271,8 +260,8 @@ def _draw_panel(axis: Any, rows: Sequence[Row], metrics: Sequence[str]) -> None:
             of_seed = [row for row in rows if row["seed"] == seed]
             label = metric.replace("_", " ") if seed == seeds[0] else None
             axis.plot(
-                column(of_seed, "episodes"),
-                column(of_seed, metric),
+                [row["episodes"] for row in of_seed],
+                [row[metric] for row in of_seed],
                 color=color,
                 linewidth=1.2,
                 alpha=1.0 if len(seeds) == 1 else 0.6,
@@ -307,14 +296,9 @@ def save_first_solved(
                 index = int(np.argmax(outcome.solved))
                 actions = np.asarray(outcome.action[index, : outcome.length[index]])
                 state = jax.tree.map(lambda x, i=index: x[i], evaluator.tasks[name])
-                save_episode(state, actions, path)
+                save_gif(episode_frames(state, actions, CELL_SIZE), path, fps=4)
                 return name
     return None
-
-
-def save_episode(state: State, actions: np.ndarray, path: Path) -> None:
-    """Writes a GIF of an episode: `actions` i32[T, 2] from one `state` at time 0."""
-    save_gif(episode_frames(state, actions, CELL_SIZE), path, fps=4)
 
 
 def results_json(

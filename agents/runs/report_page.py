@@ -7,7 +7,7 @@ import json
 import string
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from agents.acting.evaluation import Evaluation, Evaluator, play_greedily
 from agents.config import Config
 from agents.ppo.learner import TrainState, make_train
 from agents.runs.compilation import compiled
-from agents.runs.report import FEW_LAYOUTS, NOTHING
+from agents.runs.report import FEW_LAYOUTS, evaluation_table
 from trap_tube_jax import solver
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
 from trap_tube_jax.rendering import episode_frames
@@ -106,52 +106,6 @@ choose();
 """)
 
 
-class Replay(NamedTuple):
-    """What actions do in a task.
-
-    Attributes:
-      frames: before each step and after the last, the number of a picture.
-      actions: of each step, in words.
-    """
-
-    frames: list[int]
-    actions: list[str]
-
-    @classmethod
-    def of(cls, state: State, actions: np.ndarray, pictures: dict[bytes, int]) -> "Replay":
-        """The replay of actions i32[T, 2], padded with -1; adds its pictures to `pictures`."""
-        taken = actions[(actions >= 0).all(axis=1)]
-        frames = episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]
-        return cls(
-            frames=[pictures.setdefault(frame.tobytes(), len(pictures)) for frame in frames],
-            actions=[
-                f"grasp {DIRECTION_NAMES[grasp]}, move {DIRECTION_NAMES[move]}"
-                for grasp, move in taken.tolist()
-            ],
-        )
-
-
-class Episode(NamedTuple):
-    """An episode of greedy play.
-
-    Attributes:
-      title: what to call it.
-      solved: whether it was.
-      frames: as in `Replay`; likewise `actions`.
-      values: f32 of each step, what the network expects.
-      novelty: f32 of each step, the intrinsic reward before scaling.
-      plan: the oracle's shortest plan; no action if there is none.
-    """
-
-    title: str
-    solved: bool
-    frames: list[int]
-    actions: list[str]
-    values: list[float]
-    novelty: list[float]
-    plan: dict[str, Any]
-
-
 def save(
     path: Path,
     *,
@@ -178,7 +132,7 @@ def save(
       pay: from tasks to the intrinsic reward of this policy's play; see `compile_pay`.
     """
     episodes, pictures = _episodes(evaluator, played, pay)
-    data = json.dumps({"episodes": [each._asdict() for each in episodes], "pictures": pictures})
+    data = json.dumps({"episodes": episodes, "pictures": pictures})
     page = PAGE.substitute(
         title=html.escape(title),
         sentences="\n".join(f"<p>{html.escape(line)}</p>" for line in sentences if line),
@@ -192,19 +146,8 @@ def save(
 
 
 def _score_table(name: str, scores: Sequence[Score]) -> str:
-    heads = (name, "tasks", "solved %", "layouts solved", "95 % interval", "steps")
-    rows = [
-        (
-            score.label,
-            score.tasks,
-            f"{score.percent:.1f}",
-            score.layouts or NOTHING,
-            NOTHING if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval),
-            NOTHING if score.mean_steps is None else f"{score.mean_steps:.1f}",
-        )
-        for score in scores
-    ]
-    return _table(heads, rows)
+    table = evaluation_table(scores, name)
+    return _table((name, *table.heads[1:]), table.rows)
 
 
 def _table(heads: Sequence[Any], rows: Iterable[Sequence[Any]]) -> str:
@@ -238,7 +181,7 @@ def compile_pay(config: Config, state: TrainState, evaluator: Evaluator) -> Pay:
 
 def _episodes(
     evaluator: Evaluator, played: Mapping[str, Evaluation], pay: Callable[[State], jax.Array]
-) -> tuple[list[Episode], list[str]]:
+) -> tuple[list[dict[str, Any]], list[str]]:
     """The first solved and the first unsolved episode of each set, and their pictures as PNG.
 
     Sets are left out once there are too many pictures.
@@ -254,7 +197,7 @@ def _episodes(
     # Always as many, so that what plays them is compiled in time.
     unused = [states[0]] * (EPISODES_OF_A_SET * len(evaluator.tasks) - len(states))
     novelty = np.asarray(pay(jax.tree.map(lambda *x: np.stack(x), *states, *unused)))
-    episodes: list[Episode] = []
+    episodes: list[dict[str, Any]] = []
     pictures: dict[bytes, int] = {}
     for (name, index), state, plan, paid in zip(shown, states, plans, novelty, strict=False):
         if len(pictures) <= MAX_PICTURES:
@@ -270,22 +213,52 @@ def _episode(
     plan: np.ndarray,
     novelty: np.ndarray,
     pictures: dict[bytes, int],
-) -> Episode:
-    """One episode, the plan i32[L, 2] for its task, and the intrinsic reward f32[T] it earned."""
+) -> dict[str, Any]:
+    """One episode, the plan i32[L, 2] for its task, and the intrinsic reward f32[T] it earned.
+
+    Returns:
+      `title`, what to call it; `solved`, whether it was; `frames` and `actions` as `_replay`
+      gives them; `values`, f32 of each step, what the network expects; `novelty`, f32 of each
+      step, the intrinsic reward before scaling; `plan`, the replay of the oracle's shortest plan,
+      without actions if there is none.
+    """
     solved, length = bool(outcome.solved[index]), int(outcome.length[index])
     # Without a direction nothing changes: all episodes and plans are as long, and compile as one.
     longest = max(outcome.action.shape[1], len(plan))
     taken, ideal = np.full((2, longest, 2), NO_DIRECTION)
     taken[:length] = outcome.action[index, :length]
     ideal[: len(plan)] = plan
-    return Episode(
-        f"{label(name)}, task {index}: {'solved' if solved else 'not solved'}",
-        solved,
-        *Replay.of(state, taken, pictures),
-        values=[round(float(value), 4) for value in outcome.value[index, :length]],
-        novelty=[round(float(reward), 4) for reward in novelty[:length]],
-        plan=Replay.of(state, ideal, pictures)._asdict(),
-    )
+    return {
+        "title": f"{label(name)}, task {index}: {'solved' if solved else 'not solved'}",
+        "solved": solved,
+        **_replay(state, taken, pictures),
+        "values": [round(float(value), 4) for value in outcome.value[index, :length]],
+        "novelty": [round(float(reward), 4) for reward in novelty[:length]],
+        "plan": _replay(state, ideal, pictures),
+    }
+
+
+def _replay(state: State, actions: np.ndarray, pictures: dict[bytes, int]) -> dict[str, Any]:
+    """What actions i32[T, 2], padded with -1, do in a task.
+
+    Args:
+      state: the task.
+      actions: the actions.
+      pictures: the number of each picture; those of the replay are added.
+
+    Returns:
+      `frames`, the number of a picture before each step and after the last; `actions`, those of
+      each step in words.
+    """
+    taken = actions[(actions >= 0).all(axis=1)]
+    frames = episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]
+    return {
+        "frames": [pictures.setdefault(frame.tobytes(), len(pictures)) for frame in frames],
+        "actions": [
+            f"grasp {DIRECTION_NAMES[grasp]}, move {DIRECTION_NAMES[move]}"
+            for grasp, move in taken.tolist()
+        ],
+    }
 
 
 def _png(pixels: bytes) -> bytes:

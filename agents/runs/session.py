@@ -148,8 +148,10 @@ class Session:
         self._save_page(story, evaluator, played, results, functools.partial(pay, state))
         self._say(story.before)
         for name, result in results.items():
-            self.console.print(report.evaluation_table(result, f"{folder.path.name}, {name}"))
-        self.console.print(report.summary_table(solved, env.id))
+            table = report.evaluation_table(result, f"{folder.path.name}, {name}")
+            self.console.print(table.to_rich())
+        self.console.print(report.FEW_LAYOUTS)
+        self.console.print(report.summary_table(solved, env.id).to_rich())
         self._say_where()
         self._say(story.after)
 

@@ -66,11 +66,11 @@ class Tracker:
             self._best[seed] = max(self._best[seed], overall)
 
     def is_due(self, iteration: int) -> bool:
-        """Whether this iteration is among those that are evaluated in any case."""
+        """Whether this iteration is among those that are evaluated regularly."""
         return iteration % self._every == 0
 
     def forget(self, iteration: int) -> None:
-        """Deletes the parameters that are not the best of any iteration from this one on."""
+        """Deletes parameters that were no longer the best at this iteration."""
         for seed in self._best:
             before = [
                 path for done, path in self._folder.kept_best(seed).items() if done <= iteration
@@ -117,6 +117,6 @@ def _columns(played: Mapping[str, Evaluation]) -> dict[str, int]:
     """A column for each task, in the order of their names."""
     return {
         f"{name}{SEPARATOR}{index:05d}": int(count)
-        for name, steps in steps_taken(played).items()
+        for name, steps in sorted(steps_taken(played).items())
         for index, count in enumerate(steps)
     }
