@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,13 +15,15 @@ from rich.console import Console
 import trap_tube_jax as tt
 from agents.config import PRESETS, Config
 from agents.experiments import figures, workers
+from agents.experiments.protocol import parse_value
 from agents.experiments.statistics import Spread
+from agents.experiments.tables import spread_text
 from agents.experiments.training import FOLDER_NAME, find_runs, plan_runs
 from agents.ppo.learner import make_train
 from agents.runs.folder import check_name, is_done, write_json
 from agents.runs.results import results
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
-from agents.runs.table import NOTHING, Table
+from agents.runs.table import Table
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
 
 PERCENT = "percent_"
@@ -108,10 +111,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             options = tyro.cli(Options, args=arguments, prog="python -m agents.sweep")
             jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
             failed = run(options, console, stop)
-    except (Stopped, KeyboardInterrupt) as stopped:
+    except (Stopped, KeyboardInterrupt):
         console.print("Stopped. The same command continues.")
-        number = stopped.signal if isinstance(stopped, Stopped) else stop.received
-        raise SystemExit(128 + (number or 2)) from None
+        raise SystemExit(128 + (stop.received or signal.SIGINT)) from None
     raise SystemExit(1 if failed else 0)
 
 
@@ -203,10 +205,7 @@ def point_name(settings: dict[str, Any]) -> str:
 
 def _mean(values: Sequence[float | None], form: str) -> str:
     spread = Spread.of(values)
-    if spread is None:
-        return NOTHING
-    mean = format(spread.mean, form)
-    return mean if spread.sd is None else f"{mean} ± {format(spread.sd, form)}"
+    return spread_text(spread and spread._replace(margin=None), form)
 
 
 def _values(text: str) -> tuple[str, list[Any]]:
@@ -216,14 +215,7 @@ def _values(text: str) -> tuple[str, list[Any]]:
     try:
         return name, json.loads(f"[{values}]")
     except ValueError:
-        return name, [_value(value) for value in values.split(",")]
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+        return name, [parse_value(value) for value in values.split(",")]
 
 
 def _text(value: Any) -> str:

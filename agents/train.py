@@ -1,7 +1,6 @@
 """Training from the command line: python -m agents.train --help."""
 
 import dataclasses
-import os
 import signal
 import sys
 import traceback
@@ -34,9 +33,10 @@ class Selection(processes.Job):
 
     Attributes:
       preset: the named settings to start from.
-      imports: modules of your own to import first, for the curiosities, encoders and task sets
-        that they register; the same as --imports.
-      env: the task set to train on, by id or short name; the same as --env-id.
+      imports: modules of your own, for the curiosities, encoders and task sets that they
+        register; read first, before all other options; use it rather than --imports.
+      env: the task set to train on, by id or short name; read first, before all other options;
+        use it rather than --env-id.
       seed: the first seed.
       seeds: how many seeds to train side by side, from --seed on.
       name: the run's folder within --out; <preset>-<task set>-<seed> if absent.
@@ -45,8 +45,8 @@ class Selection(processes.Job):
         are the defaults then, and only --iterations, --max-transitions and
         --stop-when-solved may change.
       devices: how many devices share the episodes and seeds, or `all` there are. On a CPU a
-        device is a core, and up to 4 share them unless said otherwise; else one, or with several
-        processes all of theirs.
+        device is a core, and up to 4 share them unless said otherwise. Of other devices one is
+        used, or all where there are several processes.
     """
 
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
@@ -125,7 +125,7 @@ def train(arguments: Sequence[str]) -> None:
         if isinstance(stopped, Stopped):
             stop.end_process()  # the exit may have to wait for what compiles in the background
             raise SystemExit(128 + stopped.signal) from None
-        end_at_once(128 + (stop.received or signal.SIGINT))
+        processes.leave(128 + (stop.received or signal.SIGINT))
     except (jax.errors.JaxRuntimeError, ValueError) as error:
         end_without_peers(error, f"Iteration {session.saved} is saved. {resume}")
     finally:
@@ -242,16 +242,6 @@ def run_path(selection: Selection, env_id: str) -> Path:
     name = selection.name or f"{selection.preset}-{short}-{selection.seed}{last}"
     check_name(name)
     return selection.out / name
-
-
-def end_at_once(code: int) -> NoReturn:
-    """Ends this process without waiting for what compiles in the background.
-
-    What it has written is on disk; a checkpoint that it was writing is as if it had not begun.
-    """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
 
 
 def end_without_peers(error: Exception, advice: str) -> NoReturn:

@@ -28,7 +28,7 @@ from agents.config import Config
 from agents.experiments import __main__ as experiments
 from agents.experiments import figures, records, reporting, statistics, tables, training
 from agents.experiments.protocol import Protocol
-from agents.parallel.sharding import ALONE
+from agents.parallel.sharding import ALONE, Placement
 from agents.ppo.learner import make_train
 from agents.runs import report, session, stopping, tracking
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays
@@ -408,7 +408,9 @@ def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
         if not folder.path.exists():
             RunFolder.create(folder.path, run)
         console = Console(file=io.StringIO())
-        part = session.Session(folder, run, console, checkpoint_every=3, keep=1)
+        part = session.Session(
+            folder, run, console, checkpoint_every=3, keep=1, placement=Placement()
+        )
         part.train(stopping.StopSignals(lambda: None))
         part.summarize()
         part.close()

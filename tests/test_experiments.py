@@ -132,8 +132,7 @@ def test_any_sets_are_trained_and_evaluated_on():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_ppo_is_ppo_alone_in_every_preset(preset):
-    learner = {"method": "ppo"} if "method" in PRESETS[preset] else {}
-    protocol = Protocol(preset=preset, settings=learner)
+    protocol = Protocol(preset=preset)
     whole = protocol.config("preset")
     for name in ("ppo", "ppo+icm", "ppo+counts"):
         config = protocol.config(name)

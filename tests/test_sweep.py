@@ -197,7 +197,7 @@ def test_a_run_is_done_when_it_has_reached_the_threshold_of_now(finished):
     assert done(1.0)
     assert not done(0.0)
     assert done(0.0, iterations=3)
-    folder.metrics.write_text(folder.metrics.read_text().replace(",1.0,", ",0.75,"))
+    folder.metrics.write_text(folder.metrics.read_text().replace(",1.0\n", ",0.75\n"))
     assert done(0.75)
     assert not done(1.0)  # its summary says that it was solved, by a lower threshold
     MetricsLog(folder.metrics, last_iteration=3).append(

@@ -70,10 +70,15 @@ def parse_setting(text: str) -> tuple[str, Any]:
         raise ValueError(f"settings are given as NAME=VALUE, got {text!r}")
     if name in OWN_OPTIONS:
         raise ValueError(f"{name} is none of --settings; give {OWN_OPTIONS[name]}")
+    return name, parse_value(value)
+
+
+def parse_value(text: str) -> Any:
+    """A value as JSON has it; other text is itself."""
     try:
-        return name, json.loads(value)
+        return json.loads(text)
     except ValueError:
-        return name, value
+        return text
 
 
 COMMA = re.compile(r",(?![^\[]*\])")  # but not those in a list

@@ -87,9 +87,11 @@ def solved_table(record: Record) -> Table:
     for entry in record["algorithms"]:
         episodes = statistics.episodes_to_solve(entry)
         trials = f"{len(episodes)} / {len(entry['runs'])}"
-        rows.append((algorithm_label(record, entry), trials, _spread(Spread.of(episodes), ",.0f")))
+        rows.append(
+            (algorithm_label(record, entry), trials, spread_text(Spread.of(episodes), ",.0f"))
+        )
     for name, (trials, paper) in PAPER_SOLVED.items() if is_of_paper(record) else ():
-        rows.append((f"{LABELS[name]}, paper", trials, _spread(paper, ",.0f")))
+        rows.append((f"{LABELS[name]}, paper", trials, spread_text(paper, ",.0f")))
     heads = ("algorithm", "trials solved", "episodes to solve")
     what = "Base task" if is_of_paper(record) else label(record["protocol"]["train_set"])
     return Table(f"{what} solved; episodes to solve it, {SPREAD}", heads, tuple(rows))
@@ -159,7 +161,7 @@ def quality_table(record: Record, entry: Record) -> Table:
             label(name),
             str(len(record["sets"][name]["shortest"] or ())),
             _percent(summary.percent_of_solvable),
-            _spread(summary.optimality, ".3f", high=1.0),
+            spread_text(summary.optimality, ".3f", high=1.0),
             number(summary.worst, ".3f"),
         )
         for name, summary in statistics.by_set(record, entry).items()
@@ -274,10 +276,10 @@ def algorithm_label(record: Record, entry: Record) -> str:
 
 
 def _percent(spread: Spread | None) -> str:
-    return _spread(spread, ".1f", high=100.0)
+    return spread_text(spread, ".1f", high=100.0)
 
 
-def _spread(spread: Spread | None, form: str, high: float = math.inf) -> str:
+def spread_text(spread: Spread | None, form: str, high: float = math.inf) -> str:
     """Mean, deviation and interval, the last cut off at 0 and `high`, beyond which no mean lies."""
     if spread is None:
         return NOTHING

@@ -9,7 +9,7 @@ import os
 
 import jax
 
-MOST = 4  # that share a run unless it is told how many: the more, the smaller each one's part
+MOST = 4  # cores that share a run by default; with more, each one's part gets too small
 
 
 def available_cores() -> list[int]:

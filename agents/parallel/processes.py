@@ -22,10 +22,6 @@ from trap_tube_jax.command_line import Flag
 Value = TypeVar("Value")
 
 
-class PeerError(ValueError):
-    """The first process has refused what was asked of it, and said why."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Job:
     """How this process finds the others.
@@ -33,8 +29,8 @@ class Job:
     Attributes:
       distributed: train together with the other processes of this job, as Slurm, Open MPI,
         Kubernetes or a Cloud TPU describe it.
-      coordinator: host:port of the first process, the same in all; where nothing describes
-        the job.
+      coordinator: host:port of the first process, the same in all; needed where no launcher
+        describes the job.
       processes: how many processes there are, beside --coordinator.
       process_id: which of them this is, from 0, beside --coordinator.
       peer_timeout: seconds without a sign of life after which a process counts as lost and
@@ -115,7 +111,7 @@ def from_first(function: Callable[[], Value]) -> Value:
     """What `function()` returns in the first process, which alone calls it; picklable.
 
     Raises:
-      PeerError: it raised there, and this is another process.
+      ValueError: it raised there, and this is another process.
       Exception: it raised here, after the others were told.
     """
     if count() == 1:
@@ -123,7 +119,7 @@ def from_first(function: Callable[[], Value]) -> Value:
     if not is_first():
         message = _broadcast(b"")
         if not message:
-            raise PeerError("the first process has refused; its output says why")
+            raise ValueError("the first process has refused; its output says why")
         return pickle.loads(message)
     message = b""
     try:
@@ -145,12 +141,14 @@ def agree(number: int | None) -> int | None:
 
 
 def leave(code: int) -> NoReturn:
-    """Ends this process when the others do not expect it: they notice, and end with an error."""
-    if count() == 1:
-        raise SystemExit(code)
+    """Ends this process at once; the others, if there are any, notice and end with an error.
+
+    What it has written is on disk; a checkpoint that it was writing is as if it had not begun.
+    """
     sys.stdout.flush()
     sys.stderr.flush()
-    # An orderly exit would wait for the others, who wait for this process.
+    # An orderly exit would wait for what compiles in the background, and for the others, who wait
+    # for this process.
     os._exit(code)
 
 

@@ -187,7 +187,7 @@ class Placement:
         return jax.jit(whole, out_shardings=sharding)(numbers)
 
     def local(self, tree: Tree) -> Tree:
-        """The whole of arrays that may lie anywhere, on one device of this process.
+        """The whole arrays, wherever their parts lie, on one device of this process.
 
         Every process has to call it.
         """
@@ -205,9 +205,6 @@ class Placement:
         processes = jax.process_count()
         within = f" of {processes} processes" if processes > 1 else ""
         return f"{self.mesh.size} {kind} devices{within}"
-
-
-DEFAULT_DEVICE = Placement()
 
 
 def _map(function: Callable[..., Any], mesh: Mesh, inputs: Any, outputs: Any) -> Callable[..., Any]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from agents.acting.policy import Policy
@@ -51,28 +50,26 @@ def save(path: Path, policy: Policy, *, half: bool = False) -> None:
     draft.replace(path)
 
 
-def load(path: Path | Traversable, name: str | None = None) -> Policy:
+def load(path: Path | Traversable) -> Policy:
     """The policy of a file that `save` wrote, its parameters as float32.
 
     Args:
-      path: the file.
-      name: what to call the policy; the file's name if absent.
+      path: the file; its name is the policy's.
 
     Raises:
       ValueError: the file is damaged, of another kind, or of settings that this version
         does not know.
       OSError: the file cannot be opened.
     """
-    name = path.name.removesuffix(SUFFIX) if name is None else name
     header, arrays = _read(path)
     try:
         config = Config.from_dict(header["config"])
-        arrays = {key: array.astype(np.float32) for key, array in arrays.items()}
+        arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
         template = jax.eval_shape(make_train(config).init_params, jax.random.key(0))
-        params = jax.tree.map(jnp.asarray, from_arrays(arrays, template))
+        params = from_arrays(arrays, template)
     except ValueError as error:
         raise ValueError(f"{path} does not fit this version: {error}") from error
-    return Policy(name, config, params, header["iteration"])
+    return Policy(path.name.removesuffix(SUFFIX), config, params, header["iteration"])
 
 
 def names() -> tuple[str, ...]:

@@ -41,27 +41,28 @@ class Checkpoints:
 
         Raises:
           ValueError: `keep` is below 1.
+          CheckpointError: there is no such folder to read.
         """
         if keep is not None and keep < 1:
             raise ValueError(f"keep must be >= 1, got {keep}")
+        if keep is None and not folder.is_dir():
+            raise CheckpointError(f"{folder} holds no checkpoint")
         import orbax.checkpoint as ocp  # noqa: PLC0415  slow to import
 
         # Orbax reports every refused file with a stack trace of its own.
         logging.getLogger("absl").setLevel(logging.CRITICAL)
         self.folder = folder
         self._ocp = ocp
-        self._manager = None
-        if keep is not None or folder.is_dir():
-            folder.mkdir(parents=True, exist_ok=True)
-            options = ocp.CheckpointManagerOptions(
-                max_to_keep=keep,
-                read_only=keep is None,
-                create=False,
-                cleanup_tmp_directories=keep is not None,
-                enable_async_checkpointing=False,
-                multiprocessing_options=_this_process_alone(ocp),
-            )
-            self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
+        folder.mkdir(parents=True, exist_ok=True)
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep,
+            read_only=keep is None,
+            create=False,
+            cleanup_tmp_directories=keep is not None,
+            enable_async_checkpointing=False,
+            multiprocessing_options=_this_process_alone(ocp),
+        )
+        self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
 
     def __enter__(self) -> Self:
         return self
@@ -71,13 +72,12 @@ class Checkpoints:
 
     def close(self) -> None:
         """Ends whatever works in the background."""
-        if self._manager is not None:
-            self._manager.close()
+        self._manager.close()
 
     @property
     def iterations(self) -> list[int]:
         """The iterations that have a checkpoint, in order."""
-        return [] if self._manager is None else sorted(self._manager.all_steps(read=True))
+        return sorted(self._manager.all_steps(read=True))
 
     def save(self, iteration: int, state: Any, record: dict[str, Any]) -> None:
         """Saves a pytree of arrays, PRNG keys included; returns once it is on disk.
@@ -87,7 +87,7 @@ class Checkpoints:
           state: the pytree.
           record: plain values to keep with it.
         """
-        if self._manager is None or iteration in self.iterations:
+        if iteration in self.iterations:
             return
         arrays = to_arrays(state)
         record = {**record, "iteration": iteration, "digest": digest(arrays)}
@@ -105,11 +105,14 @@ class Checkpoints:
           CheckpointError: there is none, or it is damaged or of another kind.
         """
         known = self.iterations
-        if self._manager is None or not known or (iteration is not None and iteration not in known):
-            names = ", ".join(map(str, known)) or "none"
-            wanted = "no checkpoint" if iteration is None else f"no checkpoint {iteration}"
-            raise CheckpointError(f"{self.folder} holds {wanted}; allowed: {names}")
+        if not known:
+            raise CheckpointError(f"{self.folder} holds no checkpoint")
         iteration = known[-1] if iteration is None else iteration
+        if iteration not in known:
+            names = ", ".join(map(str, known))
+            raise CheckpointError(
+                f"{self.folder} holds no checkpoint {iteration}; allowed: {names}"
+            )
         args = self._ocp.args
         items = args.Composite(state=args.StandardRestore(), record=args.JsonRestore())
         try:

@@ -1,13 +1,14 @@
 """What a result was computed on: hardware, versions and commit."""
 
 import importlib.metadata
-import os
 import pathlib
 import platform
 import subprocess
 from typing import Any
 
 import jax
+
+from agents.parallel.cores import available_cores
 
 ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -24,7 +25,7 @@ def machine(commit: str | None = None) -> dict[str, Any]:
     """
     return {
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "cores": len(available_cores()),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
         "platform": platform.platform(),

@@ -24,7 +24,7 @@ def results(paths: str | Path | Iterable[str | Path]) -> list[dict[str, Any]]:
                               `stop_when_solved` of it); likewise solved_episodes,
                               solved_transitions and solved_seconds; None if it has not
         percent_<set>         of each set's tasks, percent solved once training was over; None
-                              as long as a run is extended
+                              where training has gone on since
 
     Args:
       paths: a folder or several: of a run, or anything that holds runs, at any depth.

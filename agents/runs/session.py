@@ -2,9 +2,8 @@
 
 import dataclasses
 import functools
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent import futures
 from typing import Any
 
@@ -14,11 +13,11 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluation, Evaluator, evaluate, own_and_paper_sets, scores
+from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets, scores
 from agents.acting.policy import Policy
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
-from agents.parallel.sharding import DEFAULT_DEVICE, Placement
+from agents.parallel.sharding import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
@@ -30,9 +29,7 @@ from agents.runs.progress import Progress
 from agents.runs.stopping import Stopped, StopSignals
 from agents.runs.story import Story, resume_command
 from agents.runs.tracking import Tracker
-from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
-from trap_tube_jax.state import State
 
 POLL_SECONDS = 0.005
 
@@ -50,8 +47,8 @@ class Session:
         *,
         checkpoint_every: int,
         keep: int,
+        placement: Placement,
         tracker: Tracker | None = None,
-        placement: Placement = DEFAULT_DEVICE,
         options: Sequence[str] = (),
     ):
         """Builds training and takes up the newest checkpoint.
@@ -62,10 +59,9 @@ class Session:
           console: where to show it.
           checkpoint_every: iterations from one checkpoint to the next.
           keep: how many checkpoints to keep.
-          tracker: what evaluates on further task sets as training goes, if anything does; of
-            a single process.
-          placement: the devices to train on; no matter which wrote the checkpoint.
-          options: those of the command line that a run that is continued needs again.
+          placement: the devices to train on; need not be that of the checkpoint.
+          tracker: evaluates on further sets during training; for a single process only.
+          options: command-line options to repeat when the run is continued.
 
         Raises:
           ValueError: the settings cannot be trained with, or the checkpoint is unusable.
@@ -145,7 +141,17 @@ class Session:
         report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
         solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
         story = Story.of(folder, run, results.values(), list(solved.values()), self.resume_command)
-        self._save_page(story, evaluator, played, results, functools.partial(pay, state))
+        report_page.save(
+            folder.page,
+            title=folder.path.name,
+            sentences=[*story.before, *story.after],
+            settings={"preset": run.preset, **run.config.to_dict()},
+            scores=results,
+            curves=folder.curves,
+            evaluator=evaluator,
+            played=played[trained[0].name],
+            pay=functools.partial(pay, state),
+        )
         self._say(story.before)
         for name, result in results.items():
             table = report.evaluation_table(result, f"{folder.path.name}, {name}")
@@ -155,37 +161,13 @@ class Session:
         self._say_where()
         self._say(story.after)
 
-    def _save_page(
-        self,
-        story: Story,
-        evaluator: Evaluator,
-        played: Mapping[str, Mapping[str, Evaluation]],
-        results: Mapping[str, Sequence[Score]],
-        pay: Callable[[State], jax.Array],
-    ) -> None:
-        """Writes the page, with episodes of the first seed."""
-        if not self.folder.curves.exists():
-            return
-        report_page.save(
-            self.folder.page,
-            title=self.folder.path.name,
-            sentences=[*story.before, *story.after],
-            settings={"preset": self.run.preset, **self.run.config.to_dict()},
-            scores=results,
-            curves=self.folder.curves,
-            evaluator=evaluator,
-            played=next(iter(played.values())),
-            pay=pay,
-        )
-
     def summarize(self) -> None:
         """Writes the summary and the learning curves."""
         summary = self._summary()
         if self._log is None:
             return
         write_json(self.folder.summary, summary)
-        if self._log.rows:
-            report.save_curves(self._log.rows, self.folder.curves, self.folder.path.name)
+        report.save_curves(self._log.rows, self.folder.curves, self.folder.path.name)
 
     def _start(self) -> tuple[TrainState, Progress]:
         keys = jax.vmap(jax.random.key)(np.array(self.run.seed_range, np.uint32))
@@ -371,6 +353,5 @@ def make_advance(train: Learner, num_seeds: int) -> Advance:
 
 def _wait(arrays: Any) -> None:
     """Blocks until the arrays are there, but lets signals through."""
-    pause = threading.Event()
     while not all(x.is_ready() for x in jax.tree.leaves(arrays)):
-        pause.wait(POLL_SECONDS)
+        time.sleep(POLL_SECONDS)

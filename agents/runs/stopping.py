@@ -1,7 +1,6 @@
 """Stopping a run by Ctrl-C or SIGTERM."""
 
 import signal
-import threading
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -12,7 +11,7 @@ class Stopped(Exception):  # noqa: N818  it is no error
     """Training was asked to stop and has saved.
 
     Attributes:
-      signal: the number of the signal that asked, perhaps another process.
+      signal: the number of the signal, which another process may have received.
     """
 
     def __init__(self, number: int):
@@ -31,10 +30,7 @@ class StopSignals:
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._previous = {
-                number: signal.signal(number, self._handle) for number in self.SIGNALS
-            }
+        self._previous = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -43,9 +39,8 @@ class StopSignals:
 
     def end_process(self) -> None:
         """Lets further signals end the process at once, as they do by default."""
-        if threading.current_thread() is threading.main_thread():
-            for number in self.SIGNALS:
-                signal.signal(number, signal.SIG_DFL)
+        for number in self.SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
 
     def _handle(self, number: int, frame: Any) -> None:
         del frame

@@ -52,12 +52,12 @@ class Story(NamedTuple):
         if not folder.animation.exists():
             watch = "No episode of the evaluation is solved, so there is none to watch."
         return cls(
-            before=["", learnt(own, percent, solved), watch, transfers(own, percent, others)],
-            after=["", f"Next: {next_step(folder, run, percent, solved, command)}"],
+            before=["", _learnt(own, percent, solved), watch, _transfers(own, percent, others)],
+            after=["", f"Next: {_next_step(folder, run, percent, solved, command)}"],
         )
 
 
-def learnt(own: tt.TaskSet, percent: float, solved: Sequence[FirstSolved | None]) -> str:
+def _learnt(own: tt.TaskSet, percent: float, solved: Sequence[FirstSolved | None]) -> str:
     """What was learnt on the set that was trained on."""
     what = "the base task" if own.short == "base" else f"tasks of {own.label}"
     firsts = [first for first in solved if first is not None]
@@ -74,14 +74,8 @@ def learnt(own: tt.TaskSet, percent: float, solved: Sequence[FirstSolved | None]
     )
 
 
-def transfers(own: tt.TaskSet, percent: float, others: Sequence[float]) -> str:
-    """Whether what was learnt carries over to the other task sets.
-
-    Args:
-      own: the set that was trained on.
-      percent: of its tasks, percent solved.
-      others: percent solved of each other set.
-    """
+def _transfers(own: tt.TaskSet, percent: float, others: Sequence[float]) -> str:
+    """Whether what was learnt carries over to the other task sets."""
     if percent == 0:
         return "Nothing is learnt yet that could carry over to the other task sets."
     mean = statistics.fmean(others)
@@ -101,22 +95,14 @@ def resume_command(folder: RunFolder, *options: str) -> str:
     return f"python -m agents.train {shlex.join(arguments)}"
 
 
-def next_step(
+def _next_step(
     folder: RunFolder,
     run: Run,
     percent: float,
     solved: Sequence[FirstSolved | None],
     command: str,
 ) -> str:
-    """What to try after a run.
-
-    Args:
-      folder: its files.
-      run: what it trained.
-      percent: of its own tasks, percent solved.
-      solved: when each seed first solved what it trains on.
-      command: the one that continues it.
-    """
+    """What to try after a run."""
     config = run.config
     more = f"--iterations {2 * config.iterations}"
     can_go_on = not (config.cooldown or config.intrinsic_start or config.max_transitions)
