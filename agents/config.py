@@ -5,7 +5,9 @@ Source of the `paper` preset: agents/agent.md.
 
 import dataclasses
 import difflib
-from typing import Any, Literal, Self, get_args, get_type_hints
+import inspect
+import types
+from typing import Any, Literal, Self, get_args, get_origin
 
 from agents import registry
 from trap_tube_jax.imports import import_modules
@@ -38,7 +40,8 @@ def _setting(
 class Config:
     """The settings of one training run.
 
-    `Config()` is the preset `paper`. The command line starts from the preset `fast`.
+    `Config()` is the preset `paper`. `agents.train` and `agents.sweep` start from the preset
+    `fast`.
 
     Attributes:
       imports: modules of your own, imported first, for the names that they register.
@@ -101,7 +104,7 @@ class Config:
       imitation_episodes: the newest solved episodes that are remembered and imitated.
 
       replayed: shares of the episodes that play tasks again which were failed once, twice, and
-        so on; none for none.
+        so on; empty: none.
       failures: how many tasks of each kind, the newest, are kept for that.
 
       facing: whether the board is turned and mirrored for the agent, once for each episode, so
@@ -181,7 +184,6 @@ class Config:
         """
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            _check_type(field, value)
             _check_value(field, value)
         import_modules(self.imports)
         registry.curiosities.factory(self.curiosity)
@@ -342,43 +344,32 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def _check_type(field: dataclasses.Field, value: Any) -> None:
-    default = field.default
-    if default is None:
-        matches = value is None or type(value) is int
-    elif isinstance(default, bool) or isinstance(value, bool):
-        matches = isinstance(default, bool) and isinstance(value, bool)
-    elif isinstance(default, float):
-        matches = isinstance(value, int | float)
-    elif isinstance(default, tuple):
-        kind = _kind_of_items(field)
-        matches = (
-            isinstance(value, tuple)
-            and (not default or len(value) == len(default))
-            and all(isinstance(item, kind) and not isinstance(item, bool) for item in value)
-        )
-    else:
-        matches = isinstance(value, type(default))
-    if not matches:
-        wanted = "int or None" if default is None else type(default).__name__
-        if isinstance(default, tuple):
-            names = {int: f"{len(default)} integers", str: "names"}
-            wanted = f"a tuple of {names.get(_kind_of_items(field), 'numbers')}"
-        raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
-
-
-def _kind_of_items(field: dataclasses.Field) -> Any:
-    """The type of a tuple's items; integers are numbers too."""
-    kind = get_args(get_type_hints(Config)[field.name])[0]
-    return int | float if kind is float else kind
-
-
 def _check_value(field: dataclasses.Field, value: Any) -> None:
-    limits, choices = field.metadata["limits"], get_args(get_type_hints(Config)[field.name])
-    if limits is not None and value is not None:
-        low, high = limits
+    if not _fits(field.type, value):
+        wanted = inspect.formatannotation(field.type)
+        if get_origin(field.type) is Literal:
+            wanted = f"one of {', '.join(get_args(field.type))}"
+        raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
+    if field.metadata["limits"] is not None and value is not None:
+        low, high = field.metadata["limits"]
         for number in value if isinstance(value, tuple) else (value,):
             if not low <= number <= high:
                 raise ValueError(f"{field.name} must lie in [{low}, {high}], got {number}")
-    if isinstance(field.default, str) and choices and value not in choices:
-        raise ValueError(f"{field.name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def _fits(kind: Any, value: Any) -> bool:
+    """Whether a value is of an annotated type. An integer is a float too, a bool is neither."""
+    kinds = get_args(kind)
+    if get_origin(kind) is Literal:
+        return value in kinds
+    if isinstance(kind, types.UnionType):
+        return any(_fits(each, value) for each in kinds)
+    if get_origin(kind) is tuple:
+        if not isinstance(value, tuple):
+            return False
+        if kinds[-1] is ...:
+            kinds = kinds[:1] * len(value)
+        return len(kinds) == len(value) and all(map(_fits, kinds, value))
+    if isinstance(value, bool):
+        return kind is bool
+    return isinstance(value, int | float if kind is float else kind)

@@ -131,7 +131,7 @@ def test_missing_modules_are_named(tmp_path, monkeypatch, capsys, own_tables):
         Config(imports=("needs_more",))
     with pytest.raises(ValueError, match=r"cannot import '\./x\.py': name a module"):
         import_modules(["./x.py"])
-    with pytest.raises(ValueError, match=r"imports must be a tuple of names, got \('a', 3\)"):
+    with pytest.raises(ValueError, match=r"imports must be tuple\[str, \.\.\.\], got \('a', 3\)"):
         Config.from_dict({"imports": ["a", 3]})
 
 
