@@ -19,11 +19,11 @@ import tyro
 
 from agents.acting.rollout import sample_action
 from agents.config import PRESETS, Config
-from agents.experiments.tables import Table, number
 from agents.networks.actions import ActionDistribution
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
 from agents.runs.session import make_advance
+from agents.runs.table import Table, number
 from benchmarks import harness
 from trap_tube_jax.command_line import Flag, plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS

@@ -6,7 +6,6 @@ Source: paper Tables 1 and 2.
 import math
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import NamedTuple
 
 from agents.experiments import statistics
 from agents.experiments.protocol import PRESET, PROTOCOLS
@@ -233,11 +232,6 @@ def markdown(record: Record) -> str:
     """All tables and notes in Markdown."""
     parts = [f"**{table.title}**\n\n{table.to_markdown()}" for table in tables(record)]
     return "\n\n".join([*parts, *notes(record)])
-
-
-def number(value: float | None, form: str) -> str:
-    """A number as text; `NOTHING` where there is none."""
-    return NOTHING if value is None else format(value, form)
 
 
 def _tested(record: Record) -> list[Record]:

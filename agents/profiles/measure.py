@@ -49,8 +49,8 @@ class Settings:
       parts: what to measure: some of colours, layout, both, swaps, controls, pairs.
       strengths: how far colours and layouts are changed: above 0, the base task, to 1, the
         paper's transfers.
-      tasks: of every point that has more than one.
-      episodes: of how many of a point's episodes to find out where they go wrong.
+      tasks: how many of every point that has more than one.
+      episodes: how many of a point's episodes are searched for where they go wrong.
     """
 
     parts: tuple[str, ...] = PARTS
