@@ -9,6 +9,7 @@ import optax
 from agents.config import Config
 
 LAST_STEP_SIZE = 1 / 50  # of the last gradient step of a cooldown, as a fraction of the first
+BETA1, BETA2 = 0.9, 0.999  # decay of Adam's moments
 
 
 class AdamState(NamedTuple):
@@ -25,17 +26,11 @@ class AdamState(NamedTuple):
     second: optax.Params
 
 
-def adam(
-    learning_rate: optax.Schedule,
-    *,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
-    epsilon: float = 1e-7,
-) -> optax.GradientTransformation:
+def adam(learning_rate: optax.Schedule, epsilon: float) -> optax.GradientTransformation:
     """Adam with epsilon added to the root of the uncorrected second moment.
 
-      m <- beta1 m + (1 - beta1) g,  v <- beta2 v + (1 - beta2) g^2,
-      step = -learning_rate sqrt(1 - beta2^t) / (1 - beta1^t) * m / (sqrt(v) + epsilon).
+      m <- BETA1 m + (1 - BETA1) g,  v <- BETA2 v + (1 - BETA2) g^2,
+      step = -learning_rate sqrt(1 - BETA2^t) / (1 - BETA1^t) * m / (sqrt(v) + epsilon).
 
     This is the form at the end of section 2 of Kingma and Ba (2015), which the baseline's
     framework uses. `optax.adam` adds epsilon after the correction of v: while t is small,
@@ -43,8 +38,6 @@ def adam(
 
     Args:
       learning_rate: step size, by the number of updates so far.
-      beta1: decay of the first moment.
-      beta2: decay of the second moment.
       epsilon: added to the root of the second moment.
     """
 
@@ -52,14 +45,11 @@ def adam(
         zeros = jax.tree.map(jnp.zeros_like, params)
         return AdamState(jnp.zeros((), jnp.int32), zeros, zeros)
 
-    def update(
-        updates: optax.Updates, state: Any, params: optax.Params | None = None
-    ) -> tuple[optax.Updates, AdamState]:
-        del params
+    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, AdamState]:
         count = state.updates + 1
-        first = optax.tree.update_moment(updates, state.first, beta1, 1)
-        second = optax.tree.update_moment(updates, state.second, beta2, 2)
-        rate = learning_rate(state.updates) * jnp.sqrt(1 - beta2**count) / (1 - beta1**count)
+        first = optax.tree.update_moment(updates, state.first, BETA1, 1)
+        second = optax.tree.update_moment(updates, state.second, BETA2, 2)
+        rate = learning_rate(state.updates) * jnp.sqrt(1 - BETA2**count) / (1 - BETA1**count)
         step = jax.tree.map(lambda m, v: -rate * m / (jnp.sqrt(v) + epsilon), first, second)
         return step, AdamState(count, first, second)
 
