@@ -69,15 +69,17 @@ def test_advantages(episodes):
 
 def test_advantages_without_lambda_are_errors_and_with_it_are_returns(episodes):
     """At lambda 0 the advantage is one step's error, at lambda 1 return less value."""
-    ones = np.ones_like(episodes["mask"])
-    value = episodes["values"] * np.append(ones, np.zeros((CASES, 1), np.float32), axis=1)
-    discount = np.broadcast_to(episodes["discount"][:, None], ones.shape)
-    gae: Any = jax.vmap(returns.generalized_advantages, in_axes=(0, 0, 0, 0, None))
-    args: list[Any] = [episodes["reward"], discount, value, ones]
-    error = episodes["reward"] + discount * value[:, 1:] - value[:, :-1]
-    np.testing.assert_allclose(gae(*args, 0.0), error, atol=1e-5)
-    full = jax.vmap(returns.discounted_returns)(episodes["reward"], episodes["discount"])
-    np.testing.assert_allclose(gae(*args, 1.0), full - value[:, :-1], atol=1e-4)
+    reward, gamma = jnp.asarray(episodes["reward"].T), 0.9
+    ones = jnp.ones_like(reward)
+    value = jnp.asarray(episodes["values"].T).at[-1].set(0)
+    args = reward, jnp.full_like(reward, gamma), value, ones
+    error = reward + gamma * value[1:] - value[:-1]
+    without = returns.generalized_advantages(*args, 0.0)
+    np.testing.assert_allclose(without, error, atol=1e-5)
+    full = returns.discounted_returns(reward, gamma)
+    np.testing.assert_allclose(
+        returns.generalized_advantages(*args, 1.0), full - value[:-1], atol=1e-4
+    )
 
 
 def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[Any, Any]:

@@ -22,12 +22,6 @@ RETURN_DEVIATION = 0.3
 # Added to the variance of advantages, so that a stream that hardly pays is not blown up.
 VARIANCE_FLOOR = 4e-4
 
-# Over [T, B] arrays.
-discounted_returns = jax.vmap(returns.discounted_returns, in_axes=(1, None), out_axes=1)
-generalized_advantages = jax.vmap(
-    returns.generalized_advantages, in_axes=(1, 1, 1, 1, None), out_axes=1
-)
-
 RewardMoments = tuple[returns.Moments, returns.Moments]
 
 
@@ -94,11 +88,13 @@ def of_streams(
     task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
     if config.streams == 1:
         return task, task_target[..., None], moments
-    intrinsic = moments[1].update(discounted_returns(novelty, gamma), mask, config.reward_rate)
+    intrinsic = moments[1].update(
+        returns.discounted_returns(novelty, gamma), mask, config.reward_rate
+    )
     own = continuing_value(value[..., 1], mask)
     discount = jnp.full_like(novelty, gamma)
     reward = RETURN_DEVIATION * novelty / intrinsic.deviation
-    curiosity = generalized_advantages(reward, discount, own, mask, lambda_)
+    curiosity = returns.generalized_advantages(reward, discount, own, mask, lambda_)
     target = jnp.stack([task_target, curiosity + own[:-1]], axis=-1)
     advantage = joint_advantage(task, curiosity, scale, mask)
     return advantage, target, (moments[0], intrinsic)
@@ -122,12 +118,12 @@ def advantages_and_targets(
     gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
     if config.bootstrap == "value":
         discount = gamma * episodes.discount
-        advantage = generalized_advantages(reward, discount, value, episodes.mask, lambda_)
+        advantage = returns.generalized_advantages(reward, discount, value, episodes.mask, lambda_)
         return advantage, advantage + value[:-1]
     value = jnp.concatenate([value[:-1], value[-2:-1]])
     discount = jnp.full_like(reward, gamma)
-    advantage = generalized_advantages(reward, discount, value, episodes.mask, lambda_)
-    return advantage, discounted_returns(reward, gamma)
+    advantage = returns.generalized_advantages(reward, discount, value, episodes.mask, lambda_)
+    return advantage, returns.discounted_returns(reward, gamma)
 
 
 def continuing_value(value: jax.Array, mask: jax.Array) -> jax.Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from agents.acting.episodes import Episodes, beside, take
 from agents.acting.identity import observation_ids
 from agents.parallel.sharding import Shards
-from agents.ppo.advantages import discounted_returns
+from agents.ppo.returns import discounted_returns
 from trap_tube_jax.state import State
 
 

@@ -19,14 +19,14 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
       G_t = r_t + discount * G_{t+1},  G_T = 0.
 
     Args:
-      reward: f32[T], zero after the end.
+      reward: f32[T, ...], zero after the end.
       discount: scalar in [0, 1].
 
     Returns:
-      f32[T].
+      f32[T, ...].
     """
-    chex.assert_rank([reward, discount], [1, 0])
-    return _backward_sum(reward, jnp.full_like(reward, discount))
+    chex.assert_rank(discount, 0)
+    return _backward_sum(reward, jnp.full(len(reward), discount))
 
 
 def generalized_advantages(
@@ -36,22 +36,21 @@ def generalized_advantages(
     mask: jax.Array,
     lambda_: float | jax.Array,
 ) -> jax.Array:
-    """Generalised advantage estimates over a padded episode (Schulman et al., 2016).
+    """Generalised advantage estimates over padded episodes (Schulman et al., 2016).
 
       delta_t = mask_t (r_t + discount_t v_{t+1} - v_t),
       A_t = delta_t + discount_t * lambda * A_{t+1},  A_T = 0.
 
     Args:
-      reward: f32[T].
-      discount: f32[T], of what follows each step: gamma, or 0 where a step terminates.
-      value: f32[T + 1], the values of all observations.
-      mask: f32[T].
+      reward: f32[T, ...].
+      discount: f32[T, ...], of what follows each step: gamma, or 0 where a step terminates.
+      value: f32[T + 1, ...], the values of all observations.
+      mask: f32[T, ...].
       lambda_: scalar in [0, 1].
 
     Returns:
-      f32[T].
+      f32[T, ...].
     """
-    chex.assert_rank([reward, discount, value, mask, lambda_], [1, 1, 1, 1, 0])
     chex.assert_equal_shape([reward, discount, value[1:], mask])
     delta = mask * (reward + discount * value[1:] - value[:-1])
     return _backward_sum(delta, discount * lambda_)
@@ -110,11 +109,11 @@ class Moments(NamedTuple):
 
 
 def _backward_sum(x: jax.Array, decay: jax.Array) -> jax.Array:
-    """y_t = x_t + decay_t * y_{t+1} with y_T = 0, f32[T]."""
+    """y_t = x_t + decay_t * y_{t+1} with y_T = 0, f32[T, ...]; decay is f32[T] or f32[T, ...]."""
 
     def body(y: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         x_t, decay_t = inputs
         y = x_t + decay_t * y
         return y, y
 
-    return jax.lax.scan(body, jnp.zeros((), x.dtype), (x, decay), reverse=True)[1]
+    return jax.lax.scan(body, jnp.zeros_like(x[0]), (x, decay), reverse=True)[1]
