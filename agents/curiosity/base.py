@@ -59,7 +59,6 @@ class Curiosity:
           key: PRNG key. `networks.layers.init_module` initialises modules of the layers there.
           board: u8[1, 12, 12, N], an observation, for its shape.
         """
-        del key, board
         return {}
 
     def memory(self) -> Any:
@@ -68,7 +67,6 @@ class Curiosity:
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features of its own, f32[M, F], of observations u8[M, 12, 12, N]; F = 0 if none."""
-        del params
         return jnp.zeros((len(observation), 0))
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
@@ -76,7 +74,6 @@ class Curiosity:
 
         Values after an episode's end are ignored, whatever they are.
         """
-        del params
         return jnp.zeros_like(experience.episodes.reward), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
@@ -84,5 +81,4 @@ class Curiosity:
 
         {} if nothing is trained. Names are other than those of PPO's terms (`Learner.loss`).
         """
-        del params, experience
         return {}

@@ -52,7 +52,6 @@ class Counts(Curiosity):
         self, params: Params, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
         """The bonus of the next observation, and the visits with this iteration's."""
-        del params
         episodes = experience.episodes
         return visit_bonus(memory, observation_slots(episodes)[1:], episodes.mask)
 

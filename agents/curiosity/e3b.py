@@ -38,7 +38,6 @@ class E3B(Curiosity):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The bonus of every next observation."""
-        del params
         return elliptical_bonus(experience.features)[1:], memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:

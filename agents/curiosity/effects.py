@@ -48,7 +48,6 @@ class Effects(Curiosity):
         self, params: Params, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
         """What the new effects of every step pay, and the rates with this iteration's."""
-        del params
         mask = experience.episodes.mask
         new = new_effects(experience.episodes) * mask[None]
         rate = jnp.sum(new, axis=(1, 2)) / jnp.sum(mask)

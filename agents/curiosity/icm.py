@@ -54,8 +54,7 @@ class ICM(Curiosity):
         self._widths = (config.hidden, config.hidden, 2 * config.embedding)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
-        """The parameters of both models."""
-        del board
+        """The parameters of both models; `board` is not looked at."""
         inputs = (jnp.zeros((1, width)) for width in self._widths)
         return init_module(self._models, key, *inputs)
 

@@ -24,7 +24,6 @@ class NovelD(RND):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The rise of novelty, paid at first visits."""
-        del params
         novelty = jnp.linalg.norm(experience.features, axis=-1)
         rise = jnp.maximum(novelty[1:] - ALPHA * novelty[:-1], 0.0)
         return rise * first_visits(experience.observation_id)[1:], memory

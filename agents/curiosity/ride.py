@@ -24,6 +24,5 @@ class RIDE(DetachedICM):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The change of the features, over the root of the visits."""
-        del params
         change = jnp.linalg.norm(jnp.diff(experience.features, axis=0), axis=-1)
         return change / jnp.sqrt(visits(experience.observation_id)[1:]), memory

@@ -53,10 +53,8 @@ class RND(Curiosity):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The sum over units of the squared error at the next observation."""
-        del params
         return jnp.sum(jnp.square(experience.features[1:]), axis=-1), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """The mean over units of the same errors."""
-        del params
         return {"forward_loss": jnp.mean(jnp.square(experience.features[1:]), axis=-1)}

@@ -44,17 +44,15 @@ class Deviation(struct.PyTreeNode, meta.AxisMetadata):
 
     def add_axis(self, index: int, params: dict[Any, Any]) -> Self:
         """Itself: axes have no names."""
-        del index, params
         return self
 
     remove_axis = add_axis
 
 
 def variance_scaling(scale: float) -> Callable[..., Any]:
-    """An initialiser of a `Deviation`, sqrt(scale / fan-in) everywhere in a parameter."""
+    """An initialiser of a `Deviation`, sqrt(scale / fan-in) everywhere; it does not use its key."""
 
     def init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Deviation:
-        del key
         return Deviation(jnp.full(shape, np.sqrt(scale / np.prod(shape[:-1])), dtype))
 
     return init
