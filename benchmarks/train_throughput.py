@@ -6,7 +6,6 @@ product. The parts are separate programs, so they add up to the iteration only r
 """
 
 import dataclasses
-import functools
 import math
 import pathlib
 from collections.abc import Callable
@@ -25,7 +24,6 @@ from agents.acting.episodes import take
 from agents.acting.rollout import Trajectory
 from agents.curiosity import Experience
 from agents.networks.agent import Params
-from agents.networks.windows import encode_rows
 from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
@@ -126,8 +124,8 @@ def useful_flop(train: Learner, state: TrainState, batch: Batch) -> Flop:
 
     def step(params: Params, features: jax.Array) -> Any:
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
-        inputs = agent.core_inputs(params, features, action, reward)
-        return agent.act(params, agent.advance(params, agent.initial_state(params, 1), inputs))
+        first = agent.initial_state(params, 1)
+        return agent.act(params, agent.step(params, first, features, action, reward))
 
     board = batch.episodes.observations()[0, :1]
     per_observation = matrix_flop(jax.make_jaxpr(agent.encode)(state.params, board))
@@ -202,10 +200,9 @@ def _accumulate(config: Config, gradient: Callable[[jax.Array], Params], params:
 
 def _encoder_only(train: Learner, state: TrainState, batch: Batch) -> Params:
     def total(params: Params, part: Batch) -> jax.Array:
-        encode = functools.partial(encode_rows, train.agent.encoder)
         features = encode_episodes(
-            encode,
-            params["encoder"],
+            train.agent.encode_rows,
+            {"encoder": params["encoder"]},
             part.episodes,
             part.observation_id,
             chunk=train.config.chunk,

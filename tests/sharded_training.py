@@ -95,7 +95,7 @@ def play(params, tasks, devices):
     env = tt.make("st", max_steps=CONFIG.max_steps)
 
     def own(params, tasks):
-        return evaluate(Agent(CONFIG), params, env, tasks, CONFIG.chunk, Shards(devices))
+        return evaluate(Agent(CONFIG), params, env, tasks, Shards(devices))
 
     mesh = Mesh(np.array(jax.devices()[:devices]), EPISODES)
     whole = PartitionSpec()

@@ -1,5 +1,7 @@
 """Grouping equal elements, and functions of rows chunk by chunk."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,6 @@ import pytest
 
 from agents.networks import chunks
 from agents.networks.grouping import group
-from agents.networks.shared_maximum import shared_maximum
 
 ROWS, WIDTH = 37, 5
 
@@ -60,7 +61,7 @@ def test_map_rows_and_its_gradient(problem, fn, chunk, count, monkeypatch):
     valid = (jnp.arange(ROWS) < count)[:, None]
 
     def ours(params):
-        features = chunks.map_rows(fn, chunk, params, rows, jnp.int32(count))
+        features: Any = chunks.map_rows(fn, chunk, params, rows, jnp.int32(count))
         return jnp.sum(jnp.where(valid, features, 0) * cotangent)
 
     def reference(params):
@@ -77,7 +78,7 @@ def test_map_rows_under_vmap_with_different_counts(problem):
 
     def gradient(params, count):
         def total(params):
-            features = chunks.map_rows(remembering, 8, params, rows, count)
+            features: Any = chunks.map_rows(remembering, 8, params, rows, count)
             return jnp.sum(features * cotangent * (jnp.arange(ROWS) < count)[:, None])
 
         return jax.grad(total)(params)
@@ -94,5 +95,5 @@ def test_map_rows_under_vmap_with_different_counts(problem):
 
 
 def test_shared_maximum_is_unbatched():
-    doubled = jax.vmap(jax.vmap(lambda x: x + shared_maximum(x)))
+    doubled = jax.vmap(jax.vmap(lambda x: x + chunks.shared_maximum(x)))
     np.testing.assert_array_equal(doubled(jnp.array([[1, 2], [3, 4]])), [[5, 6], [7, 8]])

@@ -92,7 +92,7 @@ class FakeEvaluator:
         }
 
 
-def fake_evaluate(agent, params, env, tasks, chunk, shards):
+def fake_evaluate(agent, params, env, tasks, shards):
     nothing = jnp.zeros(len(tasks.time), jnp.int32)
     return evaluation.Evaluation(nothing > 0, nothing, nothing, nothing)
 
@@ -394,7 +394,7 @@ def test_the_best_parameters_are_found_by_their_iteration(tmp_path, monkeypatch,
 def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
     """Solved of four tasks are as many as there were iterations."""
 
-    def evaluate(agent, params, env, tasks, chunk, shards):
+    def evaluate(agent, params, env, tasks, shards):
         iteration = jax.tree.leaves(params)[0].reshape(-1)[0] % 100
         nothing = jnp.zeros(4, jnp.int32)
         return evaluation.Evaluation(jnp.arange(4) < iteration, nothing, nothing, nothing)

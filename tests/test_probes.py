@@ -62,9 +62,7 @@ def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajecto
         lambda state, _: train.iterate(state), train.init(init_key), length=ITERATIONS
     )
     tasks, _ = jax.vmap(env.reset)(jax.random.split(reset_key, 32))
-    played = rollout(
-        train.agent, state.params, env, tasks, reset_key, choose=greedy_action, chunk=16
-    )
+    played = rollout(train.agent, state.params, env, tasks, reset_key, choose=greedy_action)
     return 1 / state.extrinsic.deviation, played
 
 

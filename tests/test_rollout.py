@@ -46,7 +46,7 @@ def make_play():
 
     def play(params, initial):
         key = jax.random.key(2)
-        return rollout(agent, params, env, initial, key, choose=choose, chunk=CONFIG.chunk)
+        return rollout(agent, params, env, initial, key, choose=choose)
 
     def make(params, initial):
         with pytest.MonkeyPatch.context() as patch:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from agents.acting.episodes import Episodes, place
 from agents.networks import chunks
+from agents.networks.agent import Agent, Params
 from agents.networks.grouping import group, slots
 from trap_tube_jax.observation import observe
 from trap_tube_jax.positions import position_id
@@ -74,15 +75,12 @@ class Cache(NamedTuple):
         )
 
     def encode(
-        self,
-        encode_rows: chunks.RowFn,
-        params: Any,
-        state: State,
-        time: jax.Array | int,
-        *,
-        chunk: int,
+        self, agent: Agent, params: Params, state: State, time: jax.Array | int
     ) -> tuple[jax.Array, "Cache"]:
-        """The features f32[B, F] of B states' observations at `time`, and the cache with them."""
+        """The features f32[B, F] of B states' observations at `time`, and the cache with them.
+
+        At most `agent.config.chunk` observations are encoded at once.
+        """
         position = jax.vmap(position_id)(state)
         slot = slots(jnp.stack([self.layout_id, position], axis=1), SLOT_BITS)
         is_known, known = self._look_up(position, slot)
@@ -90,7 +88,7 @@ class Cache(NamedTuple):
         groups = group(is_known.astype(jnp.int32), self.layout_id, position)
         num_new = jnp.max(jnp.where(is_known, -1, groups.number)) + 1
         rows = jax.vmap(observe)(state)[groups.representative]
-        new = chunks.map_rows(encode_rows, chunk, params, rows, num_new)
+        new: Any = chunks.map_rows(agent.encode_rows, agent.config.chunk, params, rows, num_new)
         features = jnp.where(is_known[:, None], known, new[groups.number])
         batch = len(self.layout_id)
         return features, self._replace(

@@ -51,18 +51,14 @@ def along_episodes(function: Callable[..., jax.Array], *records: Record) -> Reco
     """Applies `function(axis, *arrays)` to the arrays of records of the same structure.
 
     A record is `Episodes`, or a tree that holds one beside arrays [T, B, ...]. `axis` is where an
-    array has its episodes: 0 in layouts, 1 elsewhere.
+    array has its episodes: 0 in a field of the name `layout`, 1 elsewhere.
     """
+    layout = jax.tree_util.GetAttrKey("layout")
 
-    def apply(*parts: Any) -> Any:
-        if not isinstance(parts[0], Episodes):
-            return function(1, *parts)
-        layouts = (part.layout for part in parts)
-        layout = jax.tree.map(lambda *x: function(0, *x), *layouts)
-        rest = (function(1, *x) for x in zip(*(part[1:] for part in parts), strict=True))
-        return Episodes(layout, *rest)
+    def apply(path: tuple[Any, ...], *parts: jax.Array) -> jax.Array:
+        return function(0 if layout in path else 1, *parts)
 
-    return jax.tree.map(apply, *records, is_leaf=lambda x: isinstance(x, Episodes))
+    return jax.tree.map_with_path(apply, *records)
 
 
 def take(record: Record, places: jax.Array) -> Record:

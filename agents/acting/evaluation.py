@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
@@ -38,12 +39,7 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    agent: Agent,
-    params: Params,
-    env: Environment,
-    tasks: State,
-    chunk: int,
-    shards: Shards = ALONE,
+    agent: Agent, params: Params, env: Environment, tasks: State, shards: Shards = ALONE
 ) -> Evaluation:
     """Plays every task once with the most probable actions. Pure; jit it.
 
@@ -52,13 +48,12 @@ def evaluate(
       params: its parameters.
       env: the dynamics and the step limit; its transfers play no part.
       tasks: B states at time 0.
-      chunk: distinct observations encoded at once; more than B are of no use.
       shards: how devices divide the tasks among themselves, evenly or not.
     """
     num_tasks = tasks.time.shape[0]
     if shards.count > 1:
         tasks = _rows(tasks, shards.places(num_tasks)[0])
-    frame, played = play_greedily(agent, params, env, tasks, chunk)
+    frame, played = play_greedily(agent, params, env, tasks)
     episodes = played.episodes
     action = jax.vmap(Frame.original_action)(frame, episodes.action.swapaxes(0, 1))
     value = played.value[:-1, :, 0].swapaxes(0, 1)
@@ -67,18 +62,18 @@ def evaluate(
 
 
 def play_greedily(
-    agent: Agent, params: Params, env: Environment, tasks: State, chunk: int
+    agent: Agent, params: Params, env: Environment, tasks: State
 ) -> tuple[Frame, Trajectory]:
     """The frame in which the agent sees each task, and the episodes in these frames.
 
     Arguments are those of `evaluate`.
     """
-    frame = jax.vmap(Frame.facing_food if agent.facing else Frame.of_board)(
-        jax.vmap(tt.observe)(tasks)
-    )
+    frame = Frame.of(jnp.zeros(len(tasks.time), jnp.int32))
+    if agent.config.facing:
+        frame = jax.vmap(Frame.facing_food)(jax.vmap(tt.observe)(tasks))
     seen = jax.vmap(Frame.state)(frame, tasks)
-    chunk, unused_key = min(chunk, len(tasks.time)), jax.random.key(0)
-    return frame, rollout(agent, params, env, seen, unused_key, choose=greedy_action, chunk=chunk)
+    unused_key = jax.random.key(0)
+    return frame, rollout(agent, params, env, seen, unused_key, choose=greedy_action)
 
 
 class Evaluator:
@@ -108,9 +103,7 @@ class Evaluator:
         longest = max(self.limits.values())
         env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
         agent = Agent(config)
-        self._play: Any = jax.jit(
-            lambda params, states: evaluate(agent, params, env, states, config.chunk)
-        )
+        self._play: Any = jax.jit(lambda params, states: evaluate(agent, params, env, states))
 
     @classmethod
     def of_sets(cls, config: Config, sets: Sequence[str], num_tasks: int) -> "Evaluator":

@@ -36,12 +36,6 @@ class Frame(NamedTuple):
         return Frame(number % 2 == 1, number // 2 % 2 == 1, number // 4 == 1)
 
     @staticmethod
-    def of_board(observation: jax.Array) -> "Frame":
-        """The board as it is, whatever the observation u8[12, 12, N]."""
-        del observation
-        return Frame.of(jnp.zeros((), jnp.int32))
-
-    @staticmethod
     def facing_food(observation: jax.Array) -> "Frame":
         """The frame in which the food of u8[12, 12, N] lies below, or right, no further right.
 

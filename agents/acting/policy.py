@@ -1,6 +1,5 @@
 """A trained policy: pure functions from observations to actions."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -52,7 +51,7 @@ class Policy(NamedTuple):
         """The carry before the first step of `batch` episodes."""
         zeros = jnp.zeros(batch, jnp.int32)
         return Carry(
-            embedding=_agent(self.config).initial_state(self.params, batch),
+            embedding=Agent(self.config).initial_state(self.params, batch),
             action_tm1=jnp.zeros((batch, 2), jnp.int32),
             frame=Frame.of(zeros),
             is_first=zeros == 0,
@@ -82,16 +81,15 @@ class Policy(NamedTuple):
             )
         if key is None and not self.greedy:
             raise ValueError("a policy that draws its actions needs a key; greedy ones do not")
-        agent = _agent(self.config)
+        agent = Agent(self.config)
         frame = carry.frame
-        if agent.facing:
+        if self.config.facing:
             first = jax.vmap(Frame.facing_food)(observation)
             frame = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, frame)
             observation = jax.vmap(Frame.picture)(frame, observation)
         features = agent.encode(self.params, observation)
         reward_tm1 = jnp.zeros(len(observation))
-        inputs = agent.core_inputs(self.params, features, carry.action_tm1, reward_tm1)
-        embedding = agent.advance(self.params, carry.embedding, inputs)
+        embedding = agent.step(self.params, carry.embedding, features, carry.action_tm1, reward_tm1)
         outputs = agent.act(self.params, embedding)
         if key is None or self.greedy:
             action = outputs.actions.mode()
@@ -99,8 +97,3 @@ class Policy(NamedTuple):
             action = outputs.actions.sample(key)
         after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first))
         return jax.vmap(Frame.original_action)(frame, action), after
-
-
-@functools.cache
-def _agent(config: Config) -> Agent:
-    return Agent(config)

@@ -3,7 +3,6 @@
 Source: paper, section "Experimental Setup".
 """
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,8 +14,6 @@ from agents.acting.episodes import Episodes, cells_of
 from agents.acting.identity import layout_ids
 from agents.networks.actions import ActionDistribution
 from agents.networks.agent import Agent, Params
-from agents.networks.core import Outputs
-from agents.networks.windows import encode_rows
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State
@@ -59,7 +56,6 @@ def sample_action(key: jax.Array, actions: ActionDistribution) -> jax.Array:
 
 def greedy_action(key: jax.Array, actions: ActionDistribution) -> jax.Array:
     """The most probable actions i32[B, 2]; the key is not used."""
-    del key
     return actions.mode()
 
 
@@ -71,7 +67,6 @@ def rollout(
     key: jax.Array,
     *,
     choose: ChooseAction,
-    chunk: int,
 ) -> Trajectory:
     """Plays one episode from each of B initial states.
 
@@ -82,26 +77,27 @@ def rollout(
       initial: B states at time 0.
       key: PRNG key of the actions.
       choose: `sample_action` or `greedy_action`.
-      chunk: distinct observations encoded at once.
     """
 
     def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[_Carry, dict]:
         time, step_key = inputs
-        carry, outputs = _see(agent, params, chunk, carry, time)
-        action = choose(step_key, outputs.actions)
-        before = carry.state
-        state, timestep = jax.vmap(env.step)(before, action)
+        before, embedding, action_tm1, reward_tm1, cache = carry
+        features, cache = cache.encode(agent, params, before, time)
+        embedding = agent.step(params, embedding, features, action_tm1, reward_tm1)
+        actions, value = agent.act(params, embedding)
+        action = choose(step_key, actions)
+        after, timestep = jax.vmap(env.step)(before, action)
         record = {
             "cells": cells_of(before),
             "action": action,
             "reward": timestep.reward,
             "discount": timestep.discount,
             "mask": 1.0 - (before.terminated | before.truncated),
-            "embedding": carry.embedding,
-            "log_prob": outputs.actions.log_prob(action),
-            "value": outputs.value,
+            "embedding": embedding,
+            "log_prob": actions.log_prob(action),
+            "value": value,
         }
-        return carry._replace(state=state, action_tm1=action, reward_tm1=timestep.reward), record
+        return _Carry(after, embedding, action, timestep.reward, cache), record
 
     # Once more than there are steps, for the last observation; by then no state changes any more.
     times = jnp.arange(env.max_steps + 1)
@@ -115,17 +111,6 @@ def rollout(
         log_prob=record["log_prob"][:-1],
         value=record["value"],
     )
-
-
-def _see(
-    agent: Agent, params: Params, chunk: int, carry: _Carry, time: jax.Array
-) -> tuple[_Carry, Outputs]:
-    """The network's step: encodes the observation, updates the GRU, asks the heads."""
-    encode = functools.partial(encode_rows, agent.encoder)
-    features, cache = carry.cache.encode(encode, params["encoder"], carry.state, time, chunk=chunk)
-    inputs = agent.core_inputs(params, features, carry.action_tm1, carry.reward_tm1)
-    embedding = agent.advance(params, carry.embedding, inputs)
-    return carry._replace(embedding=embedding, cache=cache), agent.act(params, embedding)
 
 
 def _first(agent: Agent, params: Params, env: Environment, initial: State) -> _Carry:

@@ -1,6 +1,5 @@
 """Intrinsic rewards, one module each, by the names that `Config.curiosity` knows."""
 
-from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience
 from agents.curiosity.counts import Counts
 from agents.curiosity.e3b import E3B
@@ -11,9 +10,8 @@ from agents.curiosity.noveld import NovelD
 from agents.curiosity.ride import RIDE
 from agents.curiosity.rnd import RND
 from agents.registry import curiosities
-from trap_tube_jax.environment import Environment
 
-__all__ = ["Curiosity", "Experience", "make", "register"]
+__all__ = ["Curiosity", "Experience", "register"]
 
 register = curiosities.register
 
@@ -26,12 +24,3 @@ register("e3b", lambda config, env: E3B(config))
 register("effects", lambda config, env: Effects(config))
 register("counts", lambda config, env: Counts(env))
 register("none", lambda config, env: Curiosity())
-
-
-def make(config: Config, env: Environment) -> Curiosity:
-    """The curiosity of `config.curiosity`.
-
-    Raises:
-      ValueError: it is unknown, or not for this environment.
-    """
-    return curiosities.factory(config.curiosity)(config, env)

@@ -10,6 +10,7 @@ from agents.config import Config
 from agents.networks import make_encoder
 from agents.networks.core import Core, Heads, Outputs
 from agents.networks.layers import draw
+from agents.networks.windows import encode_rows
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
@@ -21,23 +22,21 @@ class Agent:
     Parameters are a dictionary with `encoder`, `core` and `heads`; other entries are ignored.
 
     Attributes:
-      facing: whether it is to see and act in the frame `acting.frames.Frame.facing_food`.
+      config: the settings. Whoever plays heeds `facing` and `chunk`, which are not done here.
     """
 
     def __init__(self, config: Config):
         self.encoder = make_encoder(config)
         self.core = Core(config.hidden, config.embedding, config.recurrent)
         self.heads = Heads(config.streams)
-        self.facing = config.facing
-        self._hidden = config.hidden
-        self._num_features = config.num_features
+        self.config = config
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters."""
         encoder_key = jax.random.fold_in(key, 0)
-        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self._num_features), jnp.uint8)
+        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         features, encoder = self.encoder.init_with_output(encoder_key, board)
-        state = jnp.zeros((1, self._hidden))
+        state = jnp.zeros((1, self.config.hidden))
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
         params = {
             "encoder": encoder,
@@ -50,21 +49,32 @@ class Agent:
         """Features f32[M, F] of observations u8[M, 12, 12, N]; reads `params["encoder"]`."""
         return _apply(self.encoder, params["encoder"], observation)
 
-    def core_inputs(
-        self, params: Params, features: jax.Array, action_tm1: jax.Array, reward_tm1: jax.Array
+    def encode_rows(self, params: Params, observation: jax.Array, remembered: Any = None) -> Any:
+        """The same by the fast path; a row function, see `chunks.RowFn`."""
+        return encode_rows(self.encoder, params["encoder"], observation, remembered)
+
+    def step(
+        self,
+        params: Params,
+        state: jax.Array,
+        features: jax.Array,
+        action_tm1: jax.Array,
+        reward_tm1: jax.Array,
     ) -> jax.Array:
-        """The GRU's inputs f32[..., 3 * hidden]; see `Core.inputs`."""
-        return _apply(
-            self.core, params["core"], features, action_tm1, reward_tm1, method=Core.inputs
-        )
+        """The GRU's state f32[..., hidden] after a step.
+
+        Args:
+          params: the parameters.
+          state: f32[..., hidden], the state before it.
+          features: f32[..., F], the encoded observation.
+          action_tm1: i32[..., 2], the previous (grasp, move); zeros at the first step.
+          reward_tm1: f32[...], the previous reward; 0 at the first step.
+        """
+        return _apply(self.core, params["core"], state, features, action_tm1, reward_tm1)
 
     def initial_state(self, params: Params, batch: int) -> jax.Array:
         """The GRU's state f32[batch, hidden] before the first step."""
         return _apply(self.core, params["core"], batch, method=Core.initial_state)
-
-    def advance(self, params: Params, state: jax.Array, inputs: jax.Array) -> jax.Array:
-        """One step of the GRU; see `Core.advance`."""
-        return _apply(self.core, params["core"], state, inputs, method=Core.advance)
 
     def act(self, params: Params, embedding: jax.Array) -> Outputs:
         """Distribution of actions and value of an embedding f32[..., hidden]."""
@@ -114,7 +124,9 @@ class Agent:
         """The GRU's inputs at all observations, f32[T + 1, B, 3 * hidden]."""
         action_tm1 = jnp.concatenate([jnp.zeros_like(action[:1]), action])
         reward_tm1 = jnp.concatenate([jnp.zeros_like(reward[:1]), reward])
-        return self.core_inputs(params, features, action_tm1, reward_tm1)
+        return _apply(
+            self.core, params["core"], features, action_tm1, reward_tm1, method=Core.inputs
+        )
 
 
 def num_parameters(params: Params) -> int:

@@ -13,8 +13,6 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from agents.networks.shared_maximum import shared_maximum
-
 REMEMBERED_BYTES = 2**26  # by one `map_rows`; changes speed and nothing else
 
 
@@ -37,6 +35,7 @@ class RowFn(Protocol):
         ...
 
 
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
     """`fn` on the first `count` rows, a chunk at a time; zeros below.
 
@@ -45,7 +44,7 @@ def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) ->
 
     Args:
       fn: see `RowFn`.
-      chunk: rows per call of `fn`.
+      chunk: rows per call of `fn`; M where there are fewer.
       params: any pytree.
       rows: pytree of arrays [M, ...].
       count: i32[], at most M.
@@ -53,11 +52,6 @@ def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) ->
     Returns:
       The features, a pytree of arrays [M, ...].
     """
-    return _map_rows(fn, chunk, params, rows, count)
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
     return _map_rows_forward(fn, chunk, params, rows, count)[0]
 
 
@@ -65,6 +59,7 @@ def _map_rows_forward(
     fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array
 ) -> tuple[Any, Any]:
     num_rows = len(jax.tree.leaves(rows)[0])
+    chunk = min(chunk, num_rows)
     padded = _pad_rows(rows, chunk)
     num_chunks = len(jax.tree.leaves(padded)[0]) // chunk
     shapes = jax.eval_shape(fn, params, _take(padded, 0, chunk), None)
@@ -96,6 +91,7 @@ def _map_rows_backward(
     fn: RowFn, chunk: int, residuals: Any, cotangent: Any
 ) -> tuple[Any, None, None]:
     params, rows, count, memory = residuals
+    chunk = min(chunk, len(jax.tree.leaves(rows)[0]))
     rows, cotangent = _pad_rows((rows, cotangent), chunk)
     num_remembered = min((len(kept) - 1 for kept in jax.tree.leaves(memory)), default=math.inf)
 
@@ -114,19 +110,33 @@ def _map_rows_backward(
     return jax.lax.fori_loop(0, _num_chunks(count, chunk), body, zero), None, None
 
 
-_map_rows.defvjp(_map_rows_forward, _map_rows_backward)
+map_rows.defvjp(_map_rows_forward, _map_rows_backward)
 
 
 @jax.custom_jvp
 def recall(value: jax.Array, remembered: jax.Array) -> jax.Array:
     """`remembered` in place of the equal `value`, which is differentiated but not computed."""
-    del value
     return remembered
 
 
 @recall.defjvp
 def _(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
     return primals[1], tangents[0]
+
+
+@jax.custom_batching.custom_vmap
+def shared_maximum(x: jax.Array) -> jax.Array:
+    """The maximum of a scalar over all vmapped axes, the same in every batch element.
+
+    A loop whose trip count differs between batch elements has to carry both outcomes of
+    every element through selects; one that runs as long as the longest does not.
+    """
+    return x
+
+
+@shared_maximum.def_vmap
+def _(axis_size: int, in_batched: list[bool], x: jax.Array) -> tuple[jax.Array, bool]:
+    return shared_maximum(jnp.max(x)), False
 
 
 def _num_chunks(count: jax.Array, chunk: int) -> jax.Array:

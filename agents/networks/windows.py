@@ -74,7 +74,7 @@ def encode_by_windows(
     def encode(weights: Weights, rows: Any, _: None) -> tuple[Any, None]:
         return encode_windows(weights, *rows), None
 
-    features = chunks.map_rows(encode, WINDOW_CHUNK, weights, (window, block), groups.total)
+    features: Any = chunks.map_rows(encode, WINDOW_CHUNK, weights, (window, block), groups.total)
     shape = (len(observation), BLOCKS, BLOCKS, -1)
     x, spread = (table[groups.number].reshape(shape) for table in features)
     products = _Products(remembered)

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from agents import curiosity as curiosities
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import Episodes, along_episodes, beside, take
 from agents.acting.frames import Frame
@@ -25,11 +24,11 @@ from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
-from agents.networks.windows import encode_rows
 from agents.parallel.sharding import ALONE, Shards
 from agents.ppo import advantages, losses, replay, returns
 from agents.ppo.failures import Failures
 from agents.ppo.optimizer import make_optimizer
+from agents.registry import curiosities
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.registry import make
@@ -146,10 +145,13 @@ class Learner:
         trajectory = self.play(state.params, reset_keys, action_key)
         batch, state, play_metrics = self.prepare(state, trajectory)
         params, opt_state, loss_metrics = self.optimize(state, batch, update_key)
+        failures = state.failures
+        if again := self.config.num_replayed:
+            failures = failures.remember(reset_keys, ~batch.episodes.solved, again)
         state = state._replace(
             params=params,
             opt_state=opt_state,
-            failures=self.note_failures(state.failures, reset_keys, batch.episodes.solved),
+            failures=failures,
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + self.config.episodes,
@@ -165,24 +167,14 @@ class Learner:
         new = jax.random.split(key, config.num_new)
         return jnp.concatenate([new, failures.draw(failures_key, config.num_replayed)])
 
-    def note_failures(
-        self, failures: Failures, reset_keys: jax.Array, solved: jax.Array
-    ) -> Failures:
-        """The failures after tasks [B] were played, as `draw_tasks` gave them, bool[B] solved."""
-        again = self.config.num_replayed
-        return failures.remember(reset_keys, ~solved, again) if again else failures
-
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays this device's share of an iteration's episodes."""
         initial, timestep = jax.vmap(self.env.reset)(self.shards.part(reset_keys))
-        if self.agent.facing:
+        if self.config.facing:
             frame = jax.vmap(Frame.facing_food)(timestep.observation)
             initial = jax.vmap(Frame.state)(frame, initial)
         choose = self.shards.drawing(sample_action)
-        chunk = self.config.chunk
-        return rollout(
-            self.agent, params, self.env, initial, action_key, choose=choose, chunk=chunk
-        )
+        return rollout(self.agent, params, self.env, initial, action_key, choose=choose)
 
     def prepare(
         self, state: TrainState, trajectory: Trajectory
@@ -259,8 +251,11 @@ class Learner:
         observation_id = observation_ids(episodes)
         features = jnp.zeros((*observation_id.shape, 0))
         if type(self.curiosity).encode is not Curiosity.encode:
-            encode = _without_memory(self.curiosity.encode)
             own = params.get("curiosity", {})
+
+            def encode(own: Params, rows: jax.Array, _: None) -> tuple[jax.Array, None]:
+                return self.curiosity.encode(own, rows), None
+
             features = encode_episodes(
                 encode, own, episodes, observation_id, chunk=self.config.chunk
             )
@@ -349,7 +344,7 @@ class Learner:
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         if imitated is not None:
             log_prob = self.agent.act(params, remembered).actions.log_prob(imitated.episodes.action)
-            terms["imitation_loss"] = config.imitation_coef * imitated.loss(log_prob)
+            terms["imitation_loss"] = config.imitation_coef * -jnp.sum(imitated.weight * log_prob)
         total = sum(terms.values(), jnp.zeros(()))
         sums = {"entropy": jnp.sum(entropy * mask), "steps": jnp.sum(mask)}
         return total, {**terms, "loss": total, **sums}
@@ -369,7 +364,11 @@ class Learner:
             other_id = jnp.max(observation_id) + 1 + imitated.observation_id
             observation_id = jnp.concatenate([observation_id, other_id], axis=1)
         read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
-        encode = functools.partial(_encode_both, self.agent, self.curiosity)
+
+        def encode(params: Params, rows: jax.Array, remembered: Any) -> Any:
+            features, remembered = self.agent.encode_rows(params, rows, remembered)
+            return (features, self.curiosity.encode(params.get("curiosity", {}), rows)), remembered
+
         features, own = encode_episodes(encode, read, both, observation_id, chunk=self.config.chunk)
         size = batch.log_prob.shape[1]
         experience = Experience(batch.episodes, batch.observation_id, own[:, :size])
@@ -414,19 +413,5 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             f"iterations={config.iterations} of {config.episodes} episodes of {env.max_steps} "
             f"steps are {steps:,} steps; allowed: at most {COUNTABLE:,}"
         )
-    curiosity = curiosities.make(config, env)
+    curiosity = curiosities.factory(config.curiosity)(config, env)
     return Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
-
-
-def _encode_both(
-    agent: Agent, curiosity: Curiosity, params: Params, observation: jax.Array, remembered: Any
-) -> tuple[tuple[jax.Array, jax.Array], Any]:
-    """The policy's features and the curiosity's; a row function of `chunks.map_rows`."""
-    features, remembered = encode_rows(agent.encoder, params["encoder"], observation, remembered)
-    own = curiosity.encode(params.get("curiosity", {}), observation)
-    return (features, own), remembered
-
-
-def _without_memory(encode: Any) -> Any:
-    """A row function of `chunks.map_rows` that remembers nothing."""
-    return lambda params, rows, _: (encode(params, rows), None)

@@ -41,10 +41,6 @@ class Imitated(NamedTuple):
         weight = discounted_returns(memory.reward, jnp.float32(discount)) * memory.mask
         return cls(memory, observation_ids(memory), weight / steps)
 
-    def loss(self, log_prob: jax.Array) -> jax.Array:
-        """Minus the weighted log-likelihood f32[] of the actions, from `log_prob` f32[T, K]."""
-        return -jnp.sum(self.weight * log_prob)
-
 
 def empty(base: State, capacity: int, num_steps: int) -> Episodes:
     """A memory for `capacity` episodes of `num_steps` steps: their masks are 0 everywhere."""

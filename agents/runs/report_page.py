@@ -171,7 +171,7 @@ def compile_pay(config: Config, state: TrainState, evaluator: Evaluator) -> Pay:
     env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
 
     def paid(state: TrainState, tasks: State) -> jax.Array:
-        _, trajectory = play_greedily(learner.agent, state.params, env, tasks, config.chunk)
+        _, trajectory = play_greedily(learner.agent, state.params, env, tasks)
         return learner.intrinsic_reward(state, trajectory)[0].swapaxes(0, 1)
 
     shown = EPISODES_OF_A_SET * len(evaluator.tasks)

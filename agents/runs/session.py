@@ -330,7 +330,7 @@ def make_advance(train: Learner, num_seeds: int) -> Advance:
 
     def advance(state: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
         after, metrics = train.iterate(state)
-        outcome = evaluate(train.agent, after.params, train.env, tasks, config.chunk, train.shards)
+        outcome = evaluate(train.agent, after.params, train.env, tasks, train.shards)
         metrics = {
             **metrics,
             "episodes": after.episodes,
