@@ -156,7 +156,8 @@ def repeated_seconds(config: Config, repeats: int = 5) -> float:
         actions = jax.lax.map(lambda key: sample_action(key, distribution), step_keys)
         return actions, train.prepare(state, trajectory)
 
-    trajectory = jax.jit(train.play)(state.params, jax.random.key(1), jax.random.key(3))
+    reset_keys = jax.random.split(jax.random.key(1), config.episodes)
+    trajectory = jax.jit(train.play)(state.params, reset_keys, jax.random.key(3))
     return harness.measure(lambda: repeat(trajectory), repeats).median_s
 
 

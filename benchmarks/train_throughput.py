@@ -98,8 +98,9 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     iterate = jax.jit(train.iterate)
     for _ in range(warm):
         state, _ = iterate(state)
-    reset_keys = jax.random.split(state.key, config.episodes)
-    play = jax.jit(lambda state: train.play(state.params, reset_keys, state.key))
+    reset_key, action_key = jax.random.split(state.key)
+    reset_keys = jax.random.split(reset_key, config.episodes)
+    play = jax.jit(lambda state: train.play(state.params, reset_keys, action_key))
     trajectory = play(state)
     batch, _, _ = jax.jit(train.prepare)(state, trajectory)
     flop = useful_flop(train, state, batch)
