@@ -46,14 +46,14 @@ class Shards:
 
     count: int = 1
 
-    def part(self, tree: Tree, axis: int = 0) -> Tree:
-        """This device's share of arrays that every device holds whole."""
+    def part(self, tree: Tree) -> Tree:
+        """This device's share of the rows of arrays that every device holds whole."""
         if self.count == 1:
             return tree
 
         def own(x: jax.Array) -> jax.Array:
-            size = x.shape[axis] // self.count
-            return jax.lax.dynamic_slice_in_dim(x, self._index() * size, size, axis)
+            size = len(x) // self.count
+            return jax.lax.dynamic_slice_in_dim(x, self._index() * size, size)
 
         return jax.tree.map(own, tree)
 
