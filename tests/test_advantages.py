@@ -9,6 +9,7 @@ import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting.episodes import Episodes
 from agents.ppo import advantages, returns
+from agents.ppo.learner import RESERVED_NAMES
 
 TINY = {
     "env_id": "pstsy", "episodes": 8, "minibatch": 4, "epochs": 1, "filters": (4, 4),
@@ -59,6 +60,7 @@ def test_training_with_two_streams_replays_and_frames():
     assert int(after.failures.next[0]) == failed % TINY["failures"]
     assert 0 <= float(metrics["replayed_success"]) <= 1
     assert all(np.isfinite(float(value)) for value in metrics.values())
+    assert metrics.keys() <= RESERVED_NAMES  # the curiosity has no losses
 
 
 def test_without_curiosity_the_task_has_the_only_value():

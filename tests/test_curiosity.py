@@ -28,7 +28,10 @@ class Corners(Curiosity):
 
 
 class Plain(Curiosity):
-    """Encodes without parameters, pays NaN after an episode's end, and has a loss of PPO's name."""
+    """Encodes without parameters, pays NaN after an episode's end, and has a loss of any name."""
+
+    def __init__(self, loss="value_loss"):
+        self.loss = loss
 
     def encode(self, params, observation):
         return observation.reshape(len(observation), -1)[:, :3] / 255.0
@@ -38,7 +41,7 @@ class Plain(Curiosity):
         return experience.features[1:, :, 0] * 0 + 1 / mask - jnp.where(mask, 0.0, jnp.inf), memory
 
     def losses(self, params, experience):
-        return {"value_loss": experience.episodes.mask}
+        return {self.loss: experience.episodes.mask}
 
 
 @pytest.fixture(scope="module")
@@ -80,11 +83,12 @@ def test_a_curiosity_without_parameters_encodes_and_may_pay_anything_after_the_e
     np.testing.assert_array_equal(reward, episodes.mask)
 
 
-def test_losses_called_like_those_of_ppo_are_refused():
-    register("plain", lambda config, env: Plain())
+@pytest.mark.parametrize("name", ["value_loss", "success"])
+def test_losses_called_like_metrics_are_refused(name):
+    register("plain", lambda config, env: Plain(name))
     train = make_train(Config.from_dict({**TINY, "curiosity": "plain"}))
     start = jax.eval_shape(train.init, jax.random.key(0))
-    with pytest.raises(ValueError, match="need names of their own, got value_loss"):
+    with pytest.raises(ValueError, match=f"need names of their own, got {name}"):
         jax.eval_shape(train.iterate, start)
 
 

@@ -79,6 +79,6 @@ class Curiosity:
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """Terms of the loss by name, f32[T, B] each, finite also after an episode's end.
 
-        {} if nothing is trained. Names are other than those of PPO's terms (`Learner.loss`).
+        {} if nothing is trained. Names are other than the metrics' (`ppo.learner.RESERVED_NAMES`).
         """
         return {}

@@ -37,6 +37,15 @@ Metrics = dict[str, jax.Array]
 
 COUNTABLE = np.iinfo(np.int32).max  # by `TrainState.transitions`
 
+# The names of all other metrics, which a curiosity's losses may not have: those of play, of
+# gradient steps, and what a run adds to them.
+RESERVED_NAMES = {
+    "success", "replayed_success", "episode_length", "intrinsic_reward", "distinct_observations",
+    "policy_loss", "value_loss", "entropy_loss", "imitation_loss", "loss", "entropy", "steps",
+    "gradient_norm", "seed", "iteration", "episodes", "transitions", "evaluation", "seconds",
+    "transitions_per_second",
+}  # fmt: skip
+
 
 class TrainState(NamedTuple):
     """Everything that training carries from one iteration to the next.
@@ -306,7 +315,9 @@ class Learner:
     def loss(
         self, params: Params, batch: Batch, imitated: replay.Imitated | None = None
     ) -> tuple[jax.Array, Metrics]:
-        """The total loss f32[] and its terms, weighted as they enter it; means over devices.
+        """The total loss f32[] and its terms, weighted as they enter it.
+
+        Their mean over devices is the whole minibatch's.
 
           L = policy + value - entropy + curiosity_coef * curiosity's losses
               - imitation_coef * sum_t G_t log pi(a_t | o_t) / steps, of remembered successes
@@ -320,7 +331,7 @@ class Learner:
           imitated: its part of the episodes to imitate, if any are.
 
         Raises:
-          ValueError: the curiosity calls a loss of its own like one of PPO's.
+          ValueError: the curiosity calls a loss of its own like a metric.
         """
         config, mask = self.config, batch.episodes.mask
         embedding, experience = self.learning_experience(params, batch, imitated)
@@ -336,7 +347,7 @@ class Learner:
             "entropy_loss": -config.entropy_coef * losses.padded_mean(entropy, mask),
         }
         own = self.curiosity.losses(params.get("curiosity", {}), experience)
-        if taken := own.keys() & {*terms, "imitation_loss", "loss", "entropy", "steps"}:
+        if taken := own.keys() & RESERVED_NAMES:
             raise ValueError(
                 f"a curiosity's losses need names of their own, got {', '.join(sorted(taken))}"
             )
