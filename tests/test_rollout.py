@@ -114,8 +114,8 @@ def test_every_observation_has_its_own_features(played):
 def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch):
     """Across episodes and times; where hashes collide it may be more often, to the same result."""
     _, _, params, initial, play, _ = played
-    if bits != encodings.SLOT_BITS:
-        monkeypatch.setattr(encodings, "SLOT_BITS", bits)
+    if bits != encodings.CACHE_BITS:
+        monkeypatch.setattr(encodings, "CACHE_BITS", bits)
         play = make_play(params, initial)
     for env_id in ("base", "st"):
         # Several episodes of each layout, which meet again what the others have met before.

@@ -17,7 +17,7 @@ from trap_tube_jax.observation import observe
 from trap_tube_jax.positions import position_id
 from trap_tube_jax.state import State
 
-SLOT_BITS = 20  # of an observation's hash, by which the cache finds it
+CACHE_BITS = 20  # of an observation's hash, by which the cache finds it
 
 
 def encode_episodes(
@@ -71,7 +71,7 @@ class Cache(NamedTuple):
             layout_id=layout_id,
             position=jnp.zeros(shape, jnp.int32),
             features=jnp.zeros((*shape, width)),
-            newest=jnp.full(2**SLOT_BITS, -1),
+            newest=jnp.full(2**CACHE_BITS, -1),
         )
 
     def encode(
@@ -82,7 +82,7 @@ class Cache(NamedTuple):
         At most `agent.config.chunk` observations are encoded at once.
         """
         position = jax.vmap(position_id)(state)
-        slot = slots(jnp.stack([self.layout_id, position], axis=1), SLOT_BITS)
+        slot = slots(jnp.stack([self.layout_id, position], axis=1), CACHE_BITS)
         is_known, known = self._look_up(position, slot)
         # Of those that are not known, the distinct ones come first.
         groups = group(is_known.astype(jnp.int32), self.layout_id, position)

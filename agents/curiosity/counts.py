@@ -13,7 +13,7 @@ from agents.curiosity.base import Curiosity, Experience, Params
 from agents.networks.grouping import slots
 from trap_tube_jax.environment import Environment
 
-SLOT_BITS = 20
+VISIT_BITS = 20  # of an observation's hash, in the table of visits
 
 
 class Counts(Curiosity):
@@ -46,7 +46,7 @@ class Counts(Curiosity):
 
     def memory(self) -> jax.Array:
         """No visits yet, f32[2^20]."""
-        return jnp.zeros(2**SLOT_BITS)
+        return jnp.zeros(2**VISIT_BITS)
 
     def reward(
         self, params: Params, memory: jax.Array, experience: Experience
@@ -61,7 +61,7 @@ def observation_slots(episodes: Episodes) -> jax.Array:
     position = position_ids(episodes)
     layout = jnp.broadcast_to(layout_hashes(episodes.layout), position.shape)
     rows = jnp.stack([layout, position.astype(jnp.uint32)], axis=-1)
-    return slots(rows, SLOT_BITS)
+    return slots(rows, VISIT_BITS)
 
 
 def visit_bonus(visits: jax.Array, slot: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-SLOT_BITS = 16  # of a hash, in the table that `group_rows` looks up
+GROUPING_BITS = 16  # of a hash, in the table that `group_rows` looks up
 
 
 class Groups(NamedTuple):
@@ -48,8 +48,8 @@ def group_rows(content: jax.Array) -> Groups:
     Different rows are never in one group. Equal rows may be in two if hashes collide.
     """
     own = jnp.arange(len(content))
-    slot = slots(content, SLOT_BITS)
-    known = jnp.zeros(2**SLOT_BITS, jnp.int32).at[slot].max(own)[slot]
+    slot = slots(content, GROUPING_BITS)
+    known = jnp.zeros(2**GROUPING_BITS, jnp.int32).at[slot].max(own)[slot]
     known = jnp.where(jnp.all(content[known] == content, axis=1), known, own)
     first = known == own
     number = jnp.cumsum(first, dtype=jnp.int32) - 1
