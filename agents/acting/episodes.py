@@ -11,13 +11,16 @@ from trap_tube_jax.state import State
 
 Record = TypeVar("Record")
 
+CELL_AGENT, CELL_TOOL, CELL_FOOD = 0, 1, 2  # places in `Episodes.cells`
+
 
 class Episodes(NamedTuple):
     """B episodes of T steps, padded after an early end with what does not change any more.
 
     Attributes:
       layout: B states, of which board, palette and tool extent hold for the episode.
-      cells: u8[T + 1, B, 3, 2], the (row, column) of agent, tool and food at each observation.
+      cells: u8[T + 1, B, 3, 2], the (row, column) of agent, tool and food at each observation;
+        `CELL_AGENT`, `CELL_TOOL` and `CELL_FOOD` are their places.
       action: i32[T, B, 2], (grasp, move).
       reward: f32[T, B], extrinsic.
       discount: f32[T, B], 0 on the step that terminated the episode and after it, else 1.

@@ -8,7 +8,7 @@ in RIDE (Raileanu and Rocktaeschel, 2020).
 import jax
 import jax.numpy as jnp
 
-from agents.acting.episodes import Episodes
+from agents.acting.episodes import CELL_AGENT, CELL_FOOD, CELL_TOOL, Episodes
 from agents.acting.identity import first_visits
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
@@ -17,7 +17,6 @@ from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 
 NUM_KINDS = 3
 LOWEST_RATE = 1e-4  # effects a step, below which an effect does not pay more
-AGENT, TOOL, FOOD = 0, 1, 2  # in `Episodes.cells`
 
 
 class Effects(Curiosity):
@@ -67,13 +66,13 @@ def new_effects(episodes: Episodes) -> jax.Array:
     """
     cell = episodes.cells.astype(jnp.int32)
     cell = cell[..., 0] * BOARD_SIZE + cell[..., 1]
-    moved = [first_visits(cell[..., thing])[1:] for thing in (FOOD, TOOL)]
+    moved = [first_visits(cell[..., thing])[1:] for thing in (CELL_FOOD, CELL_TOOL)]
     return jnp.stack([*moved, new_touches(episodes)])
 
 
 def new_touches(episodes: Episodes) -> jax.Array:
     """f32[T, B]: 1 where the cell that is grasped at shows a look new to the episode's grasps."""
-    hand = episodes.cells[:-1, :, AGENT].astype(jnp.int32)
+    hand = episodes.cells[:-1, :, CELL_AGENT].astype(jnp.int32)
     hand = hand + jnp.asarray(DIRECTIONS)[episodes.action[..., 0]]
     on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
     hand = jnp.clip(hand, 0, BOARD_SIZE - 1)

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from agents import Config, make_train
+from agents.acting.episodes import CELL_TOOL
 from agents.curiosity import Curiosity, Experience, register
-
-TOOL = 1  # in `Episodes.cells`
 
 
 class ToolMoves(Curiosity):
@@ -28,7 +27,7 @@ class ToolMoves(Curiosity):
         self, params: Any, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
         """The bonus f32[T, B] of every step, and the moves with this iteration's."""
-        tool = experience.episodes.cells[:, :, TOOL]
+        tool = experience.episodes.cells[:, :, CELL_TOOL]
         moves = jnp.any(tool[1:] != tool[:-1], axis=-1) * experience.episodes.mask
         total = memory + jnp.sum(moves)
         return moves / jnp.sqrt(jnp.maximum(total, 1.0)), total
