@@ -33,7 +33,9 @@ class E3B(Curiosity):
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features of its own encoder, f32[M, F]."""
-        features: Any = self._models.apply(params, observation, method=InverseFeatures.encode)
+        features: Any = self._models.apply(
+            params, observation, method=lambda models, x: models.encoder(x)
+        )
         return features
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
@@ -44,7 +46,7 @@ class E3B(Curiosity):
         """-log p(action) under the inverse model."""
         features = experience.features
         action: Any = self._models.apply(
-            params, features[:-1], features[1:], method=InverseFeatures.infer
+            params, features[:-1], features[1:], method=lambda models, *x: models.inverse(*x)
         )
         return {"inverse_loss": -action.log_prob(experience.episodes.action)}
 

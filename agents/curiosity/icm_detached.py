@@ -39,8 +39,9 @@ class Models(InverseFeatures):
         self, observation: jax.Array, next_observation: jax.Array, action: jax.Array
     ) -> tuple[jax.Array, ActionDistribution]:
         """All of it on single steps: u8[M, 12, 12, N] twice and i32[M, 2]; see `compare`."""
-        features = self.encode(observation), self.encode(next_observation)
-        return self.compare(*features, action)
+        features: Any = self.encoder(observation)
+        next_features: Any = self.encoder(next_observation)
+        return self.compare(features, next_features, action)
 
     def compare(
         self, features: jax.Array, next_features: jax.Array, action: jax.Array
@@ -72,7 +73,9 @@ class DetachedICM(ICM):
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features of its own encoder, f32[M, F]."""
-        features: Any = self._models.apply(params, observation, method=Models.encode)
+        features: Any = self._models.apply(
+            params, observation, method=lambda models, x: models.encoder(x)
+        )
         return features
 
     def predict(self, params: Params, experience: Experience) -> Any:

@@ -3,8 +3,6 @@
 Source: Pathak et al. (2017); agents/agent.md, "Network".
 """
 
-from typing import Any
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -54,13 +52,4 @@ class InverseFeatures(nn.Module):
 
     def __call__(self, observation: jax.Array, next_observation: jax.Array) -> ActionDistribution:
         """The inferred action between two observations u8[M, 12, 12, N]."""
-        return self.inverse(self.encode(observation), self.encode(next_observation))
-
-    def encode(self, observation: jax.Array) -> jax.Array:
-        """Features f32[M, F] of u8[M, 12, 12, N]."""
-        features: Any = self.encoder(observation)
-        return features
-
-    def infer(self, features: jax.Array, next_features: jax.Array) -> ActionDistribution:
-        """The inferred action between two features f32[..., F]."""
-        return self.inverse(features, next_features)
+        return self.inverse(self.encoder(observation), self.encoder(next_observation))
