@@ -14,11 +14,10 @@ from agents.config import Config
 from agents.networks.agent import Agent, Params
 from agents.parallel.sharding import ALONE, Shards
 from trap_tube_jax.environment import Environment
+from trap_tube_jax.scoring.benchmark import BLOCK
 from trap_tube_jax.scoring.scores import Optimality, Score
 from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks, label, layout_numbers
 from trap_tube_jax.state import State
-
-BLOCK = 1024  # tasks played at once: bounds the memory, whatever their number
 
 
 class Evaluation(NamedTuple):
@@ -88,7 +87,7 @@ class Evaluator:
             is None, the names are those of registered sets, whose limits hold.
 
         Raises:
-          ValueError: a name is to be that of a registered set, and is not.
+          ValueError: `config.max_steps` is None, and a name is not that of a registered set.
         """
         self.tasks = dict(tasks)
         self.limits = {name: config.step_limit(name) for name in self.tasks}
@@ -107,7 +106,7 @@ class Evaluator:
 
     @classmethod
     def of_sets(cls, config: Config, sets: Sequence[str], num_tasks: int) -> "Evaluator":
-        """That of registered task sets.
+        """An evaluator of registered task sets.
 
         Raises:
           ValueError: unknown set, no set, or no task.

@@ -18,7 +18,9 @@ from trap_tube_jax.state import State, base_state
 
 
 class Frame(NamedTuple):
-    """One of the eight: first mirrored at the diagonal or not, then top down, then left right.
+    """One of the eight images of the board.
+
+    It is mirrored at the main diagonal or not, then upside down or not, then left to right or not.
 
     Attributes:
       transposed: bool[].
@@ -37,10 +39,10 @@ class Frame(NamedTuple):
 
     @staticmethod
     def facing_food(observation: jax.Array) -> "Frame":
-        """The frame in which the food of u8[12, 12, N] lies below, or right, no further right.
+        """The frame in which food lies below the agent, at most as far to the right as below.
 
-        Agent and food are found by their colours. The board stays as it is where one of them
-        is not to be seen.
+        Agent and food are found in the observation u8[12, 12, N] by their colours. The board stays
+        as it is where one of them is not to be seen.
         """
         palette = base_state(observation.shape[-1]).palette
         agent, food = (_first_cell(observation, palette[thing]) for thing in (AGENT, FOOD))

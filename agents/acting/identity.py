@@ -46,6 +46,6 @@ def first_visits(observation_id: jax.Array) -> jax.Array:
 
 
 def _layout_content(layout: State) -> jax.Array:
-    """u8[B, ...]: all that an episode keeps, one row each."""
+    """u8[B, K]: board, palette and tool extent of each state as one row."""
     parts = (layout.board, layout.palette, layout.tool_extent.astype(jnp.uint8))
     return jnp.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)

@@ -17,7 +17,7 @@ class Carry(NamedTuple):
     Attributes:
       embedding: f32[B, hidden], the state of the GRU.
       action_tm1: i32[B, 2], the previous (grasp, move) in the frame; zeros before the first step.
-      frame: the frame bool[B] each that the first observation has fixed.
+      frame: the frames, three arrays bool[B], as each episode's first observation has fixed them.
       is_first: bool[B], whether no observation has been seen yet.
     """
 

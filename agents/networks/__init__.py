@@ -16,9 +16,5 @@ register("objects", lambda config: ObjectEncoder(config.filters))
 
 
 def make_encoder(config: Config) -> nn.Module:
-    """A new encoder of the kind `config.encoder`.
-
-    Raises:
-      ValueError: there is no such kind.
-    """
+    """A new encoder of the kind `config.encoder`."""
     return encoders.factory(config.encoder)(config)

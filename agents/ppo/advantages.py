@@ -15,8 +15,8 @@ from agents.acting.episodes import Episodes
 from agents.config import Config
 from agents.ppo import returns
 
-# Of the curiosity's returns, once scaled: like that of the task's, which lie in [0, 1], so that
-# one weight of the value's error suits both.
+# Deviation to which the curiosity's returns are scaled: about that of the task's returns, which lie
+# in [0, 1], so that one weight of the value's error suits both.
 RETURN_DEVIATION = 0.3
 
 # Added to the variance of advantages, so that a stream that hardly pays is not blown up.
@@ -73,8 +73,8 @@ def of_streams(
 ) -> tuple[jax.Array, jax.Array, RewardMoments]:
     """The sum of the advantages of both rewards, normalised apart.
 
-    Added up as rewards, the louder one decides: once easy tasks pay, what the agent still has to
-    find out is lost in their variance (Burda et al., 2019b).
+    If the rewards were added, the louder one would decide: once easy tasks pay, what the agent
+    still has to find out is lost in their variance (Burda et al., 2019b).
 
     The task's reward, at most 1 an episode, is taken as it is; the curiosity's is scaled so that
     its returns deviate by `RETURN_DEVIATION`.

@@ -33,8 +33,9 @@ def adam(learning_rate: optax.Schedule, epsilon: float) -> optax.GradientTransfo
       step = -learning_rate sqrt(1 - BETA2^t) / (1 - BETA1^t) * m / (sqrt(v) + epsilon).
 
     This is the form at the end of section 2 of Kingma and Ba (2015), which the baseline's
-    framework uses. `optax.adam` adds epsilon after the correction of v: while t is small,
-    a 30 times smaller bound, which shows in parameters whose gradient is near 1e-6.
+    framework uses. `optax.adam` adds epsilon after the correction of v. At t = 1 epsilon
+    then weighs 30 times less (sqrt(1 - BETA2) = 0.03), which shows in parameters whose gradient is
+    near 1e-6.
 
     Args:
       learning_rate: step size, by the number of updates so far.
