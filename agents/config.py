@@ -120,7 +120,7 @@ class Config:
         and reward and no more.
       chunk: distinct observations that are encoded at once; changes speed, and results only by
         the order of float32 sums.
-      compile_quickly: whether a run's program compiles in half the time, for short runs on a CPU;
+      compile_quickly: whether a run's program compiles in two thirds of the time, for short runs on a CPU;
         changes speed, and results only by rounding.
     """
 
