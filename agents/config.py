@@ -120,8 +120,8 @@ class Config:
         and reward and no more.
       chunk: distinct observations that are encoded at once; changes speed, and results only by
         the order of float32 sums.
-      compile_quickly: whether a run's program compiles in two thirds of the time, for short runs on a CPU;
-        changes speed, and results only by rounding.
+      compile_quickly: whether a run's program compiles in two thirds of the time, for short runs
+        on a CPU; changes speed, and results only by rounding.
     """
 
     imports: tuple[str, ...] = _setting(())
