@@ -426,6 +426,18 @@ def test_no_iteration_begins_that_could_take_too_many_steps():
         dataclasses.replace(config, max_transitions=399)
 
 
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    lowered = jax.jit(lambda x: x + 1).lower(1.0)
+    monkeypatch.setattr(compilation, "QUICKLY", {"xla_no_such_option": True})
+    with pytest.raises(jax.errors.JaxRuntimeError, match="No such compile option"):
+        lowered.compile(compilation.QUICKLY)
+    assert compilation.compiled(lowered, Config(compile_quickly=True))(1.0) == 2
+    monkeypatch.setattr(compilation, "QUICKLY", {"xla_cpu_use_fusion_emitters": "perhaps"})
+    with pytest.raises(jax.errors.JaxRuntimeError):  # any other error is not hidden
+        compilation.compiled(lowered, Config(compile_quickly=True))
+    assert compilation.compiled(lowered, Config())(1.0) == 2
+
+
 def test_cache_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert compilation.default_folder() == tmp_path / "trap_tube_jax" / "jax"

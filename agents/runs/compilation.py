@@ -20,15 +20,10 @@ def default_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "trap_tube_jax" / "jax"
 
 
-def enable_cache(folder: Path | None = None) -> None:
-    """Keeps compiled programs from one process to the next.
-
-    Args:
-      folder: where; `default_folder()` if absent. Made if missing.
-    """
-    folder = default_folder() if folder is None else folder
+def enable_cache() -> None:
+    """Keeps compiled programs from one process to the next, in `default_folder()`."""
     jax.config.update("jax_enable_compilation_cache", True)
-    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_dir", str(default_folder()))
     # By default only what took over a second is kept; a run compiles many smaller programs.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
@@ -37,11 +32,12 @@ def enable_cache(folder: Path | None = None) -> None:
 def compiled(lowered: jax.stages.Lowered, config: Config) -> jax.stages.Compiled:
     """The program, compiled as `config.compile_quickly` says.
 
-    An XLA that does not know the options for it compiles as usual.
+    On other devices than a CPU, and by an XLA that does not know the options, it compiles as usual.
     """
-    if config.compile_quickly:
+    if config.compile_quickly and jax.default_backend() == "cpu":
         try:
             return lowered.compile(QUICKLY)
-        except jax.errors.JaxRuntimeError:
-            pass
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
     return lowered.compile()

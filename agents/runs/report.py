@@ -127,7 +127,7 @@ class LiveReport:
 
 
 def _cells(mean: Row, columns: Sequence[tuple[str, str, str]]) -> list[str]:
-    """Where these are percentages, the head says so."""
+    """The cells of a row. Percentages have no sign, which is in the head."""
     return [format(mean[metric], form).removesuffix("%") for _, metric, form in columns]
 
 
