@@ -32,7 +32,6 @@ CONFIG = Config.preset(
     filters=(2, 2),
     hidden=4,
     embedding=2,
-    imitation_episodes=3,
     eval_episodes=3,
     chunk=8,
 )
@@ -62,14 +61,7 @@ class Trainer:
 
 
 def first_state(trainer):
-    """A state whose replay holds solved episodes, so that imitation has something to share."""
-    state = trainer.init(jax.vmap(jax.random.key)(np.arange(SEEDS, dtype=np.uint32)))
-    replay = state.replay
-    mask = np.ones(replay.mask.shape, np.float32)
-    mask[:, :, -1] = 0
-    reward = np.zeros_like(mask)
-    reward[:, -1, :-1] = 1
-    return state._replace(replay=replay._replace(mask=mask, reward=reward))
+    return trainer.init(jax.vmap(jax.random.key)(np.arange(SEEDS, dtype=np.uint32)))
 
 
 def rows_of(tree, index):
@@ -149,7 +141,6 @@ def main(folder):
         "state": difference(expected, to_arrays(found)),
         "metrics": [difference(*pair) for pair in zip(expected_rows, rows, strict=True)],
         "learned": float(np.max(np.abs(expected[head] - to_arrays(start)[head]))),
-        "imitation": [float(np.min(np.abs(row["imitation_loss"]))) for row in rows],
         "eight_to_one": difference(expected, from_eight),
         "eight_to_eight": digest(to_arrays(twice)) == digest(to_arrays(found)),
         "evaluation": all(jax.tree.leaves(same)),

@@ -20,7 +20,7 @@ def test_paper_preset_is_the_specification():
         "learning_rate": 1e-3, "adam_epsilon": 1e-7, "max_gradient_norm": 1.0,
         "curiosity": "icm", "intrinsic_scale": 0.1, "curiosity_coef": 10.0, "reward_rate": 0.9,
         "filters": (32, 64), "hidden": 64, "embedding": 8, "iterations": 250,
-        "episodic_novelty": False, "bootstrap": "baseline",
+        "bootstrap": "baseline",
     }  # fmt: skip
     assert {name: getattr(config, name) for name in expected} == expected
 
@@ -54,11 +54,11 @@ def test_every_setting_is_documented():
         ({"adam_epsilon": 0.0}, ["adam_epsilon", "1e-12", "0.0"]),
         ({"intrinsic_start": 0.01}, ["intrinsic_start", "at least intrinsic_scale=0.1", "0.01"]),
         ({"learning_rate": "fast"}, ["learning_rate", "float", "fast"]),
-        ({"episodic_novelty": 1}, ["episodic_novelty", "bool", "1"]),
+        ({"facing": 1}, ["facing", "bool", "1"]),
         ({"bootstrap": "none"}, ["bootstrap", "none", "value, baseline"]),
         ({"curiosity": "none", "intrinsic_scale": 0.7}, ["intrinsic_scale", "0.7", "'none'"]),
         ({"curiosity": "counts", "curiosity_coef": 1.0}, ["curiosity_coef", "'counts'", "10.0"]),
-        ({"imitation_episodes": 3}, ["imitation_episodes", "imitation_coef=0"]),
+        ({"failures": 3}, ["failures", "replayed=()"]),
         ({"num_features": 0}, ["num_features", "0"]),
         ({"max_steps": 0}, ["max_steps", "0"]),
         ({"max_steps": 5.0}, ["max_steps", "int | None", "5.0"]),
@@ -74,7 +74,7 @@ def test_refusals_name_the_value_and_what_is_allowed(settings, words):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_can_be_had_without_curiosity(name):
-    assert Config.preset(name, curiosity="none", imitation_coef=0.0).curiosity == "none"
+    assert Config.preset(name, curiosity="none").curiosity == "none"
 
 
 def test_unknown_preset_lists_the_known():

@@ -101,13 +101,13 @@ def test_names_are_checked_against_the_registry():
 
 @pytest.mark.parametrize("env_id", ["base", "sy"])
 def test_counts_are_for_tasks_that_return(env_id):
-    make_train(Config.preset("fast", env_id=env_id))
+    make_train(Config.preset("fast", env_id=env_id, curiosity="counts"))
 
 
 @pytest.mark.parametrize("env_id", ["p", "st", "pstsy"])
 def test_counts_are_refused_where_tasks_do_not_return(env_id):
     with pytest.raises(ValueError, match=r"'counts' needs tasks that return: base or Sy"):
-        make_train(Config.preset("fast", env_id=env_id))
+        make_train(Config.preset("fast", env_id=env_id, curiosity="counts"))
 
 
 def test_visits_are_counted_and_pay_by_their_root():

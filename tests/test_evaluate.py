@@ -282,8 +282,8 @@ def test_a_page_shows_shortest_plans(page):
 
 
 def test_a_page_shows_what_the_curiosity_pays():
-    """Counts of this play alone: the same task twice, paid where an episode meets news."""
-    config = Config(**TINY, curiosity="counts", episodic_novelty=True)
+    """Counts of this play alone: the same task twice."""
+    config = Config(**TINY, curiosity="counts")
     trained = jax.jit(make_train(config).init)(jax.random.key(0))
     evaluator = Evaluator.of_sets(config, ["base"], 1)
     pay = report_page.compile_pay(config, trained, evaluator)
@@ -295,10 +295,7 @@ def test_a_page_shows_what_the_curiosity_pays():
     for action in outcome.action[0, : outcome.length[0]]:
         state = advance(state, action)
         seen.append(np.asarray(tt.observe(state)).tobytes())
-    expected = [
-        0.0 if board in seen[: time + 1] else (2 * seen[1:].count(board)) ** -0.5
-        for time, board in enumerate(seen[1:])
-    ]
+    expected = [(2 * seen[1:].count(board)) ** -0.5 for board in seen[1:]]
     np.testing.assert_allclose(novelty, [expected] * 2, rtol=1e-6)
 
 

@@ -12,7 +12,7 @@ from agents.examples import custom_curiosity, custom_transfer, oracle
 
 SMALL = {
     "episodes": 8, "minibatch": 8, "epochs": 1, "max_steps": 20, "filters": (2, 2), "hidden": 4,
-    "embedding": 2, "chunk": 8, "imitation_coef": 0.0,
+    "embedding": 2, "chunk": 8,
 }  # fmt: skip
 
 

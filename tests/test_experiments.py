@@ -32,7 +32,6 @@ def refused(capsys, *arguments):
         ("--preset slow", "unknown preset 'slow'; allowed: paper, fast"),
         ("--seeds 0", "seeds must be >= 1, got 0"),
         ("--reported 0", "reported must be >= 1, got 0"),
-        ("--algorithms ppo+imitation", "imitates, but imitation_coef is 0 in preset 'paper'"),
         ("--evaluate-every 0", "evaluate_every must be >= 1, got 0"),
         ("--checkpoint-every 0", "checkpoint_every must be >= 1, got 0"),
         ("--iterations 0", "iterations must lie in [1, inf], got 0"),
@@ -79,7 +78,7 @@ def test_protocols_are_the_papers():
         assert protocol.config("ppo").curiosity == "none"
         assert (protocol.selection, protocol.num_reported) == ("validation", 1000)
     fast = QUICK["exp1"].config("preset")
-    assert (fast.curiosity, fast.imitation_coef, fast.eval_episodes) == ("counts", 1.0, 16)
+    assert (fast.curiosity, fast.eval_episodes) == ("effects", 16)
 
 
 @pytest.mark.parametrize("experiment", QUICK)
@@ -136,10 +135,8 @@ def test_ppo_is_ppo_alone_in_every_preset(preset):
     whole = protocol.config("preset")
     for name in ("ppo", "ppo+icm", "ppo+counts"):
         config = protocol.config(name)
-        assert config.imitation_coef == 0
         assert config.curiosity == (name.partition("+")[2] or "none")
         assert config.learning_rate == whole.learning_rate
-    assert not protocol.config("ppo").episodic_novelty
 
 
 def test_an_algorithm_may_change_settings():
@@ -163,13 +160,3 @@ def test_a_command_can_be_pasted_into_a_shell():
     words = shlex.split(Protocol(settings=settings).command("exp1", ["ppo"]))
     given = words[words.index("--settings") + 1 :]
     assert dict(map(parse_setting, given)) == settings
-
-
-def test_a_name_may_say_that_the_agent_imitates():
-    fast = Protocol(preset="fast")
-    whole = fast.config("preset")
-    assert whole.imitation_coef > 0
-    named = fast.config(f"ppo+{whole.curiosity}+imitation")
-    assert named == whole
-    plain = fast.config("ppo+imitation")
-    assert (plain.curiosity, plain.imitation_coef) == ("none", whole.imitation_coef)

@@ -115,8 +115,8 @@ def test_the_environment_compiles_for_a_gpu(gpus, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [OBJECTS, {"imitation_coef": 1.0}, *({"curiosity": name} for name in CURIOSITIES)],
-    ids=["objects", "imitation", *CURIOSITIES],
+    [OBJECTS, *({"curiosity": name} for name in CURIOSITIES)],
+    ids=["objects", *CURIOSITIES],
 )
 def test_training_compiles_for_a_gpu(gpus, settings):
     train = make_train(Config.from_dict({**TINY, **settings}))

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent
 SETTINGS = [
     *("--episodes", "8", "--minibatch", "4", "--epochs", "1", "--max-steps", "4", "--chunk", "8"),
     *("--filters", "2", "2", "--hidden", "4", "--embedding", "2", "--eval-episodes", "1"),
-    *("--curiosity", "none", "--imitation-coef", "0", "--iterations", "100000"),
+    *("--curiosity", "none", "--iterations", "100000"),
 ]
 
 
@@ -61,7 +61,6 @@ def eight(tmp_path_factory):
 def test_eight_devices_train_as_one(eight):
     assert eight["mesh"] == {"seeds": 2, "episodes": 4}
     assert eight["learned"] > 1e-3
-    assert min(eight["imitation"]) > 1e-3
     assert eight["state"]["gap"] < 2e-6, eight["state"]
     for metrics in eight["metrics"]:
         assert metrics["gap"] < 2e-6, metrics

@@ -53,7 +53,7 @@ def test_the_grid_holds_every_combination():
     ]  # fmt: skip
     config = configs["learning_rate=0.0003,curiosity=icm"]
     assert (config.learning_rate, config.curiosity, config.clip) == (3e-4, "icm", 0.3)
-    assert (config.filters, config.episodic_novelty) == ((2, 2), True)
+    assert (config.filters, config.curiosity) == ((2, 2), "icm")
 
 
 def test_lists_and_truth_values_are_values_too():
@@ -83,7 +83,7 @@ def test_modules_of_ones_own_are_imported_first():
         (["--env", "sy", "--settings", "env_id=p"], "give --env sy or the setting env_id"),
         (["--settings", "klip=1,2"], "did you mean 'clip'"),
         (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
-        (["--settings", "env_id=base,p"], "'counts' needs tasks that return"),
+        (["--settings", "env_id=base,p", "curiosity=counts"], "'counts' needs tasks that return"),
         (["--seeds", "0"], "seeds must be >= 1, got 0"),
         (["--processes", "0"], "processes must be >= 1, got 0"),
         (["--name", "a/b"], "name of a folder"),

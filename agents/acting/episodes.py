@@ -1,4 +1,4 @@
-"""The record of episodes that acting, learning and remembering share."""
+"""The record of episodes that acting and learning share."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -67,11 +67,6 @@ def along_episodes(function: Callable[..., jax.Array], *records: Record) -> Reco
 def take(record: Record, places: jax.Array) -> Record:
     """The episodes at these places, i32[M], of any record; see `along_episodes`."""
     return along_episodes(lambda axis, x: x[places] if axis == 0 else x[:, places], record)
-
-
-def beside(*records: Record) -> Record:
-    """The episodes of several records of the same structure as one; see `along_episodes`."""
-    return along_episodes(lambda axis, *x: jnp.concatenate(x, axis), *records)
 
 
 def place(layout: State, cells: jax.Array) -> State:

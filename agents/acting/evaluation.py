@@ -51,7 +51,7 @@ def evaluate(
     """
     num_tasks = tasks.time.shape[0]
     if shards.count > 1:
-        tasks = _rows(tasks, shards.places(num_tasks)[0])
+        tasks = _rows(tasks, shards.places(num_tasks))
     frame, played = play_greedily(agent, params, env, tasks)
     episodes = played.episodes
     action = jax.vmap(Frame.original_action)(frame, episodes.action.swapaxes(0, 1))

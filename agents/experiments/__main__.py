@@ -43,10 +43,9 @@ class Options:
       imports: modules of your own to import first, for the curiosities, encoders and sets that
         they register.
       preset: the named settings; the paper's if absent.
-      algorithms: ppo: the preset without curiosity and without imitation; ppo+icm,
-        ppo+rnd and so on: with that curiosity; each followed by +imitation: with the
-        preset's imitation too; preset: as it is. Each may be followed by settings that it
-        changes, as in preset,recurrent=false. ppo and ppo+icm if absent.
+      algorithms: ppo: the preset without curiosity; ppo+icm, ppo+rnd and so on: with that
+        curiosity; preset: as it is. Each may be followed by settings that it changes, as in
+        preset,recurrent=false. ppo and ppo+icm if absent.
       seeds: how many seeds, from --seed on; 5 if absent.
       seed: the first seed; 0 if absent.
       iterations: of training; 250 in exp1 and 500 in exp2 if absent.

@@ -70,16 +70,14 @@ class Shards:
         flat, restore = ravel_pytree(tree)
         return restore(jax.lax.pmean(flat, EPISODES))
 
-    def places(self, total: int) -> tuple[jax.Array, jax.Array]:
-        """This device's share of `total` places, which need not divide evenly.
+    def places(self, total: int) -> jax.Array:
+        """This device's share i32[M] of `total` places, M the same on every device.
 
-        Returns:
-          The places i32[M], M the same on every device, and bool[M]: false where the
-          places are used up, and one is taken for the second time.
+        Where they do not divide evenly, the first ones are taken for the second time.
         """
         size = -(-total // self.count)
         place = self._index() * size + jnp.arange(size)
-        return place % total, place < total
+        return place % total
 
     def drawing(self, choose: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
         """`choose(key, outputs)`, drawn as on one device, of which each keeps its own part."""

@@ -17,15 +17,15 @@ import numpy as np
 import optax
 
 from agents.acting.encodings import encode_episodes
-from agents.acting.episodes import Episodes, along_episodes, beside, take
+from agents.acting.episodes import Episodes, along_episodes, take
 from agents.acting.frames import Frame
-from agents.acting.identity import first_visits, observation_ids
+from agents.acting.identity import observation_ids
 from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
 from agents.parallel.sharding import ALONE, Shards
-from agents.ppo import advantages, losses, replay, returns
+from agents.ppo import advantages, losses, returns
 from agents.ppo.failures import Failures
 from agents.ppo.optimizer import make_optimizer
 from agents.registry import curiosities
@@ -41,7 +41,7 @@ COUNTABLE = np.iinfo(np.int32).max  # by `TrainState.transitions`
 # gradient steps, and what a run adds to them.
 RESERVED_NAMES = {
     "success", "replayed_success", "episode_length", "intrinsic_reward", "distinct_observations",
-    "policy_loss", "value_loss", "entropy_loss", "imitation_loss", "loss", "entropy", "steps",
+    "policy_loss", "value_loss", "entropy_loss", "loss", "entropy", "steps",
     "gradient_norm", "seed", "iteration", "episodes", "transitions", "evaluation", "seconds",
     "transitions_per_second",
 }  # fmt: skip
@@ -56,7 +56,6 @@ class TrainState(NamedTuple):
       extrinsic: moments of the extrinsic reward.
       intrinsic: moments of the intrinsic reward, or of its returns where rewards are apart.
       memory: what the curiosity carries along.
-      replay: the newest solved episodes; never filled without imitation.
       failures: failed tasks, to be played again.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
@@ -69,7 +68,6 @@ class TrainState(NamedTuple):
     extrinsic: returns.Moments
     intrinsic: returns.Moments
     memory: Any
-    replay: Episodes
     failures: Failures
     key: jax.Array
     iteration: jax.Array
@@ -130,7 +128,6 @@ class Learner:
             extrinsic=returns.Moments.zero(),
             intrinsic=returns.Moments.zero(),
             memory=self.curiosity.memory(),
-            replay=replay.empty(self.env.base, self.config.imitation_episodes, self.env.max_steps),
             failures=Failures.untried(
                 failures_key, len(self.config.replayed), self.config.failures
             ),
@@ -196,7 +193,7 @@ class Learner:
 
         Returns:
           The batch of all devices' episodes; the state with rewards' moments, curiosity's
-          memory, replay and transitions brought up to date; and metrics of play.
+          memory and transitions brought up to date; and metrics of play.
         """
         config = self.config
         novelty, memory = self.intrinsic_reward(state, trajectory)
@@ -228,14 +225,12 @@ class Learner:
             memory=memory,
             transitions=state.transitions + jnp.sum(episodes.length),
         )
-        if config.imitation_coef:
-            state = state._replace(replay=replay.remember(state.replay, episodes))
         return batch, state, metrics
 
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
         """The intrinsic reward f32[T, B] of all devices' episodes, and the curiosity's new memory.
 
-        It is 0 after an episode's end, and with `episodic_novelty` where an observation returns.
+        It is 0 after an episode's end.
         """
         experience = self.acting_experience(state.params, trajectory)
         if self.curiosity.needs_all_episodes:
@@ -248,8 +243,6 @@ class Learner:
         mask = experience.episodes.mask
         chex.assert_equal_shape([reward, mask])
         reward = jnp.where(mask > 0, reward, 0.0)
-        if self.config.episodic_novelty:
-            reward = reward * first_visits(experience.observation_id)[1:]
         if not self.curiosity.needs_all_episodes:
             reward = self.shards.whole(reward, axis=1)
         return reward, memory
@@ -287,16 +280,12 @@ class Learner:
 
         Every device differentiates its part of each minibatch; the mean is everyone's gradient.
         """
-        config, imitated = self.config, None
-        if config.imitation_coef:
-            imitated = replay.Imitated.of(state.replay, config.discount, self.shards)
+        config = self.config
 
         def update(carry: tuple[Params, Any], places: jax.Array) -> tuple[Any, Metrics]:
             params, opt_state = carry
             own = take(batch, self.shards.part(places))
-            gradient, metrics = self.shards.mean(
-                jax.grad(self.loss, has_aux=True)(params, own, imitated)
-            )
+            gradient, metrics = self.shards.mean(jax.grad(self.loss, has_aux=True)(params, own))
             updates, opt_state = self.optimizer.update(gradient, opt_state, params)
             metrics["gradient_norm"] = optax.tree.norm(gradient)
             metrics["entropy"] /= metrics.pop("steps")
@@ -312,15 +301,12 @@ class Learner:
         )
         return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
-    def loss(
-        self, params: Params, batch: Batch, imitated: replay.Imitated | None = None
-    ) -> tuple[jax.Array, Metrics]:
+    def loss(self, params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
         """The total loss f32[] and its terms, weighted as they enter it.
 
         Their mean over devices is the whole minibatch's.
 
           L = policy + value - entropy + curiosity_coef * curiosity's losses
-              - imitation_coef * sum_t G_t log pi(a_t | o_t) / steps, of remembered successes
 
         Also returned: `entropy`, summed over the steps before an episode's end, and `steps`, their
         number.
@@ -328,15 +314,13 @@ class Learner:
         Args:
           params: the parameters to differentiate by.
           batch: this device's part of a minibatch.
-          imitated: its part of the episodes to imitate, if any are.
 
         Raises:
           ValueError: the curiosity calls a loss of its own like a metric.
         """
         config, mask = self.config, batch.episodes.mask
-        embedding, experience = self.learning_experience(params, batch, imitated)
-        played, remembered = jnp.split(embedding, [mask.shape[1]], axis=1)
-        actions, value = self.agent.act(params, played)
+        embedding, experience = self.learning_experience(params, batch)
+        actions, value = self.agent.act(params, embedding)
         log_prob = actions.log_prob(batch.episodes.action)
         surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
         value_error = jnp.sum(optax.squared_error(value, batch.value_target), axis=-1)
@@ -353,44 +337,31 @@ class Learner:
             )
         for name, term in own.items():
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
-        if imitated is not None:
-            log_prob = self.agent.act(params, remembered).actions.log_prob(imitated.episodes.action)
-            terms["imitation_loss"] = config.imitation_coef * -jnp.sum(imitated.weight * log_prob)
         total = sum(terms.values(), jnp.zeros(()))
         sums = {"entropy": jnp.sum(entropy * mask), "steps": jnp.sum(mask)}
         return total, {**terms, "loss": total, **sums}
 
-    def learning_experience(
-        self, params: Params, batch: Batch, imitated: replay.Imitated | None
-    ) -> tuple[jax.Array, Experience]:
-        """What the network makes of a minibatch, and of the episodes to imitate beside it.
-
-        Returns:
-          The GRU's outputs f32[T, B + K, hidden], and what the curiosity sees of the minibatch.
-        """
-        both, observation_id = batch.episodes, batch.observation_id
-        if imitated is not None:
-            # In one pass, because each costs its own compilation.
-            both = beside(both, imitated.episodes)
-            other_id = jnp.max(observation_id) + 1 + imitated.observation_id
-            observation_id = jnp.concatenate([observation_id, other_id], axis=1)
+    def learning_experience(self, params: Params, batch: Batch) -> tuple[jax.Array, Experience]:
+        """The GRU's outputs f32[T, B, hidden], and what the curiosity sees of a minibatch."""
+        episodes = batch.episodes
         read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
 
         def encode(params: Params, rows: jax.Array, remembered: Any) -> Any:
             features, remembered = self.agent.encode_rows(params, rows, remembered)
             return (features, self.curiosity.encode(params.get("curiosity", {}), rows)), remembered
 
-        features, own = encode_episodes(encode, read, both, observation_id, chunk=self.config.chunk)
-        size = batch.log_prob.shape[1]
-        experience = Experience(batch.episodes, batch.observation_id, own[:, :size])
-        given = (params, features, both.action, both.reward)
+        features, own = encode_episodes(
+            encode, read, episodes, batch.observation_id, chunk=self.config.chunk
+        )
+        experience = Experience(episodes, batch.observation_id, own)
+        given = (params, features, episodes.action, episodes.reward)
         if not self.curiosity.needs_embeddings:
             return self.agent.unroll(*given), experience
         embedding, after = self.agent.unroll_both(*given)
         return embedding, experience._replace(
-            embedding=embedding[:, :size],
-            next_embedding=after[:, :size],
-            action_embedding=self.agent.embed_action(params, batch.episodes.action),
+            embedding=embedding,
+            next_embedding=after,
+            action_embedding=self.agent.embed_action(params, episodes.action),
         )
 
     def _whole(self, record: Any) -> Any:
