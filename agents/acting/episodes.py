@@ -1,7 +1,7 @@
 """The record of episodes that acting and learning share."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -50,18 +50,14 @@ class Episodes(NamedTuple):
         return jax.vmap(one_time, in_axes=(None, 0))(self.layout, self.cells)
 
 
-def along_episodes(function: Callable[..., jax.Array], *records: Record) -> Record:
-    """Applies `function(axis, *arrays)` to the arrays of records of the same structure.
+def along_episodes(function: Callable[[int, jax.Array], jax.Array], record: Record) -> Record:
+    """Applies `function(axis, array)` to the arrays of a record.
 
     A record is `Episodes`, or a tree that holds one beside arrays [T, B, ...]. `axis` is where an
     array has its episodes: 0 in a field of the name `layout`, 1 elsewhere.
     """
     layout = jax.tree_util.GetAttrKey("layout")
-
-    def apply(path: tuple[Any, ...], *parts: jax.Array) -> jax.Array:
-        return function(0 if layout in path else 1, *parts)
-
-    return jax.tree.map_with_path(apply, *records)
+    return jax.tree.map_with_path(lambda path, x: function(0 if layout in path else 1, x), record)
 
 
 def take(record: Record, places: jax.Array) -> Record:
