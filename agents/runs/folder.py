@@ -15,11 +15,11 @@ MAX_SEED = 2**31 - 1
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
 FIRST_VERSION = "0.1.0"  # wrote settings without a version
-# Settings of that version that are gone. All but `method` had an effect only with another method
-# than PPO.
+# Settings that are gone. They said how a policy is trained; it acts without them.
 GONE = (
     *("method", "task_sets", "tasks", "walkers", "walk_rounds", "walk_steps", "agent_rounds"),
     *("restarts", "advised", "advice", "dataset", "mirrored"),
+    *("imitation_coef", "imitation_episodes", "episodic_novelty"),
 )
 
 
@@ -108,7 +108,7 @@ class Run:
         if not isinstance(values["config"], dict):
             raise ValueError(f"config must be a table of settings, got {values['config']!r}")
         config = values["config"]
-        if config.get("method") == "ppo":
+        if config.get("method", "ppo") == "ppo":
             config = {name: value for name, value in config.items() if name not in GONE}
         return cls(**{**values, "config": Config.from_dict(config)})
 
