@@ -43,6 +43,15 @@ def test_the_policy_acts_as_it_did(old):
     assert np.ptp(expected["grasp"]) > 1e-3
 
 
+def test_settings_that_are_gone_are_left_out_of_runs_without_a_method_too(old):
+    path = old / "config.json"
+    settings = json.loads(path.read_text())
+    del settings["config"]["method"]
+    settings["config"]["imitation_coef"] = 1.0
+    path.write_text(json.dumps(settings))
+    assert agents.load(old).config.env_id == "SymbolicTrapTube-v0"
+
+
 def test_it_can_be_evaluated(old, capsys):
     evaluate.main([str(old), "--sets", "base", "--no-cache"])
     assert "iteration 3" in capsys.readouterr().out
