@@ -81,10 +81,10 @@ class Options(Settings):
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = tyro.cli(Options, args=arguments, prog=PROGRAM)
-    if not options.no_cache:
-        compilation.enable_cache()
     with plain_errors():
+        options = tyro.cli(Options, args=arguments, prog=PROGRAM)
+        if not options.no_cache:
+            compilation.enable_cache()
         run(options, arguments)
 
 

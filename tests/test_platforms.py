@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 from jax.experimental import topologies
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -59,7 +60,7 @@ NOTHING_MEASURED = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": F
 
 
 def lowered_for(function: Any, *arguments: Any) -> tuple[str, ...]:
-    exported = jax.export.export(jax.jit(function), platforms=PLATFORMS)(*arguments)
+    exported = export.export(jax.jit(function), platforms=PLATFORMS)(*arguments)
     assert exported.mlir_module_serialized
     return exported.platforms
 
