@@ -122,7 +122,8 @@ def run(options: Options, arguments: Sequence[str]) -> None:
     for table in tables.tables(found):
         console.print(table.to_rich())
     write_record(options.out / "profile.json", found)
-    (options.out / "tables.md").write_text(f"# Profile\n\n{tables.markdown(found)}\n")
+    text = f"# Profile\n\n{tables.markdown(found)}\n"
+    (options.out / "tables.md").write_text(text, encoding="utf-8")
     for name, save in figures.drawings(found, "profile").items():
         save(options.out / name)
     console.print(f"record, tables and figures: {options.out}", soft_wrap=True, highlight=False)

@@ -154,7 +154,7 @@ def report(root: Path, console: Console) -> None:
     records = results(root)
     write_json(files["records"], records)
     made = table(records, root.name)
-    files["table"].write_text(f"# {made.title}\n\n{made.to_markdown()}\n")
+    files["table"].write_text(f"# {made.title}\n\n{made.to_markdown()}\n", encoding="utf-8")
     rows: dict[str, list[Any]] = {}
     for entry in find_runs(root):
         rows.setdefault(entry.algorithm, []).extend(entry.rows)

@@ -80,10 +80,10 @@ def stale(root: Path, records: dict[str, Record]) -> dict[Path, Callable[[], obj
     """The files that differ from what the records make of them, with what rewrites each."""
     found: dict[Path, Callable[[], object]] = {}
     for path in sorted(path for pattern in PAGES for path in root.glob(pattern)):
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
         made = generate(text, records)
         if made != text:
-            found[path] = partial(path.write_text, made)
+            found[path] = partial(path.write_text, made, encoding="utf-8")
     for name, record in records.items():
         _, own_figures = KINDS[record["schema"]]
         for file, draw in own_figures.drawings(record, name).items():

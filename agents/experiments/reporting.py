@@ -88,7 +88,8 @@ def report(root: Path, record: Record, console: Console) -> None:
         "figure": root / "curves.png",
     }
     records.write_record(files["summary"], record)
-    files["tables"].write_text(f"# {tables.title(record)}\n\n{tables.markdown(record)}\n")
+    text = f"# {tables.title(record)}\n\n{tables.markdown(record)}\n"
+    files["tables"].write_text(text, encoding="utf-8")
     figures.save(record, files["figure"])
     for table in tables.tables(record):
         console.print(table.to_rich())

@@ -142,7 +142,7 @@ def save(
         settings=_table(("setting", "value"), settings.items()),
         data=data.replace("</", "<\\/"),
     )
-    path.write_text(page)
+    path.write_text(page, encoding="utf-8")
 
 
 def _score_table(name: str, scores: Sequence[Score]) -> str:
