@@ -18,7 +18,11 @@ def load(
     iteration: int | None = None,
     greedy: bool = True,
 ) -> Policy:
-    """A trained policy, which acts from observations alone; see `agents.runs.loading.load`.
+    """A trained policy, which acts from observations alone.
+
+        policy = load("runs/mine")
+        carry = policy.initial(batch)
+        action, carry = policy.act(observation, carry, key)
 
     Args:
       source: a run's folder, a file of parameters, or the name of shipped parameters.
@@ -31,18 +35,11 @@ def load(
     """
     from agents.runs import loading  # noqa: PLC0415  training needs nothing of files
 
-    return loading.load(source, seed=seed, iteration=iteration, greedy=greedy)
+    return loading.load_policy(source, seed, iteration)._replace(greedy=greedy)
 
 
 def results(paths: str | Path | Iterable[str | Path]) -> list[dict[str, Any]]:
-    """One plain record per seed of all runs in folders; see `agents.runs.results.results`.
-
-    Args:
-      paths: a folder or several: of a run, or anything that holds runs, at any depth.
-
-    Raises:
-      ValueError: there is no run in one of the folders, or it cannot be read.
-    """
+    """One plain record per seed of all runs in folders; see `agents.runs.results.results`."""
     from agents.runs import results  # noqa: PLC0415  training needs nothing of files
 
     return results.results(paths)

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator, own_and_paper_sets, scores
+from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.acting.policy import Policy
 from agents.pretrained import load_shipped
 from agents.runs import compilation, report
@@ -17,7 +17,7 @@ from agents.runs.folder import write_json
 from agents.runs.loading import load_policies
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
-from trap_tube_jax.scoring.tasks import shortest_lengths
+from trap_tube_jax.solver import solve_batch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +36,6 @@ class Options:
       json: write the results to this file.
       optimality: compare with shortest plans, which are searched for first (a second for
         each task of a perceptual set).
-      no_cache: compile everything anew, instead of keeping compiled programs in
-        ~/.cache/trap_tube_jax from one time to the next.
     """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
@@ -49,7 +47,6 @@ class Options:
     gif: Path | None = None
     json: Path | None = None
     optimality: Flag = False
-    no_cache: Flag = False
 
     def policies(self) -> list[Policy]:
         """What to evaluate.
@@ -69,8 +66,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m agents.evaluate")
-    if not options.no_cache:
-        compilation.enable_cache()
+    compilation.enable_cache()
     with plain_errors():
         evaluate(options)
 
@@ -89,12 +85,9 @@ def evaluate(options: Options) -> None:
     evaluator = Evaluator.of_sets(config, sets, tasks)
     shortest = None
     if options.optimality:
-        shortest = {name: shortest_lengths(drawn) for name, drawn in evaluator.tasks.items()}
+        shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
     played = {policy.name: evaluator(policy.params) for policy in policies}
-    results = {
-        name: scores(outcome, evaluator.tasks, evaluator.limits, shortest)
-        for name, outcome in played.items()
-    }
+    results = {name: evaluator.scores(outcome, shortest) for name, outcome in played.items()}
     console = Console()
     source = "pretrained" if options.run is None else options.run.resolve().name
     for policy in policies:

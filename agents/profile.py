@@ -17,8 +17,8 @@ from agents.profiles import figures, tables
 from agents.profiles.measure import SCHEMA, Settings, profile
 from agents.runs import compilation
 from agents.runs.folder import RunFolder, read_json
-from agents.runs.loading import load
-from trap_tube_jax.command_line import Flag, Imports, plain_errors
+from agents.runs.loading import load_policy
+from trap_tube_jax.command_line import Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 
 PROGRAM = "python -m agents.profile"
@@ -43,8 +43,6 @@ class Options(Settings):
       record: also write the record to this file; refused unless all is of committed code.
       commit: the commit to note where git does not tell it.
       draw: measure nothing; draw tables and figures of this record.
-      no_cache: compile everything anew, instead of keeping compiled programs in
-        ~/.cache/trap_tube_jax from one time to the next.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
@@ -54,7 +52,6 @@ class Options(Settings):
     record: Path | None = None
     commit: str | None = None
     draw: Path | None = None
-    no_cache: Flag = False
 
     def policies(self) -> dict[str, Policy]:
         """What to profile, by the name that figures show.
@@ -70,7 +67,7 @@ class Options(Settings):
                 "two agents have the same name, by which figures tell them apart: "
                 f"{', '.join(names)}; rename one folder or file"
             )
-        found = [*map(load, self.runs), *map(load_shipped, self.pretrained)]
+        found = [*map(load_policy, self.runs), *map(load_shipped, self.pretrained)]
         return dict(zip(names, found, strict=True))
 
     def machines(self) -> list[Any]:
@@ -83,8 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     with plain_errors():
         options = tyro.cli(Options, args=arguments, prog=PROGRAM)
-        if not options.no_cache:
-            compilation.enable_cache()
+        compilation.enable_cache()
         run(options, arguments)
 
 

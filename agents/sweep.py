@@ -24,7 +24,7 @@ from agents.runs.folder import check_name, is_done, write_json
 from agents.runs.results import results
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from agents.runs.table import Table
-from trap_tube_jax.command_line import Flag, Imports, plain_errors
+from trap_tube_jax.command_line import Imports, plain_errors
 
 PERCENT = "percent_"
 
@@ -50,8 +50,6 @@ class Options:
       out: the folder of all runs.
       processes: how many runs to train at a time; as many as there are cores on a CPU, and one
         on other devices, if absent.
-      no_cache: compile everything anew, instead of keeping compiled programs in
-        ~/.cache/trap_tube_jax from one time to the next.
     """
 
     settings: tuple[str, ...] = ()
@@ -63,7 +61,6 @@ class Options:
     name: str | None = None
     out: Path = Path("runs")
     processes: int | None = None
-    no_cache: Flag = False
 
     def __post_init__(self) -> None:
         """Checks the numbers and the name.
@@ -138,8 +135,7 @@ def run(options: Options, console: Console, stop: StopSignals) -> int:
     if todo:
         processes = options.processes or workers.default_processes()
         console.print(f"{root}: {len(todo)} of {len(planned)} runs to train, {processes} at a time")
-        cache = ["--no-cache"] if options.no_cache else []
-        failed = workers.train_runs(todo, processes, console, stop, cache)
+        failed = workers.train_runs(todo, processes, console, stop)
     report(root, console)
     return len(failed)
 

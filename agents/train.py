@@ -65,19 +65,17 @@ class Options(Selection):
     """Trains an agent, evaluates it on all task sets and leaves everything in a folder.
 
     Ctrl-C stops after the current iteration and saves; a second one stops at once.
-    --resume then continues to the same result as if nothing had happened.
+    --resume then continues to the same result as if nothing had happened. Compiled programs are
+    kept in ~/.cache/trap_tube_jax; with JAX_ENABLE_COMPILATION_CACHE=0 all compile anew.
 
     Attributes:
       checkpoint_every: iterations from one checkpoint to the next.
       keep: how many checkpoints to keep, the newest.
-      no_cache: compile everything anew, instead of keeping compiled programs in
-        ~/.cache/trap_tube_jax from one time to the next.
       config: the settings of training.
     """
 
     checkpoint_every: int = 10
     keep: int = 3
-    no_cache: Flag = False
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
     def __post_init__(self) -> None:
@@ -146,8 +144,7 @@ def start(arguments: Sequence[str]) -> Session:
     console = Console(quiet=not processes.is_first())
     options, folder, run = processes.from_first(lambda: open_run(selection, arguments))
     import_modules(run.config.imports)  # in the processes that were told of the run
-    if not options.no_cache:
-        compilation.enable_cache()
+    compilation.enable_cache()
     session = Session(
         folder,
         run,

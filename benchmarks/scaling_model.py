@@ -127,7 +127,7 @@ def compiled_exchanges(config: Config, devices: int) -> list[Exchange]:
     placement = Placement.of(devices, config, 1)
     train = make_train(config, shards=placement.episodes)
     state = placement.put(jax.jit(jax.vmap(train.init))(jax.random.split(jax.random.key(0), 1)))
-    advance = jax.jit(placement.shard(make_advance(train, 1)))
+    advance = jax.jit(placement.shard(make_advance(train)))
     return exchanges(advance.lower(state, np.ones(1, bool)).compile().as_text() or "")
 
 

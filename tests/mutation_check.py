@@ -1,9 +1,9 @@
-"""Plants single faults in the environment, one at a time, and asks the tests to catch each.
+"""Plants single faults in the code, one at a time, and asks the tests to catch each.
 
     python tests/mutation_check.py            # every fault
     python tests/mutation_check.py tool wrap  # those whose line in the table has a word
 
-Package and tests are copied for it; the working tree is not touched. Exits with 1 if the
+Packages and tests are copied for it; the working tree is not touched. Exits with 1 if the
 tests pass in spite of a fault, if a fault's text is not found exactly once, or if the tests
 fail without any.
 """
@@ -20,17 +20,18 @@ import time
 from typing import NamedTuple
 
 ROOT = pathlib.Path(__file__).parent.parent
-PACKAGE = "trap_tube_jax"
+PACKAGES = ("trap_tube_jax", "agents")
 # The child must import the copy, not an installed package.
 CHILD = """
 import pathlib, sys
-import trap_tube_jax
-assert pathlib.Path(trap_tube_jax.__file__).is_relative_to(pathlib.Path.cwd())
+import agents, trap_tube_jax
+for package in (agents, trap_tube_jax):
+    assert pathlib.Path(package.__file__).is_relative_to(pathlib.Path.cwd())
 import pytest
 sys.exit(pytest.main(["-x", "--no-header", "-p", "no:cacheprovider", "-n0", *sys.argv[1:]]))
 """
 # Of the exhaustive comparison the base task and its swaps are enough here.
-STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-12 and not psy-6")
+STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-3 and not psy-3")
 OBSERVE = ("tests/test_observation.py", "tests/test_golden.py")
 TIME = ("tests/test_environment.py", "-k", "last_step or limit_trunc or larger or auto or statist")
 PERCEPTUAL = ("tests/test_transfers.py", "-k", "perceptual")
@@ -38,10 +39,17 @@ STRUCTURAL = ("tests/test_transfers.py", "-k", "structural")
 SYMBOLIC = ("tests/test_transfers.py", "-k", "symbolic")
 GRADED = ("tests/test_graded.py",)
 COMPOSE = ("tests/test_transfers.py", "-k", "compose or then")
+LEARNER = ("tests/test_learner.py",)
+ADVANTAGES = ("tests/test_advantages.py",)
+CURIOSITIES = ("tests/test_explorers.py", "-k", "rnd")
+INITIAL = ("tests/test_initialisation.py",)
 
 
 class Fault(NamedTuple):
-    """A change of one place in one module, and the tests that should see it."""
+    """A change of one place in one module, and the tests that should see it.
+
+    Modules are those of `trap_tube_jax` unless they begin with `agents/`.
+    """
 
     module: str
     description: str
@@ -54,8 +62,8 @@ FAULTS = (
     Fault(
         "dynamics",
         "the agent grasps from above the tool",
-        "on_tool(agent + grasp) & ~on_tool(agent)",
-        "on_tool(agent + grasp)",
+        "on_tool(state.agent + unit_vector(direction)) & ~on_tool(state.agent)",
+        "on_tool(state.agent + unit_vector(direction))",
         STEP,
     ),
     Fault(
@@ -232,8 +240,8 @@ FAULTS = (
     Fault(
         "wrappers",
         "the last observation is lost",
-        "final_observation=timestep.observation",
-        "final_observation=observation",
+        "(timestep, observation, timestep.observation)",
+        "(timestep, observation, observation)",
         TIME,
     ),
     Fault(
@@ -242,14 +250,14 @@ FAULTS = (
     Fault(
         "transfers",
         "features reach 256",
-        "points + 1) / 2 * 255",
-        "points + 1) / 2 * 256",
+        "(points.clip(-1, 1) + 1) / 2 * 255",
+        "(points.clip(-1, 1) + 1) / 2 * 256",
         STRUCTURAL,
     ),
     Fault(
         "transfers",
         "points crowd in the cube's corners",
-        "jax.random.normal(loop_free(key), (5, num_features))",
+        "jax.random.normal(loop_free(key), (5, num_features), jnp.float32)",
         "jax.random.uniform(loop_free(key), (5, num_features), minval=-1)",
         STRUCTURAL,
     ),
@@ -257,8 +265,8 @@ FAULTS = (
     Fault(
         "transfers",
         "the tool is never drawn",
-        "randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS))",
-        "randint(loop_free(key), (), 1, len(SYMBOLIC_OBJECTS))",
+        "randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS), jnp.int32)",
+        "randint(loop_free(key), (), 1, len(SYMBOLIC_OBJECTS), jnp.int32)",
         SYMBOLIC,
     ),
     Fault(
@@ -403,8 +411,8 @@ FAULTS = (
     Fault(
         "controls",
         "the second layout is never drawn",
-        "0, len(choices))",
-        "0, 1)",
+        "0, len(choices), jnp.int32)",
+        "0, 1, jnp.int32)",
         ("tests/test_controls.py",),
     ),
     Fault(
@@ -413,6 +421,97 @@ FAULTS = (
         "entry.max_steps if max_steps is None",
         "MAX_STEPS if max_steps is None",
         ("tests/test_registry.py",),
+    ),
+    Fault(
+        "agents/ppo/advantages",
+        "the task's value is the curiosity's",
+        "episodes.reward, episodes, value[..., 0]",
+        "episodes.reward, episodes, value[..., 1]",
+        ADVANTAGES,
+    ),
+    Fault(
+        "agents/ppo/advantages",
+        "the curiosity's returns deviate by more",
+        "RETURN_DEVIATION = 0.3",
+        "RETURN_DEVIATION = 0.6",
+        ADVANTAGES,
+    ),
+    Fault(
+        "agents/ppo/advantages",
+        "the curiosity's rewards are scaled by their own deviation",
+        "returns.discounted_returns(novelty, gamma), mask",
+        "novelty, mask",
+        ADVANTAGES,
+    ),
+    Fault(
+        "agents/ppo/advantages",
+        "finishing early costs novelty",
+        "jnp.where(goes_on > 0, value, jnp.mean(value[0]))",
+        "jnp.where(goes_on > 0, value, 0)",
+        ADVANTAGES,
+    ),
+    Fault(
+        "agents/ppo/learner",
+        "the weight of the curiosity never falls",
+        "(config)(state.iteration)",
+        "(config)(0)",
+        LEARNER,
+    ),
+    Fault(
+        "agents/ppo/learner",
+        "solved tasks are replayed",
+        "reset_keys, ~batch.episodes.solved, again",
+        "reset_keys, batch.episodes.solved, again",
+        LEARNER,
+    ),
+    Fault(
+        "agents/ppo/learner",
+        "replayed tasks count as new ones",
+        "episodes.solved[: config.num_new]",
+        "episodes.solved[:]",
+        LEARNER,
+    ),
+    Fault(
+        "agents/ppo/learner",
+        "the agent does not face the food",
+        "if self.config.facing:",
+        "if False:",
+        LEARNER,
+    ),
+    Fault(
+        "agents/ppo/learner",
+        "all epochs have one order",
+        "jax.vmap(permute)(jax.random.split(key, config.epochs))",
+        "jax.vmap(permute)(jnp.stack([key] * config.epochs))",
+        LEARNER,
+    ),
+    Fault(
+        "agents/ppo/learner",
+        "minibatches are drawn anew",
+        "order = jax.random.permutation(epoch_key, config.episodes)",
+        "order = jax.random.randint(epoch_key, (config.episodes,), 0, config.episodes)",
+        LEARNER,
+    ),
+    Fault(
+        "agents/curiosity/rnd",
+        "the target learns, too",
+        "jax.lax.stop_gradient(self.target(observation))",
+        "self.target(observation)",
+        CURIOSITIES,
+    ),
+    Fault(
+        "agents/curiosity/rnd",
+        "the observation that is left is paid",
+        "jnp.sum(jnp.square(experience.features[1:])",
+        "jnp.sum(jnp.square(experience.features[:-1])",
+        CURIOSITIES,
+    ),
+    Fault(
+        "agents/networks/core",
+        "a head begins like a hidden layer",
+        'output_dense(self.streams, name="value")',
+        'dense(self.streams, name="value")',
+        INITIAL,
     ),
 )
 
@@ -454,14 +553,15 @@ def main() -> int:
 
 def _copy(source: pathlib.Path, target: pathlib.Path) -> pathlib.Path:
     without_caches = shutil.ignore_patterns("__pycache__")
-    for name in (PACKAGE, "tests"):
+    for name in (*PACKAGES, "tests"):
         shutil.copytree(source / name, target / name, ignore=without_caches)
     shutil.copy(source / "pyproject.toml", target)
     return target.resolve()
 
 
 def _module(root: pathlib.Path, fault: Fault) -> pathlib.Path:
-    return root / PACKAGE / f"{fault.module}.py"
+    package = "" if fault.module.startswith("agents/") else PACKAGES[0]
+    return root / package / f"{fault.module}.py"
 
 
 def _run(snapshot: pathlib.Path, tests: tuple[str, ...], fault: Fault | None = None) -> Verdict:

@@ -9,13 +9,6 @@ import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting.episodes import Episodes
 from agents.ppo import advantages, returns
-from agents.ppo.learner import RESERVED_NAMES
-
-TINY = {
-    "env_id": "pstsy", "episodes": 8, "minibatch": 4, "epochs": 1, "filters": (4, 4),
-    "hidden": 4, "embedding": 2, "max_steps": 6, "chunk": 8, "failures": 5,
-    "replayed": (0.25, 0.25),
-}  # fmt: skip
 
 
 def test_after_an_episode_comes_one_that_is_worth_the_mean_of_all_starts():
@@ -50,21 +43,59 @@ def test_the_intrinsic_weight_falls_geometrically():
     assert [constant(iteration) for iteration in (0, 9)] == [0.7, 0.7]
 
 
-def test_training_with_two_streams_replays_and_frames():
-    train = make_train(Config.preset("best", **TINY))
-    state = train.init(jax.random.key(0))
-    assert state.params["heads"]["params"]["value"]["kernel"].shape == (4, 2)
-    after, metrics = jax.jit(train.iterate)(state)
-    # Of the episodes that are new, those that were failed are remembered.
-    failed = round(train.config.num_new * (1 - float(metrics["success"])))
-    assert int(after.failures.next[0]) == failed % TINY["failures"]
-    assert 0 <= float(metrics["replayed_success"]) <= 1
-    assert all(np.isfinite(float(value)) for value in metrics.values())
-    assert metrics.keys() <= RESERVED_NAMES  # the curiosity has no losses
+def plain_advantages(reward, discount, value, mask, lambda_):
+    """Generalised advantages, step by step."""
+    found, following = np.zeros_like(reward), 0.0
+    for t in reversed(range(len(reward))):
+        delta = mask[t] * (reward[t] + discount[t] * value[t + 1] - value[t])
+        found[t] = following = delta + discount[t] * lambda_ * following
+    return found
+
+
+def normal(x, mask):
+    """As agents/agent.md has it, with the floor of the variance."""
+    x = x - x[mask > 0].mean()
+    return mask * x / np.sqrt(np.mean(x[mask > 0] ** 2) + 4e-4)
+
+
+def test_two_streams_step_by_step():
+    """Of two episodes one is solved at its third step; the old moments have a variance of 4."""
+    config = Config.preset("best")
+    gamma, lambda_, rate = config.discount, config.gae_lambda, config.reward_rate
+    rng = np.random.default_rng(0)
+    value, novelty = rng.normal(size=(6, 2, 2)), rng.random((5, 2))
+    mask, reward, going_on = np.ones((5, 2)), np.zeros((5, 2)), np.ones((5, 2))
+    mask[3:, 0], reward[2, 0], going_on[2:, 0] = 0, 1, 0
+    novelty *= mask
+
+    task = plain_advantages(reward, gamma * going_on, value[..., 0], mask, lambda_)
+    returns_to_come = np.zeros((6, 2))
+    for t in reversed(range(5)):
+        returns_to_come[t] = novelty[t] + gamma * returns_to_come[t + 1]
+    variance = rate * 4 + (1 - rate) * returns_to_come[:-1][mask > 0].var()
+    own = value[..., 1].copy()
+    own[3:, 0] = own[5:] = own[0].mean()
+    paid, discount = 0.3 * novelty / np.sqrt(variance), np.full((5, 2), gamma)
+    curiosity = plain_advantages(paid, discount, own, mask, lambda_)
+
+    arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
+    episodes = Episodes(tt.base_state(), *[jnp.zeros(())] * 2, *arrays)  # pyright: ignore
+    old = returns.Moments(jnp.float32(9), jnp.float32(4), jnp.int32(3))
+    advantage, target, moments = advantages.of_streams(
+        config, episodes, jnp.float32(novelty), 0.7, jnp.float32(value), (old, old)
+    )
+    for found, expected in (
+        (advantage, normal(task, mask) + 0.7 * normal(curiosity, mask)),
+        (target[..., 0], task + value[:-1, :, 0]),
+        (target[..., 1], curiosity + own[:-1]),
+        (moments[1].variance, variance),
+        (moments[0].variance, 4),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_without_curiosity_the_task_has_the_only_value():
-    train = make_train(Config.preset("best", **TINY, curiosity="none"))
+    train = make_train(Config.preset("best", hidden=4, filters=(4, 4), curiosity="none"))
     params = jax.eval_shape(train.init_params, jax.random.key(0))
     assert params["heads"]["params"]["value"]["kernel"].shape == (4, 1)
     value = jax.random.normal(jax.random.key(2), (7, 8, 1))

@@ -6,7 +6,7 @@ import pytest
 
 from agents import Config
 from agents.networks.agent import Agent
-from benchmarks import scaling, scaling_model, train_throughput
+from benchmarks import scaling, train_throughput
 
 CONFIG = Config(
     max_steps=4, episodes=4, minibatch=2, epochs=2, filters=(2, 3), hidden=4, embedding=2, chunk=4
@@ -44,11 +44,7 @@ def test_an_iteration_is_split_into_its_parts():
     assert whole.flop == play.flop + encoder.flop + core.flop
     assert encoder.flop > play.flop > core.flop > 0
     assert optimiser.flop == 0
-    assert all(part.timing.median_s > 0 and part.env == "base" for part in parts)
-
-
-def test_what_every_device_repeats_takes_time():
-    assert scaling_model.repeated_seconds(CONFIG, repeats=1) > 0
+    assert all(part.env == "base" for part in parts)
 
 
 def test_points_are_drawn(tmp_path):

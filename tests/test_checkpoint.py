@@ -1,3 +1,5 @@
+"""Checkpoints: whole or not there, whatever interrupts their writing."""
+
 import shutil
 from typing import Any, NamedTuple
 

@@ -54,21 +54,21 @@ def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
 
 @pytest.mark.parametrize("fn", [forgetful, remembering])
 @pytest.mark.parametrize("chunk", [1, 8, 37, 64])
-@pytest.mark.parametrize("count", [0, 1, 8, 9, ROWS])
-def test_map_rows_and_its_gradient(problem, fn, chunk, count, monkeypatch):
+def test_map_rows_and_its_gradient(problem, fn, chunk, monkeypatch):
     monkeypatch.setattr(chunks, "REMEMBERED_BYTES", 16 * 4 * WIDTH)
     params, rows, cotangent = problem
-    valid = (jnp.arange(ROWS) < count)[:, None]
 
-    def ours(params):
-        features: Any = chunks.map_rows(fn, chunk, params, rows, jnp.int32(count))
-        return jnp.sum(jnp.where(valid, features, 0) * cotangent)
+    def ours(params, count):
+        features: Any = chunks.map_rows(fn, chunk, params, rows, count)
+        return jnp.sum(jnp.where((jnp.arange(ROWS) < count)[:, None], features, 0) * cotangent)
 
-    def reference(params):
-        return jnp.sum(jnp.where(valid, plain(params, rows), 0) * cotangent)
+    def reference(params, count):
+        return jnp.sum(plain(params, rows[:count]) * cotangent[:count])
 
-    got, want = jax.value_and_grad(ours)(params), jax.value_and_grad(reference)(params)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), got, want)
+    compiled = jax.jit(jax.value_and_grad(ours))
+    for count in (0, 1, 8, 9, ROWS):
+        got, want = compiled(params, count), jax.value_and_grad(reference)(params, count)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), got, want)
 
 
 def test_map_rows_under_vmap_with_different_counts(problem):

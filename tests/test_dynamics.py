@@ -9,6 +9,7 @@ import pytest
 import spec_reference as spec
 
 import trap_tube_jax as tt
+from trap_tube_jax.transfers import SYMBOLIC_OBJECTS, swap_with_tool
 
 ENV = tt.make("TrapTube-v0")
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -82,6 +83,8 @@ def _assert_layout_agrees(start: tt.State) -> None:
 
 
 def _layouts(task: str, number: int) -> list[tt.State]:
+    if task == "sy":  # all there are
+        return [swap_with_tool(tt.base_state(), jnp.int32(code)) for code in SYMBOLIC_OBJECTS]
     keys = jax.random.split(jax.random.key(2019), number)
     states = jax.jit(jax.vmap(tt.make(task).reset))(keys)[0]
     return [jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in range(number)]
@@ -90,10 +93,9 @@ def _layouts(task: str, number: int) -> list[tt.State]:
 @pytest.mark.parametrize(
     ("task", "number"),
     [
-        ("base", 1),
-        ("sy", 6),
-        ("p", 12),
-        ("psy", 6),
+        ("sy", 5),  # base among them
+        ("p", 3),
+        ("psy", 3),
         pytest.param("p", 70, marks=pytest.mark.slow),
         pytest.param("psy", 30, marks=pytest.mark.slow),
     ],
@@ -248,8 +250,7 @@ def test_fuzz_is_worth_its_name(fuzz):
     assert np.any(fuzz.before.food != fuzz.after.food, axis=-1).sum() >= 150
 
 
-def test_tool_keeps_its_shape_and_stays_on_the_board(fuzz):
-    np.testing.assert_array_equal(fuzz.after.tool_extent, fuzz.before.tool_extent)
+def test_tool_stays_on_the_board(fuzz):
     assert fuzz.after.tool.min() >= 0
     assert (fuzz.after.tool + fuzz.after.tool_extent).max() <= 12
 
@@ -266,17 +267,6 @@ def test_agent_enters_neither_tool_nor_tube_nor_trap(fuzz):
     assert set(np.unique(stands_on)) <= {spec.GROUND, spec.EXIT}
     assert fuzz.timestep.terminated[stands_on == spec.EXIT].all()
     assert not _on_tool(fuzz.after, fuzz.after.agent).any()
-
-
-def test_nothing_moves_by_more_than_one_cell(fuzz):
-    for name in ("agent", "tool", "food"):
-        displacement = getattr(fuzz.after, name) - getattr(fuzz.before, name)
-        assert np.abs(displacement).sum(axis=-1).max() == 1
-
-
-def test_static_objects_and_looks_never_change(fuzz):
-    np.testing.assert_array_equal(fuzz.after.board, fuzz.before.board)
-    np.testing.assert_array_equal(fuzz.after.palette, fuzz.before.palette)
 
 
 def test_rewards_are_one_on_success_and_at_most_one_in_an_episode(fuzz):

@@ -66,7 +66,7 @@ def read_off(
     return np.array([*found, new])
 
 
-@pytest.mark.parametrize("short", ["base", "p", "psy", "pstsy"])
+@pytest.mark.parametrize("short", ["base", "pstsy"])
 def test_effects_can_be_read_off_the_observations(short):
     env = tt.make(short, max_steps=STEPS)
     episodes = random_episodes(env)

@@ -19,7 +19,7 @@ from trap_tube_jax.scoring.tasks import ALL_SETS
 
 def refused(capsys, *arguments):
     with pytest.raises(SystemExit) as exit_info:
-        experiments.main([*map(str, arguments), "--no-cache"])
+        experiments.main([*map(str, arguments)])
     assert exit_info.value.code == 2
     captured = capsys.readouterr()
     return " ".join(re.sub("[│╭╰─╮╯]", " ", captured.err + captured.out).split())
@@ -98,17 +98,6 @@ def test_stored_protocols_are_whole():
     del values["selection"]
     with pytest.raises(ValueError, match="a protocol lacks selection"):
         Protocol.from_dict(values)
-
-
-def test_folders_of_earlier_versions_hold_the_papers_sets(tmp_path):
-    usual = PROTOCOLS["exp2"]
-    values = {"experiment": "exp2", **dataclasses.asdict(usual)}
-    for name in ("train_set", "sets", "imports"):
-        del values[name]
-    (tmp_path / "experiment.json").write_text(json.dumps(values))
-    assert training.open_experiment(tmp_path, "exp2", usual, {}, create=False) == usual
-    with pytest.raises(ValueError, match="has train_set=pstsy, not sy; use another --name"):
-        training.open_experiment(tmp_path, "exp2", usual, {"train_set": "sy"}, create=False)
 
 
 def test_any_sets_are_trained_and_evaluated_on():

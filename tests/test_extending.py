@@ -122,7 +122,7 @@ def test_missing_modules_are_named(tmp_path, monkeypatch, capsys, own_tables):
     folder.config.write_text(json.dumps(values))
     reason = f"cannot import 'absent_module': there is no module 'absent_module' in {tmp_path}"
     for arguments in (["--resume", "--name", "x"], ["--import", "absent_module"]):
-        assert reason in refused(capsys, *arguments, "--no-cache")
+        assert reason in refused(capsys, *arguments)
     assert reason in refused(capsys, "runs/x", command=evaluate.main)
     with pytest.raises(ValueError, match=r"x/config\.json is not the settings of a run: cannot"):
         agents.load(tmp_path / "runs" / "x")
@@ -138,21 +138,21 @@ def test_missing_modules_are_named(tmp_path, monkeypatch, capsys, own_tables):
 def test_another_module_is_another_run(here, capsys, own_tables):
     (here / "other.py").write_text("")
     RunFolder.create(here / "runs" / "x", Run(Config(imports=("my_module",))))
-    message = refused(capsys, "--resume", "--name", "x", "--import", "other", "--no-cache")
+    message = refused(capsys, "--resume", "--name", "x", "--import", "other")
     assert "the run has imports=('my_module',), not ('other',)" in message
 
 
 def test_unknown_encoders_are_refused(capsys):
     with pytest.raises(ValueError, match="unknown encoder 'flat'; allowed: paper, objects"):
         Config(encoder="flat")
-    assert "unknown encoder 'flat'" in refused(capsys, "--encoder", "flat", "--no-cache")
+    assert "unknown encoder 'flat'" in refused(capsys, "--encoder", "flat")
 
 
 @pytest.mark.slow
 def test_the_pages_experiment_runs(here):
     settings = ["episodes=2", "minibatch=2", "epochs=1", "filters=[2,2]", "hidden=4", "embedding=2"]
     counts = ["--seeds", 1, "--iterations", 1, "--tasks", 2, "--reported", 2]
-    rest = ["--settings", *settings, *counts, "--no-optimality", "--no-cache"]
+    rest = ["--settings", *settings, *counts, "--no-optimality"]
     output = command(EXPERIMENT, *rest, folder=here)
     record = json.loads((here / "runs" / "exp1-fast-cold" / "summary.json").read_text())
     assert [entry["name"] for entry in record["algorithms"]] == ["ppo", "ppo+tool-moved"]

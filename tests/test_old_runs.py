@@ -53,12 +53,12 @@ def test_settings_that_are_gone_are_left_out_of_runs_without_a_method_too(old):
 
 
 def test_it_can_be_evaluated(old, capsys):
-    evaluate.main([str(old), "--sets", "base", "--no-cache"])
+    evaluate.main([str(old), "--sets", "base"])
     assert "iteration 3" in capsys.readouterr().out
 
 
 def refusal(old, capsys) -> str:
-    arguments = ["--resume", "--name", old.name, "--out", str(old.parent), "--no-cache"]
+    arguments = ["--resume", "--name", old.name, "--out", str(old.parent)]
     with pytest.raises(SystemExit):
         train.main(arguments)
     return capsys.readouterr().err

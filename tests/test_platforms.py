@@ -136,7 +136,7 @@ def test_training_compiles_for_several_gpus(gpus, settings):
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 4))
     states = jax.eval_shape(jax.vmap(make_train(config).init), keys)
     train = make_train(config, shards=placement.episodes)
-    advance = placement.shard(make_advance(train, placement.local_seeds(4)))
+    advance = placement.shard(make_advance(train))
     code = machine_code(
         NamedSharding(mesh, PartitionSpec(SEEDS)), advance, states, jax.ShapeDtypeStruct((4,), bool)
     )

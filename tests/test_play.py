@@ -6,6 +6,7 @@ import pty
 import select
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -121,6 +122,18 @@ def test_recordings(game, tmp_path):
         assert getattr(gif, "n_frames", 1) == 8
     with pytest.raises(ValueError, match=r"ends in .gif or .npz, got '.*episode.mp4'"):
         play.save(game, tmp_path / "episode.mp4")
+
+
+def test_what_cannot_be_saved_does_not_end_the_game(game, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(play, "_draw", lambda window, game: shown.append(game.message))
+    keys = iter(["z", "q"])
+    window = SimpleNamespace(getkey=lambda: next(keys))
+    monkeypatch.setattr("curses.has_colors", lambda: False)
+    monkeypatch.setattr("curses.curs_set", lambda visible: None)
+    play._run(window, game, tmp_path / "missing")
+    assert shown[0] == ""
+    assert shown[1].startswith("not saved: ")
 
 
 def drawn(game):

@@ -1,3 +1,5 @@
+"""Trained policies act from observations alone, alike in every way of calling them."""
+
 import dataclasses
 import json
 
@@ -110,7 +112,7 @@ def test_driving_scoring_and_evaluating_come_to_the_same(run_path, tmp_path, mon
 
     base = tt.base_state(1)
     tt.register("Beside-v0", (food_beside,), base=base, max_steps=STEPS)
-    arguments = [str(run_path), "--sets", "Beside-v0", "--tasks", "8", "--no-cache"]
+    arguments = [str(run_path), "--sets", "Beside-v0", "--tasks", "8"]
     evaluate.main([*arguments, "--json", str(tmp_path / "table.json")])
     _, second = json.loads((tmp_path / "table.json").read_text())
     (found,) = second["sets"]

@@ -1,3 +1,5 @@
+"""Parameters as files: written, shipped, evaluated, and what is refused."""
+
 import json
 import re
 
@@ -6,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import trap_tube_jax as tt
 from agents import evaluate, pretrained
 from agents.acting.policy import Policy
 from agents.config import Config
@@ -92,7 +95,7 @@ def test_half_precision_is_half_the_size_and_close(run_path, tmp_path):
 def test_shipped_parameters_are_evaluated(run_path, shipped, capsys):
     export(shipped, run_path)
     results = shipped / "results.json"
-    common = ["--sets", "base", "--no-cache", "--json", str(results)]
+    common = ["--sets", "base", "--json", str(results)]
     evaluate.main(["--pretrained", "x", *common])
     assert "Greedy evaluation: pretrained, x, iteration 6" in capsys.readouterr().out
     (policy,) = json.loads(results.read_text())
@@ -104,8 +107,12 @@ def test_shipped_parameters_are_evaluated(run_path, shipped, capsys):
 
 def test_every_shipped_file_can_be_loaded():
     total = 0
-    for name in pretrained.names():
-        assert pretrained.load_shipped(name).iteration > 0
+    trained_on = {"base": "base", "paper": "base", "pstsy": "pstsy", "taught": "pstsy"}
+    assert pretrained.names() == tuple(trained_on)
+    for name, env in trained_on.items():
+        policy = pretrained.load_shipped(name)
+        assert policy.iteration > 0
+        assert tt.task_set(policy.config.env_id).short == env
         total += len((pretrained._folder() / f"{name}.npz").read_bytes())
     assert total < 4_000_000
 
@@ -152,15 +159,15 @@ def test_a_folder_that_is_no_run_does_not_hide_shipped_parameters(tmp_path, monk
 
 def test_unknown_parameters_are_refused(run_path, shipped, capsys):
     assert "unknown parameters 'q'; allowed: none" in refused(
-        capsys, evaluate.main, "--pretrained", "q", "--no-cache"
+        capsys, evaluate.main, "--pretrained", "q"
     )
     export(shipped, run_path)
-    message = refused(capsys, evaluate.main, "--pretrained", "q", "--no-cache")
+    message = refused(capsys, evaluate.main, "--pretrained", "q")
     assert "unknown parameters 'q'; allowed: x" in message
     for arguments in ([], [run_path, "--pretrained", "x"]):
-        message = refused(capsys, evaluate.main, *arguments, "--no-cache")
+        message = refused(capsys, evaluate.main, *arguments)
         assert "give a run's folder or --pretrained NAME, one of them" in message
-    message = refused(capsys, evaluate.main, "--pretrained", "x", "--iteration", 5, "--no-cache")
+    message = refused(capsys, evaluate.main, "--pretrained", "x", "--iteration", 5)
     assert "--iteration names a checkpoint of a run" in message
 
 

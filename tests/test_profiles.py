@@ -344,7 +344,7 @@ def test_pages_hold_the_tables_of_a_profile(tiny, tmp_path):
 
 
 def test_records_of_profiles_name_a_commit_known_before_measuring(tmp_path, monkeypatch, capsys):
-    arguments = ["--pretrained", "base", "--parts", "swaps", "--no-cache"]
+    arguments = ["--pretrained", "base", "--parts", "swaps"]
     arguments += ["--out", str(tmp_path / "out"), "--record", str(tmp_path / "x.json")]
     monkeypatch.setattr(command, "profile", None)
     for commit, message in (("abc-dirty", "this one of abc-dirty"), (None, "give --commit")):

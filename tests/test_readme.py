@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import trap_tube_jax as tt
 from agents.experiments import statistics
 from agents.experiments.records import read_record
 from trap_tube_jax import registry
@@ -29,7 +30,8 @@ def test_blocks_share_a_session(capsys):
     assert len(BLOCKS) >= 5
     for block in BLOCKS:
         exec(compile(block, str(README), "exec"), session)
-    assert capsys.readouterr().out.splitlines()[1] == "11"
+    output = capsys.readouterr().out.splitlines()
+    assert (output[1], output[-1]) == ("11", "21 1.0")
 
 
 def test_own_tasks(monkeypatch):
@@ -38,6 +40,12 @@ def test_own_tasks(monkeypatch):
     for block in blocks_of(ROOT / "trap_tube_jax" / "own_tasks.md"):
         exec(compile(block, "own_tasks.md", "exec"), session)
     assert "timestep" in session
+
+
+@pytest.mark.parametrize("page", ["graded.md", "controls.md"])
+def test_short_examples(page):
+    for block in blocks_of(ROOT / "trap_tube_jax" / page):
+        exec(compile(block, page, "exec"), {"tt": tt})
 
 
 def test_the_protocol(capsys):

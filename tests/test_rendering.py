@@ -142,6 +142,12 @@ def test_episode_frames_show_every_state_and_grasp():
     assert len(rendering.episode_frames(state, [], 8)) == 1
 
 
+@pytest.mark.parametrize("actions", [[3, 7, 1, 2], [[0.0, 1.0]], [[0, 1, 2]]])
+def test_episode_frames_refuse_other_actions(actions):
+    with pytest.raises(ValueError, match=r"actions must be integer\[T, 2\]"):
+        rendering.episode_frames(tt.base_state(), actions)
+
+
 def test_gif_holds_the_frames(tmp_path):
     state = tt.base_state()
     agents = jnp.array([[9, 1], [9, 2], [9, 3]])
@@ -175,6 +181,7 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
         (np.zeros((0, 4, 4, 3), np.uint8), {}, "at least one"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 0}, "at most 50, got 0"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"hold": -1}, "got -1"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"hold": 700}, "at most 655.35 s"),
     ],
 )
 def test_gif_refuses(frames, options, message, tmp_path):

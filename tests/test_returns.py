@@ -67,21 +67,6 @@ def test_advantages(episodes):
         np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
 
 
-def test_advantages_without_lambda_are_errors_and_with_it_are_returns(episodes):
-    """At lambda 0 the advantage is one step's error, at lambda 1 return less value."""
-    reward, gamma = jnp.asarray(episodes["reward"].T), 0.9
-    ones = jnp.ones_like(reward)
-    value = jnp.asarray(episodes["values"].T).at[-1].set(0)
-    args = reward, jnp.full_like(reward, gamma), value, ones
-    error = reward + gamma * value[1:] - value[:-1]
-    without = returns.generalized_advantages(*args, 0.0)
-    np.testing.assert_allclose(without, error, atol=1e-5)
-    full = returns.discounted_returns(reward, gamma)
-    np.testing.assert_allclose(
-        returns.generalized_advantages(*args, 1.0), full - value[:-1], atol=1e-4
-    )
-
-
 def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[Any, Any]:
     """Advantages and targets of one episode: rewards 1, values 10, 20, 30, 40, gamma .5."""
     config = Config(discount=0.5, gae_lambda=0.0, bootstrap=bootstrap)  # pyright: ignore[reportArgumentType]

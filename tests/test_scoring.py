@@ -235,7 +235,7 @@ def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     over = rightward_food(evaluation_tasks("near", 20))[:, None]
     first, later = [UP, RIGHT], np.where(over, 9, RIGHT)
     assert tt.score(Constant(first, later), ["near"], 20)["near"].solved == over.sum()
-    words = ["an action that is none", "(grasp, move)", "0 to 3"]
+    words = ["an invalid action", "(grasp, move)", "0 to 3"]
     for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):
         assert_refused(words, tt.score, action, ["near"], 20)
     floats = Constant([0.0, 3.0])

@@ -1,3 +1,5 @@
+"""What the end of a run says to its reader."""
+
 from pathlib import Path
 
 import numpy as np

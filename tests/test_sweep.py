@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -132,13 +133,13 @@ def test_a_request_stops_all_and_starts_no_more(tmp_path, monkeypatch):
     stop = StopSignals(lambda: None)
     begun = lambda: len(list(tmp_path.glob("*/begun")))  # noqa: E731
 
-    def poll(worker, bars):
+    def wait(seconds):
         if begun() == 3:
             stop.received = signal.SIGTERM
-        return ended(worker, bars)
+        sleep(seconds)
 
-    ended = workers._has_ended
-    monkeypatch.setattr(workers, "_has_ended", poll)
+    sleep = time.sleep
+    monkeypatch.setattr(workers.time, "sleep", wait)
     with pytest.raises(Stopped):
         workers.train_runs(planned(tmp_path, "a", seeds=5), 3, Console(quiet=True), stop)
     assert [path.read_text() for path in tmp_path.glob("*/ended")] == ["stopped"] * 3
@@ -287,6 +288,6 @@ def test_a_worker_is_told_of_every_limit_that_may_have_changed(tmp_path):
     folder = RunFolder.create(tmp_path / "x", before)
     for limits in ({"max_transitions": None, "stop_when_solved": 0.5}, {"max_transitions": 4000}):
         run = dataclasses.replace(before, config=dataclasses.replace(before.config, **limits))
-        _, _, _, *arguments = workers._command(folder, run, ["--no-cache"])
+        _, _, _, *arguments = workers._command(folder, run)
         _, options = train.parse(train.select(arguments), arguments)
         assert options.config == run.config

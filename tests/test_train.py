@@ -1,3 +1,5 @@
+"""The command line of training: what a run leaves, stopping and resuming, and what is refused."""
+
 import csv
 import dataclasses
 import json
@@ -94,7 +96,7 @@ def whole(tmp_path_factory):
 def test_a_run_leaves_its_results_and_says_where(whole):
     folder, output = whole
     names = ["config.json", "metrics.csv", "checkpoints", "curves.png", "evaluation.json"]
-    for name in [*names, "summary.json"]:
+    for name in [*names, "summary.json", "report.html"]:
         assert (folder / name).exists()
         assert str(folder / name) in output
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
@@ -186,13 +188,13 @@ def refused(capsys, *arguments, command=main):
     ],
 )
 def test_impossible_settings_are_refused(capsys, tmp_path, arguments, message):
-    assert message in refused(capsys, *arguments.split(), "--no-cache", "--out", tmp_path)
+    assert message in refused(capsys, *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_run_is_not_overwritten(capsys, whole):
     folder, _ = whole
-    out = ["--no-cache", "--out", folder.parent, "--name", "whole"]
+    out = ["--out", folder.parent, "--name", "whole"]
     assert "give --resume to continue the run in it, or another --name" in refused(capsys, *out)
     message = refused(capsys, *out, "--resume", "--hidden", 8)
     assert "the run has hidden=4, not 8; only iterations, max_transitions and stop_when" in message
@@ -202,11 +204,11 @@ def test_a_run_is_not_overwritten(capsys, whole):
 def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
     RunFolder.create(tmp_path / "foreign", Run(Config()))
     shutil.copytree(whole[0] / "checkpoints", tmp_path / "foreign" / "checkpoints")
-    out = ["--resume", "--no-cache", "--name", "foreign", "--out", tmp_path]
+    out = ["--resume", "--name", "foreign", "--out", tmp_path]
     settings = (tmp_path / "foreign" / "config.json").read_bytes()
     assert "does not fit the run's settings" in refused(capsys, *out, "--iterations", 999)
     assert (tmp_path / "foreign" / "config.json").read_bytes() == settings
-    message = refused(capsys, tmp_path / "foreign", "--no-cache", command=evaluate.main)
+    message = refused(capsys, tmp_path / "foreign", command=evaluate.main)
     assert f"checkpoint {tmp_path}/foreign/checkpoints/{ITERATIONS} does not fit" in message
     assert "holds no run" in refused(capsys, tmp_path / "none", command=evaluate.main)
 
@@ -241,7 +243,7 @@ def test_resumed_runs_keep_their_settings(tmp_path):
 
 def test_resumed_runs_keep_their_task_set(capsys, tmp_path):
     RunFolder.create(tmp_path / "x", Run(Config()))
-    arguments = ["--resume", "--no-cache", "--name", "x", "--out", str(tmp_path)]
+    arguments = ["--resume", "--name", "x", "--out", str(tmp_path)]
     message = refused(capsys, *arguments, "--env", "sy")
     assert "x is of TrapTube-v0, not of --env sy; leave that out, or begin a new run" in message
     assert parsed(*arguments, "--env", "base")[0] == Run(Config())
@@ -284,7 +286,7 @@ def test_after_stopping_a_further_ctrl_c_ends_the_process():
 def test_a_run_with_a_cooldown_is_not_extended(capsys, tmp_path):
     """Its step size has been falling towards the last iteration that was known then."""
     RunFolder.create(tmp_path / "x", Run(Config(iterations=20, cooldown=0.5)))
-    arguments = ["--resume", "--no-cache", "--name", "x", "--out", tmp_path]
+    arguments = ["--resume", "--name", "x", "--out", tmp_path]
     message = refused(capsys, *arguments, "--iterations", 30)
     assert "the run has cooldown=0.5 and iterations=20, not 30" in message
     assert json.loads((tmp_path / "x/config.json").read_text())["config"]["iterations"] == 20
@@ -390,7 +392,7 @@ def test_solved_seeds_stay_as_they_are():
     shapes = jax.eval_shape(jax.vmap(train.init), keys)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
     state = zeros._replace(key=keys)
-    after, metrics = jax.jit(make_advance(train, 2))(state, jnp.array([True, False]))
+    after, metrics = jax.jit(make_advance(train))(state, jnp.array([True, False]))
     assert after.iteration.tolist() == [1, 0]
     assert metrics["steps"].tolist() == [48, 48]
     for leaf in jax.tree.leaves(after.params):
@@ -436,6 +438,17 @@ def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
     with pytest.raises(jax.errors.JaxRuntimeError):  # any other error is not hidden
         compilation.compiled(lowered, Config(compile_quickly=True))
     assert compilation.compiled(lowered, Config())(1.0) == 2
+
+
+def test_jaxs_own_settings_of_the_cache_go_first(monkeypatch, tmp_path):
+    monkeypatch.setattr(compilation, "default_folder", lambda: tmp_path)
+    for chosen, made in (("/theirs", None), (None, str(tmp_path))):
+        found = {}
+        config = SimpleNamespace(jax_compilation_cache_dir=chosen, update=found.__setitem__)
+        monkeypatch.setattr(compilation, "jax", SimpleNamespace(config=config))
+        compilation.enable_cache()
+        assert found.get("jax_compilation_cache_dir") == made
+        assert "jax_enable_compilation_cache" not in found
 
 
 def test_cache_follows_the_environment(monkeypatch, tmp_path):

@@ -104,7 +104,7 @@ def test_draws_what_observe_shows(num_features):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"chunk_size": 0}, "chunk_size must be >= 1, got 0"),
+        ({"chunk_size": 0}, "chunk_size must be an integer >= 1, got 0"),
         ({"chunk_size": 2.0}, "chunk_size must be an integer >= 1, got 2.0"),
         ({"chunk_size": True}, "chunk_size must be an integer >= 1, got True"),
     ],

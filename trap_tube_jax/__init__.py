@@ -31,7 +31,7 @@ from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, s
 from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 
-# Gymnasium's convention: importing a package registers its environments.
+# Gymnasium's convention: importing a package registers its environments. Needs Gymnasium >= 1.1.
 with contextlib.suppress(ImportError):
     importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
 

@@ -51,7 +51,7 @@ def no_trap() -> tuple[State, ...]:
 
 
 def two_traps() -> tuple[State, ...]:
-    """A second trap is in the wall on the way to the exit: the food can pass it, not the other.
+    """A second trap is in the wall on the way to the exit. The food can pass this one only.
 
     The exit is on the base task's side, or on the other one.
     Source: Seed et al. (2006): tubes with two traps, of which one does nothing.
@@ -118,12 +118,13 @@ def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
     It keeps the state's palette, time and flags, so that it composes with the others.
 
     Args:
-      layouts: a function of no arguments that lists them, as those of this module.
+      layouts: a named function of no arguments that lists at least one, as those of this
+        module.
     """
 
     def transfer(key: jax.Array, state: State) -> State:
         choices = layouts()
-        index = jax.random.randint(loop_free(key), (), 0, len(choices))
+        index = jax.random.randint(loop_free(key), (), 0, len(choices), jnp.int32)
         fields = ("board", "agent", "tool", "tool_extent", "food")
         tables = {name: [np.asarray(getattr(each, name)) for each in choices] for name in fields}
         return state.replace(
@@ -135,7 +136,7 @@ def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
 
 
 def trap_and_exit_exchanged(state: State) -> State:
-    """The same task but for trap and exit, which have changed places.
+    """The same task with trap and exit exchanged; also of a batch of states.
 
     With the task itself it is a pair that differs in the trap alone. The twin of a task of {P}
     is a task of {P}.

@@ -31,10 +31,9 @@ def step(state: State, action: jax.Array) -> State:
     board, agent, food, tool = state.board, state.agent, state.food, state.tool
     extent = state.tool_extent
     on_tool = functools.partial(bar_covers, tool, extent)
-    grasp = unit_vector(action[0])
     move = unit_vector(action[1]) * ~(state.terminated | state.truncated)
 
-    grasped = on_tool(agent + grasp) & ~on_tool(agent)
+    grasped = holds_tool(state, action[0])
     agent_free = static_object(board, agent + move) == GROUND
     food_ahead = on_tool(food - move) & ~on_tool(food)
     beyond_food = static_object(board, food + move)
@@ -59,6 +58,12 @@ def step(state: State, action: jax.Array) -> State:
         food=new_food,
         terminated=state.terminated | same_cell(new_agent, new_food),
     )
+
+
+def holds_tool(state: State, direction: jax.Array | int) -> jax.Array:
+    """bool[]: whether the agent's hand in a direction is at the tool, and the agent not on it."""
+    on_tool = functools.partial(bar_covers, state.tool, state.tool_extent)
+    return on_tool(state.agent + unit_vector(direction)) & ~on_tool(state.agent)
 
 
 def static_object(board: jax.Array, cell: jax.Array) -> jax.Array:

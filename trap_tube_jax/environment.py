@@ -13,10 +13,12 @@ import numpy as np
 from jax.core import Tracer
 
 from trap_tube_jax import dynamics
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     DIRECTION_NAMES,
     MAX_STEPS,
+    NO_DIRECTION,
     NUM_ACTIONS,
     NUM_DIRECTIONS,
 )
@@ -60,7 +62,10 @@ class Environment:
         base: State | None = None,
         max_steps: int = MAX_STEPS,
     ):
-        """Checks its arguments; a transfer of your own is tried on the base state once.
+        """Checks its arguments.
+
+        Transfers of your own are tried once, with one key, each on the state that those before
+        it return.
 
         Args:
           transfers: functions (key, state) -> state, applied in order at every reset, each
@@ -76,14 +81,9 @@ class Environment:
                 f"transfers must be a sequence of functions (key, state) -> state, "
                 f"got {transfers!r}"
             )
-        is_integer = isinstance(max_steps, int | np.integer) and not isinstance(max_steps, bool)
-        if not is_integer or not 1 <= max_steps <= LARGEST_TIME:
-            raise ValueError(
-                f"max_steps must be an integer >= 1 and <= {LARGEST_TIME}, got {max_steps!r}"
-            )
+        self.max_steps = check_integer("max_steps", max_steps, maximum=LARGEST_TIME)
         self.transfers = tuple(transfers)
         self.base = base_state() if base is None else _check_base(base)
-        self.max_steps = int(max_steps)
         self._transfer = compose(*self.transfers)
         self._check_transfers()
 
@@ -107,8 +107,8 @@ class Environment:
 
         Args:
           state: one unbatched state.
-          action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Under
-            jit the numbers cannot be checked: any other one is no direction.
+          action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Under jit,
+            vmap and scan the numbers are not checked: any other one is no direction.
 
         Returns:
           The next state, and a timestep with reward 1 if this step solved the task.
@@ -150,15 +150,32 @@ class Environment:
         return f"Environment(transfers=({names}), max_steps={self.max_steps})"
 
     def _check_transfers(self) -> None:
-        for transfer in self.transfers:
-            if transfer not in _TRUSTED_TRANSFERS:
-                _check_transfer(transfer, self.base)
+        state, key = self.base, jax.random.key(0)
+        last = max(
+            (i for i, each in enumerate(self.transfers) if each not in _TRUSTED_TRANSFERS),
+            default=-1,
+        )
+        for transfer in self.transfers[: last + 1]:
+            if transfer in _TRUSTED_TRANSFERS:
+                state = jax.jit(transfer)(key, state)
+            else:
+                state = _try_transfer(transfer, key, state)
 
 
 def action_from_index(index: jax.Array) -> jax.Array:
-    """The action i32[..., 2] = (grasp, move) of an integer `4 * grasp + move` in 0 to 15."""
+    """The action i32[..., 2] = (grasp, move) of an integer[...] `4 * grasp + move` in 0 to 15.
+
+    Any other number becomes (-1, -1), which are no directions.
+
+    Raises:
+      ValueError: `index` does not hold integers.
+    """
     index = jnp.asarray(index)
-    return jnp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1).astype(jnp.int32)
+    if not jnp.issubdtype(index.dtype, jnp.integer):
+        raise ValueError(f"an action's index must be an integer, got {index.dtype}")
+    action = jnp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1).astype(jnp.int32)
+    is_known = (index >= 0) & (index < NUM_ACTIONS)
+    return jnp.where(is_known[..., None], action, NO_DIRECTION)
 
 
 def action_to_index(action: jax.Array) -> jax.Array:
@@ -226,16 +243,18 @@ def _check_base(base: State) -> State:
     return base
 
 
-def _check_transfer(transfer: Transfer, base: State) -> None:
-    """Tries a transfer on the base state: its result must be a valid state."""
+def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
+    """The state that a transfer returns, which must be a valid one."""
     name = getattr(transfer, "__name__", repr(transfer))
-    key = jax.random.key(0)
     try:
-        check_structure(jax.eval_shape(transfer, key, base))
-        validate(jax.jit(transfer)(key, base))
+        structure = jax.eval_shape(transfer, key, state)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"transfer {name} failed; allowed: a function (key, state) -> state that runs under "
+            f"jax.jit; {type(error).__name__}: {error}"
+        ) from error
+    try:
+        check_structure(structure)
+        return validate(jax.jit(transfer)(key, state))
     except ValueError as error:
         raise ValueError(f"transfer {name} returned a broken state: {error}") from error
-    except TypeError as error:
-        raise ValueError(
-            f"transfer {name} is not a function (key, state) -> state: {error}"
-        ) from error

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import Flag, plain_errors
 from trap_tube_jax.objects import BOARD_SIZE, NUM_OBJECTS, OBJECT_NAMES
 from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
@@ -37,7 +37,7 @@ class Arguments:
 
     Attributes:
       out: the folder for gallery.png and the GIFs; made if missing.
-      tasks: distinct tasks per set, at least 2.
+      tasks: different tasks per set, at least 2; fewer where a set has fewer.
       cell_size: pixels per cell and side of the contact sheet, at least 8.
       seed: which tasks are drawn.
       gifs: also writes a solved episode of base, p, st, sy and pstsy each.
@@ -47,7 +47,7 @@ class Arguments:
     tasks: int = 4
     cell_size: int = 16
     seed: int = 0
-    gifs: bool = False
+    gifs: Flag = False
 
 
 def contact_sheet(
@@ -61,8 +61,8 @@ def contact_sheet(
 
     Args:
       ids: the task sets, at least one; the paper's eight if absent.
-      tasks: distinct tasks per set, at least 2. The base has only one: the legend
-        takes the place of the others.
+      tasks: the most tasks per set, at least 2. They all differ; there are fewer where 64
+        draws hold fewer. The base has one: the legend takes the place of the others.
       cell_size: pixels per cell and side, at least 8.
       seed: which tasks are drawn.
 

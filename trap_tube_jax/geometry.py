@@ -11,8 +11,9 @@ ROWS, COLUMNS = np.ogrid[0:BOARD_SIZE, 0:BOARD_SIZE]
 ROWS, COLUMNS = ROWS.astype(np.int32), COLUMNS.astype(np.int32)
 
 
-def unit_vector(direction: jax.Array) -> jax.Array:
+def unit_vector(direction: jax.Array | int) -> jax.Array:
     """i32[2] (row, column) displacement of a direction; zero for any other number."""
+    direction = jnp.asarray(direction)
     row = (direction == DOWN).astype(jnp.int32) - (direction == UP)
     column = (direction == RIGHT).astype(jnp.int32) - (direction == LEFT)
     return jnp.stack([row, column])
@@ -29,7 +30,7 @@ def is_on_board(cell: jax.Array) -> jax.Array:
 
 
 def same_cell(cell: jax.Array, other: jax.Array) -> jax.Array:
-    """bool[]: whether two cells, each i32[2], are one."""
+    """bool[]: whether two cells, each i32[2], are equal."""
     return (cell[0] == other[0]) & (cell[1] == other[1])
 
 

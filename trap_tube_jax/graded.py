@@ -1,8 +1,8 @@
 """The perceptual and the structural transfer, from none of it to all of it.
 
 A strength s from 0 to 1 says how far from the base task the draws may go. At 0 nothing is changed
-from it. At 1 the draws are those of the paper's transfer. What a layout, or the direction of a
-feature point, can be at one strength, it can be at any higher one.
+from it. At 1 the draws are those of the paper's transfer. Draws are nested: a layout, or a
+direction of a feature point, that is possible at one strength is possible at every higher one.
 
 Source: graded.md; the paper, section "Structural", for interpolation on the sphere.
 """
@@ -21,7 +21,7 @@ from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State, base_state
 from trap_tube_jax.transfers import Transfer, perceptual, recolor, sphere_points, structural
 
-CENTER = 1e-4  # a radius below is 0 but for rounding; that of other features is 1 / 255 or more
+CENTER = 1e-4  # a radius below is 0 up to rounding; that of other features is 1 / 255 or more
 TOLERANCE = 1e-9  # of a distance, against the rounding of strength * distance
 
 
@@ -96,7 +96,7 @@ def graded_structural(strength: float) -> Transfer:
         # The middle of the interval that floor maps to the feature, so that 0 changes nothing.
         own = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
         drawn = sphere_points(key, state.palette.shape[-1])
-        return recolor(state, points_between(own, drawn, strength).clip(-1, 1))
+        return recolor(state, points_between(own, drawn, strength))
 
     return _named(transfer, "structural", strength)
 

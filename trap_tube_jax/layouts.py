@@ -29,8 +29,9 @@ _SIDES = ((3, 4), (3, 5), (4, 4), (4, 4))
 class LayoutTables(NamedTuple):
     """The outcomes of every choice.
 
-    Along the last axis all are equally likely. Where a row ends in padding, the counts say
-    how many of its entries are outcomes.
+    Frames are equally likely, and so are the assignments of a frame. A row of `food`, `tool`
+    or `agent` lists cells that are equally likely; where it ends in padding, the counts say
+    how many of its entries come before it.
 
     A frame is a tube's outline with a direction of the tool; an assignment says which of
     the outline's sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143.

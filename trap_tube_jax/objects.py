@@ -14,6 +14,8 @@ from typing import Final
 
 import numpy as np
 
+from trap_tube_jax.checks import check_integer
+
 BOARD_SIZE: Final = 12
 MAX_TOOL_LENGTH: Final = 4
 MAX_STEPS: Final = 50
@@ -38,11 +40,13 @@ BASE_COLORS: Final = np.array(
     ],
     np.uint8,
 )
+LUMA: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 
 UP, DOWN, LEFT, RIGHT = range(4)
 DIRECTION_NAMES: Final = ("up", "down", "left", "right")
 DIRECTIONS: Final = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.int32)
 NUM_DIRECTIONS: Final = len(DIRECTION_NAMES)
+NO_DIRECTION: Final = -1  # as is any other number
 NUM_ACTIONS: Final = NUM_DIRECTIONS**2
 
 
@@ -63,11 +67,7 @@ def base_palette(num_features: int = 3) -> np.ndarray:
     Raises:
       ValueError: `num_features` is not an integer >= 1.
     """
-    if isinstance(num_features, bool) or not isinstance(num_features, int | np.integer):
-        raise ValueError(f"num_features must be an integer >= 1, got {num_features!r}")
-    if num_features < 1:
-        raise ValueError(f"num_features must be >= 1, got {num_features}")
+    check_integer("num_features", num_features)
     if num_features == 1:
-        luma = BASE_COLORS @ np.array([0.299, 0.587, 0.114])
-        return np.rint(luma).astype(np.uint8)[:, None]
+        return np.rint(BASE_COLORS @ LUMA).astype(np.uint8)[:, None]
     return BASE_COLORS[:, np.arange(num_features) % 3]

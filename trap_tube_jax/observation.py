@@ -31,7 +31,11 @@ def observe(state: State) -> jax.Array:
 
 
 def render_ascii(state: State) -> str:
-    """The picture that `State.from_ascii` reads, topmost objects only. Host side."""
+    """The board as 12 lines of 12 characters, those of `State.from_ascii`. Host side.
+
+    Each is the topmost object of its cell. What lies below is lost: not every state can be
+    read back.
+    """
     objects = np.asarray(visible_objects(state))
     return "\n".join("".join(OBJECT_CHARS[code] for code in row) for row in objects)
 

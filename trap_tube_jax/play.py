@@ -1,7 +1,7 @@
 """Playing by hand in a terminal: `python -m trap_tube_jax.play PerceptualTrapTube-v0 --seed 3`.
 
-The game is pure: `press` maps a game and a key to the next game, `screen` a game to
-coloured text. Only `_run` and what it calls know the terminal.
+The game is pure: `press` maps a game and a key to the next game, and `screen` turns a game
+into coloured text. Only `_run` and what it calls know the terminal.
 """
 
 import contextlib
@@ -17,13 +17,14 @@ import numpy as np
 import tyro
 
 from trap_tube_jax.command_line import Imports, plain_errors
+from trap_tube_jax.dynamics import holds_tool
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import (
     AGENT,
     BASE_COLORS,
     BOARD_SIZE,
     DIRECTION_NAMES,
-    DIRECTIONS,
+    LUMA,
     NUM_OBJECTS,
     OBJECT_NAMES,
     TOOL,
@@ -95,7 +96,7 @@ class Game:
       actions: the (grasp, move) between them.
       grasp: the direction of the hand, held until changed.
       hint: the (grasp, move) that a shortest solution takes next, if asked for.
-      message: what there is to say.
+      message: the line below the board.
     """
 
     task_set: str
@@ -348,7 +349,7 @@ def _legend() -> list[Span]:
 
 def _panel(game: Game) -> list[Span]:
     """What is going on, and the keys."""
-    holds = "holds the tool" if _holds_tool(game) else "empty"
+    holds = "holds the tool" if holds_tool(game.state, game.grasp) else "empty"
     lines = [
         f"step {len(game.actions)}",
         f"hand {DIRECTION_NAMES[game.grasp]}: {holds}",
@@ -356,17 +357,6 @@ def _panel(game: Game) -> list[Span]:
         *(f"{keys:<14}{meaning}" for keys, meaning in HELP),
     ]
     return [Span(2 + index, PANEL, line) for index, line in enumerate(lines)]
-
-
-def _holds_tool(game: Game) -> bool:
-    agent, tool, extent = (
-        np.asarray(part) for part in (game.state.agent, game.state.tool, game.state.tool_extent)
-    )
-    on_tool = [
-        bool(np.all((cell >= tool) & (cell < tool + extent)))
-        for cell in (agent, agent + DIRECTIONS[game.grasp])
-    ]
-    return on_tool == [False, True]
 
 
 def _run(window: Any, game: Game, folder: pathlib.Path) -> None:
@@ -388,8 +378,12 @@ def _run(window: Any, game: Game, folder: pathlib.Path) -> None:
             _draw(window, _say(game, "thinking ..."))
         if key in ("g", "z"):
             path = folder / f"{game.task_set}-seed{game.seed}{'.gif' if key == 'g' else '.npz'}"
-            save(game, path)
-            game = _say(game, f"saved {path}")
+            try:
+                save(game, path)
+            except OSError as error:
+                game = _say(game, f"not saved: {error}")
+            else:
+                game = _say(game, f"saved {path}")
         else:
             game = press(game, key)
 
@@ -416,7 +410,7 @@ def _attribute(color: tuple[int, int, int]) -> int:
     if not curses.has_colors() or curses.COLORS < 256:
         return 0
     background = terminal_color(color)
-    is_dark = np.dot(color, (0.299, 0.587, 0.114)) < 128
+    is_dark = np.dot(color, LUMA) < 128
     # One pair per background, named like it: 256 pairs is all that some terminals have.
     curses.init_pair(background, 231 if is_dark else 16, background)
     return curses.color_pair(background) | curses.A_BOLD

@@ -26,7 +26,7 @@ def position_id(state: State) -> jax.Array:
 
 
 def cells_at(position: jax.Array) -> jax.Array:
-    """u8[3, 2]: the cells of agent, tool and food at a position. Undoes `position_id`."""
+    """u8[3, 2]: the cells of agent, tool and food at a position i32[]. Undoes `position_id`."""
     agent_and_tool, food = jnp.divmod(position, NUM_CELLS)
     cell = jnp.stack([*jnp.divmod(agent_and_tool, NUM_CELLS), food])
     return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)

@@ -2,8 +2,8 @@
 
 On a CPU, JAX computes its Threefry hash in a loop of five rounds. That is quick to compile, but a
 reset needs only a handful of numbers, and starting the loops takes longer than the hash itself.
-`loop_free` makes a key whose draws are the same bits, computed without a loop. It is of a type of
-its own, so it stays within this package: nobody else is handed one.
+`loop_free` makes a key whose draws are the same bits, computed without a loop. Such a key has its
+own type. It is used inside this package only, and never passed to your code.
 
 Source: Salmon et al. (2011) for the hash; JAX's documentation of `jax_threefry_partitionable`
 for how the counters are chosen.

@@ -4,6 +4,7 @@ Source: paper, section "Experimental Setup"; environment.md, "Task sets"; contro
 """
 
 import dataclasses
+import re
 from collections.abc import Iterable
 
 from trap_tube_jax.controls import CONTROLS, drawn_from
@@ -134,19 +135,22 @@ def register(
     Args:
       id: its name, not yet taken.
       transfers: functions (key, state) -> state, in the order in which they apply.
-      short: its name in tables; the id if absent.
+      short: its name in tables and file names; the id if absent.
       base: the state that the transfers start from, at time 0; the base task if absent.
       max_steps: steps after which an unsolved episode is truncated, 1 to 2**31 - 1.
 
     Raises:
-      ValueError: a name is empty or taken, a transfer is not a function, the base state is
-        invalid, or the step limit is; the message says what is allowed.
+      ValueError: a name is taken or has other characters than letters, digits, "_", "." and
+        "-", a transfer is not a function, or the base state or the step limit is invalid; the
+        message says what is allowed.
     """
     short = id if short is None else short
     taken = {name for entry in _task_sets.values() for name in (entry.id, entry.short)}
     for name in (id, short):
-        if not isinstance(name, str) or not name:
-            raise ValueError(f"a task set's name must be a non-empty string, got {name!r}")
+        if not isinstance(name, str) or not re.fullmatch(r"[\w.-]+", name, re.ASCII):
+            raise ValueError(
+                f"a task set's name consists of letters, digits, '_', '.' and '-', got {name!r}"
+            )
         if name in taken:
             raise ValueError(f"the name {name!r} is taken; taken are: {', '.join(sorted(taken))}")
     env = Environment(transfers, base=base, max_steps=max_steps)

@@ -17,14 +17,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.dynamics import step
-from trap_tube_jax.geometry import bar_covers, unit_vector
+from trap_tube_jax.checks import check_integer
+from trap_tube_jax.dynamics import holds_tool, step
+from trap_tube_jax.geometry import unit_vector
 from trap_tube_jax.objects import (
     AGENT,
     BASE_COLORS,
     BOARD_SIZE,
     EXIT,
     FOOD,
+    LUMA,
     NUM_DIRECTIONS,
     NUM_OBJECTS,
     TOOL,
@@ -35,15 +37,15 @@ from trap_tube_jax.objects import (
 from trap_tube_jax.observation import observe, visible_objects
 from trap_tube_jax.state import State
 
-SMALLEST_SIGN = 7  # pixels per cell from which on a sign can be read
-SMALLEST_GRID = 4  # pixels per cell from which on lines leave room for colour
+SMALLEST_SIGN = 7  # the smallest cell, in pixels, with a sign
+SMALLEST_GRID = 4  # the smallest cell, in pixels, with lines around it
 SIGN_OPACITY = 0.8
 GRID_OPACITY = 0.22
 TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
 TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 MAX_FPS = 50  # browsers slow down GIFs with shorter frames
+LONGEST_FRAME = 655.35  # seconds, what a GIF can hold
 
 
 def render(
@@ -73,8 +75,8 @@ def render(
     Raises:
       ValueError: `cell_size` is not an integer >= 1.
     """
-    _check_cell_size(cell_size)
-    return _render(state, grasp, cell_size=int(cell_size), grid=bool(grid))
+    cell_size = check_integer("cell_size", cell_size)
+    return _render(state, grasp, cell_size=cell_size, grid=bool(grid))
 
 
 def rgb(features: jax.Array) -> jax.Array:
@@ -100,11 +102,11 @@ def render_object(code: int, cell_size: int = 32) -> np.ndarray:
     Raises:
       ValueError: naming the value and what is allowed.
     """
-    _check_cell_size(cell_size)
+    cell_size = check_integer("cell_size", cell_size)
     if code not in range(NUM_OBJECTS):
         raise ValueError(f"code must be an object code from 0 to {NUM_OBJECTS - 1}, got {code!r}")
     color = np.broadcast_to(BASE_COLORS[code], (cell_size, cell_size, 3)).astype(np.float32)
-    sign = _signs(int(cell_size))[code]
+    sign = _signs(cell_size)[code]
     return np.asarray(_to_pixels(_blend(color, _ink(color), sign * SIGN_OPACITY)))
 
 
@@ -118,10 +120,20 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
       state: one unbatched state, unfinished.
       actions: i32[T, 2], (grasp, move) pairs; T may be 0.
       cell_size: s >= 1, pixels per cell and side.
+
+    Raises:
+      ValueError: naming the argument and what is allowed.
     """
-    _check_cell_size(cell_size)
-    actions = np.asarray(actions, np.int32).reshape(-1, 2)
-    return np.asarray(_episode_frames(state, actions, cell_size=int(cell_size)))
+    cell_size = check_integer("cell_size", cell_size)
+    actions = np.asarray(actions)
+    if not len(actions):
+        actions = np.zeros((0, 2), np.int32)
+    if actions.shape != (len(actions), 2) or actions.dtype.kind not in "iu":
+        raise ValueError(
+            "actions must be integer[T, 2], (grasp, move) pairs, got "
+            f"{actions.dtype}{list(actions.shape)}"
+        )
+    return np.asarray(_episode_frames(state, actions.astype(np.int32), cell_size=cell_size))
 
 
 def save_gif(
@@ -133,7 +145,7 @@ def save_gif(
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1.
       path: the file to write.
       fps: frames per second, over 0 and at most 50.
-      hold: seconds by which the last frame stays longer.
+      hold: seconds by which the last frame stays longer. No frame may last longer than 655.35.
 
     Raises:
       ValueError: naming the value and what is allowed.
@@ -151,6 +163,11 @@ def save_gif(
         raise ValueError(f"hold must be a number of seconds >= 0, got {hold}")
     durations = [round(1000 / fps)] * len(pictures)
     durations[-1] += round(1000 * hold)
+    if durations[-1] > 1000 * LONGEST_FRAME:
+        raise ValueError(
+            f"a frame of a GIF lasts at most {LONGEST_FRAME} s, got 1 / fps + hold = "
+            f"{durations[-1] / 1000} s"
+        )
     first, *rest = _indexed(pictures)
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
     first.save(path, format="GIF", duration=durations, loop=0, **options)
@@ -215,7 +232,7 @@ def _arrange(tiles: np.ndarray, objects: jax.Array) -> jax.Array:
 
 def _ink(color: Any) -> Any:
     """f32[h, w, 1]: black or white, whichever stands out from f32[h, w, 3]."""
-    return (color @ LUMA < 128)[..., None] * np.float32(255)
+    return (color @ LUMA.astype(np.float32) < 128)[..., None] * np.float32(255)
 
 
 def _blend(image: Any, ink: Any, opacity: Any) -> Any:
@@ -280,12 +297,9 @@ def _tool_bar(state: State, cell_size: int) -> jax.Array:
 
 def _draw_hand(image: jax.Array, state: State, grasp: jax.Array, cell_size: int) -> jax.Array:
     """Draws a white hand with a black outline on the agent's border in the grasp direction."""
-    direction = unit_vector(grasp)
-    on_tool = functools.partial(bar_covers, state.tool, state.tool_extent)
-    holds = on_tool(state.agent + direction) & ~on_tool(state.agent)
-    y, x = _offsets(state.agent + 0.5 + 0.5 * direction, BOARD_SIZE, cell_size)
+    y, x = _offsets(state.agent + 0.5 + 0.5 * unit_vector(grasp), BOARD_SIZE, cell_size)
     disc = jnp.hypot(y, x) - HAND_RADIUS
-    hand = jnp.where(holds, disc, jnp.abs(disc + 0.07) - 0.07)
+    hand = jnp.where(holds_tool(state, grasp), disc, jnp.abs(disc + 0.07) - 0.07)
     is_shown = (grasp >= 0) & (grasp < NUM_DIRECTIONS)
     outline = _coverage(hand - 0.05, cell_size) * is_shown
     image = _blend(image, 0.0, outline)
@@ -312,10 +326,3 @@ def _grid_lines(cell_size: int) -> np.ndarray:
     pixels = np.arange(BOARD_SIZE * cell_size)
     on_line = (pixels % cell_size < width) | (pixels >= len(pixels) - width)
     return (on_line[:, None] | on_line).astype(np.float32)
-
-
-def _check_cell_size(cell_size: Any) -> None:
-    if isinstance(cell_size, bool) or not isinstance(cell_size, int | np.integer):
-        raise ValueError(f"cell_size must be an integer >= 1, got {cell_size!r}")
-    if cell_size < 1:
-        raise ValueError(f"cell_size must be >= 1, got {cell_size}")

@@ -242,7 +242,8 @@ def check_structure(state: Any) -> None:
     """
     if not isinstance(state, State):
         raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}")
-    num_features = state.palette.shape[-1] if np.ndim(state.palette) == 2 else 3
+    shape = np.shape(state.palette)
+    num_features = shape[-1] if len(shape) == 2 else 3
     for name, (shape, dtype) in _field_specs(max(num_features, 1)).items():
         field = getattr(state, name)
         if not hasattr(field, "shape") or not hasattr(field, "dtype"):

@@ -7,13 +7,14 @@ swaps its looks with another object).
 Source: paper, sections "Perceptual", "Structural" and "Symbolic"; environment.md, "Transfers".
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.geometry import bar_cells, cell_of, is_on_board
+from trap_tube_jax.geometry import bar_cells, bar_covers, cell_of, is_on_board
 from trap_tube_jax.layouts import MAX_FOOD_CELLS, NUM_ASSIGNMENTS, NUM_FRAMES, layout_tables
 from trap_tube_jax.objects import (
     AGENT,
@@ -113,7 +114,7 @@ def sphere_points(key: jax.Array, num_features: int) -> jax.Array:
 
     The rows of agent and food are not used.
     """
-    normal = jax.random.normal(loop_free(key), (5, num_features))
+    normal = jax.random.normal(loop_free(key), (5, num_features), jnp.float32)
     points = normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
     if num_features == 1:  # -1 and 1, which the rounded quotient may miss
         points = jnp.where(normal < 0, -1.0, 1.0)
@@ -121,8 +122,11 @@ def sphere_points(key: jax.Array, num_features: int) -> jax.Array:
 
 
 def recolor(state: State, points: jax.Array) -> State:
-    """The state with the features of points f32[8, N] in [-1, 1]^N, but for agent and food."""
-    features = jnp.floor((points + 1) / 2 * 255).astype(jnp.uint8)
+    """The state with the features of points f32[8, N], but for agent and food.
+
+    Coordinates beyond -1 or 1 are cut off there.
+    """
+    features = jnp.floor((points.clip(-1, 1) + 1) / 2 * 255).astype(jnp.uint8)
     keeps = np.isin(np.arange(NUM_OBJECTS), (AGENT, FOOD))[:, None]
     return state.replace(palette=jnp.where(keeps, state.palette, features))
 
@@ -133,8 +137,9 @@ def symbolic(key: jax.Array, state: State) -> State:
     The object is uniform over tool, tube1, tube2, trap and exit. The new tool starts at
     the object's top-left cell, has as many cells, and is horizontal if the first two in
     reading order share a row; the object takes the old tool's cells. "Tool" changes
-    nothing. On other boards, nor does an object that cannot be a tool: one without cells,
-    one with more than four, or one whose bar would leave the board.
+    nothing. On boards of your own nor does an object that cannot be a tool: one without
+    cells, one with more than four, or one whose bar would leave the board; and nothing is
+    swapped while the tool covers agent or food, which would then stand on the object.
 
     Args:
       key: PRNG key.
@@ -143,7 +148,7 @@ def symbolic(key: jax.Array, state: State) -> State:
     Returns:
       The state after the swap.
     """
-    choice = jax.random.randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS))
+    choice = jax.random.randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS), jnp.int32)
     return swap_with_tool(state, jnp.asarray(SYMBOLIC_OBJECTS)[choice])
 
 
@@ -152,7 +157,10 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
 
     Args:
       state: one unbatched state.
-      code: i32[], one of `SYMBOLIC_OBJECTS`.
+      code: i32[], one of `SYMBOLIC_OBJECTS`; the tool's own code changes nothing.
+
+    Returns:
+      The state after the swap, or as it was; see `symbolic`.
     """
     cells = np.arange(BOARD_SIZE**2, dtype=np.int32)
     is_object = state.board.reshape(-1) == code
@@ -163,8 +171,10 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
     horizontal = (length > 1) & (second // BOARD_SIZE == first // BOARD_SIZE)
     extent = jnp.where(horizontal, jnp.stack([1, length]), jnp.stack([length, 1]))
 
+    covers = functools.partial(bar_covers, state.tool, state.tool_extent)
+    is_clear = ~covers(state.agent) & ~covers(state.food)
     fits = is_on_board(corner + extent - 1)
-    swaps = (length >= 1) & (length <= MAX_TOOL_LENGTH) & fits
+    swaps = (length >= 1) & (length <= MAX_TOOL_LENGTH) & fits & is_clear
     old_tool = bar_cells(state.tool, state.tool_extent)
     board = jnp.where(state.board == code, jnp.uint8(GROUND), state.board)
     board = jnp.where(old_tool, code.astype(jnp.uint8), board)

@@ -19,10 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
-from trap_tube_jax.state import State
-from trap_tube_jax.wrappers import AutoReset, AutoResetState, AutoResetTimeStep
+from trap_tube_jax.state import State, TimeStep
+from trap_tube_jax.wrappers import (
+    AutoReset,
+    AutoResetState,
+    AutoResetTimeStep,
+    auto_reset_timestep,
+)
 
 MAX_SELECTED_FEATURES = 8
 
@@ -43,9 +49,9 @@ class VectorEnvironment:
     """B environments in step, each starting its next episode when one ends.
 
     States, observations and everything else equal `jax.vmap` of `AutoReset(env)`, for the
-    same keys and actions. Batched already: jit and scan it, do not vmap it over
-    environments. (Over a few seeds a vmap is right, though chunks then run as often as the
-    seed with most finished environments needs.)
+    same keys and actions. It is batched already: jit and scan it, and do not vmap it over
+    environments. A vmap over seeds works; each step then runs as many chunks as the seed with
+    the most finished environments needs.
     """
 
     starts_over = True
@@ -64,12 +70,8 @@ class VectorEnvironment:
         """
         if not isinstance(env, Environment):
             raise ValueError(f"env must be a trap_tube_jax.Environment, got {type(env).__name__}")
-        if isinstance(chunk_size, bool) or not isinstance(chunk_size, int | np.integer):
-            raise ValueError(f"chunk_size must be an integer >= 1, got {chunk_size!r}")
-        if chunk_size < 1:
-            raise ValueError(f"chunk_size must be >= 1, got {chunk_size}")
         self.env = env
-        self.chunk_size = int(chunk_size)
+        self.chunk_size = check_integer("chunk_size", chunk_size)
         self._auto_reset = AutoReset(env)
 
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
@@ -78,19 +80,21 @@ class VectorEnvironment:
         return VectorState(episodes, jax.vmap(draw_static)(episodes.inner)), timestep
 
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
-        """Takes one action i32[B, 2] in each and starts over those whose episode ended."""
-        inner, timestep = jax.vmap(self.env.step)(state.episodes.inner, actions)
-        final_picture = jax.vmap(draw_movable)(inner, state.background)
-        stepped = VectorState(AutoResetState(inner, state.episodes.key), state.background)
+        """Takes one action i32[B, 2] in each and starts over those whose episode ended.
+
+        Numbers of actions are not checked; see `Environment.step`.
+        """
+        stepped, timestep, final_picture = self._advance(state, actions)
         state, picture = self._start_over(timestep.done, stepped, final_picture)
-        return state, AutoResetTimeStep(
-            observation=picture.reshape(timestep.observation.shape),
-            reward=timestep.reward,
-            terminated=timestep.terminated,
-            truncated=timestep.truncated,
-            discount=timestep.discount,
-            final_observation=final_picture.reshape(timestep.observation.shape),
-        )
+        return state, auto_reset_timestep(timestep, picture, final_picture)
+
+    def _advance(
+        self, state: VectorState, actions: jax.Array
+    ) -> tuple[VectorState, TimeStep, jax.Array]:
+        """One step without any reset: states, timesteps, and pictures u8[B, 12 * 12 * N]."""
+        inner, timestep = jax.vmap(self.env.step)(state.episodes.inner, actions)
+        stepped = VectorState(AutoResetState(inner, state.episodes.key), state.background)
+        return stepped, timestep, jax.vmap(draw_movable)(inner, state.background)
 
     def _start_over(
         self, done: jax.Array, state: VectorState, picture: jax.Array

@@ -1,4 +1,7 @@
-"""Wrappers around an environment, with its `reset` and `step`: pure and unbatched too."""
+"""Wrappers around an environment, pure as it is, with the same `reset` and `step`.
+
+They are unbatched; `EpisodeStatistics` also goes around a `VectorEnvironment`.
+"""
 
 from typing import Any, Protocol
 
@@ -63,12 +66,17 @@ class AutoReset:
         """Wraps an environment that does not start over by itself.
 
         Raises:
-          ValueError: it does.
+          ValueError: it does, or it is an `EpisodeStatistics`.
         """
         if _starts_over(env):
             raise ValueError(
                 f"{type(env).__name__} starts over by itself already; allowed: an environment "
                 "that does not, such as a trap_tube_jax.Environment"
+            )
+        if isinstance(env, EpisodeStatistics):
+            raise ValueError(
+                "every next episode would start with all counts at zero; allowed: "
+                "EpisodeStatistics(AutoReset(env))"
             )
         self.env = env
 
@@ -76,7 +84,8 @@ class AutoReset:
         """Starts the first episode. See `Environment.reset`."""
         reset_key, next_key = split(check_key(key))
         inner, timestep = self.env.reset(reset_key)
-        return AutoResetState(inner, next_key), _auto_reset_timestep(timestep, timestep.observation)
+        first = auto_reset_timestep(timestep, timestep.observation, timestep.observation)
+        return AutoResetState(inner, next_key), first
 
     def step(
         self, state: AutoResetState, action: jax.Array
@@ -90,7 +99,7 @@ class AutoReset:
             (fresh, first.observation),
             stepped,
         )
-        return next_state, _auto_reset_timestep(timestep, observation)
+        return next_state, auto_reset_timestep(timestep, observation, timestep.observation)
 
 
 class EpisodeStatisticsState(struct.PyTreeNode):
@@ -120,7 +129,8 @@ class EpisodeStatisticsState(struct.PyTreeNode):
 class EpisodeStatistics:
     """Counts return and length of every episode of any environment, also a `VectorEnvironment`.
 
-    Around a bare environment, steps after the end of the episode are not counted.
+    Around a bare environment, steps after the end of the episode are not counted. To start
+    over, wrap an `AutoReset` in it, not the other way round.
     """
 
     def __init__(self, env: EnvironmentLike):
@@ -165,12 +175,16 @@ def _starts_over(env: Any) -> bool:
     return bool(getattr(env, "starts_over", False))
 
 
-def _auto_reset_timestep(timestep: TimeStep, observation: jax.Array) -> AutoResetTimeStep:
+def auto_reset_timestep(
+    timestep: TimeStep, observation: jax.Array, final_observation: jax.Array
+) -> AutoResetTimeStep:
+    """The timestep of a step with these observations, of any shape with as many elements."""
+    shape = timestep.observation.shape
     return AutoResetTimeStep(
-        observation=observation,
+        observation=observation.reshape(shape),
         reward=timestep.reward,
         terminated=timestep.terminated,
         truncated=timestep.truncated,
         discount=timestep.discount,
-        final_observation=timestep.observation,
+        final_observation=final_observation.reshape(shape),
     )

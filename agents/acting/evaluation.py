@@ -17,6 +17,7 @@ from trap_tube_jax.environment import Environment
 from trap_tube_jax.scoring.benchmark import BLOCK
 from trap_tube_jax.scoring.scores import Optimality, Score
 from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks, label, layout_numbers
+from trap_tube_jax.solver.search import take
 from trap_tube_jax.state import State
 
 
@@ -49,15 +50,17 @@ def evaluate(
       tasks: B states at time 0.
       shards: how devices divide the tasks among themselves, evenly or not.
     """
-    num_tasks = tasks.time.shape[0]
+    num_tasks = len(tasks.time)
+    # Where they do not divide evenly, the first ones are played twice.
+    place = np.arange(-(-num_tasks // shards.count) * shards.count) % num_tasks
     if shards.count > 1:
-        tasks = _rows(tasks, shards.places(num_tasks))
+        tasks = take(tasks, shards.part(jnp.asarray(place)))
     frame, played = play_greedily(agent, params, env, tasks)
     episodes = played.episodes
     action = jax.vmap(Frame.original_action)(frame, episodes.action.swapaxes(0, 1))
     value = played.value[:-1, :, 0].swapaxes(0, 1)
     outcome = Evaluation(episodes.solved, episodes.length, action, value)
-    return outcome if shards.count == 1 else _rows(shards.whole(outcome), slice(num_tasks))
+    return outcome if shards.count == 1 else take(shards.whole(outcome), slice(num_tasks))
 
 
 def play_greedily(
@@ -95,7 +98,7 @@ class Evaluator:
         block = min(BLOCK, self._total)
         together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
         self._blocks = [
-            _rows(together, np.arange(start, start + block) % self._total)
+            take(together, np.arange(start, start + block) % self._total)
             for start in range(0, self._total, block)
         ]
         # All sets are played up to the largest limit; `__call__` cuts off what is beyond a set's.
@@ -128,34 +131,31 @@ class Evaluator:
         ends = np.cumsum([len(states.time) for states in self.tasks.values()])
         starts = np.concatenate([[0], ends[:-1]])
         return {
-            name: _within(_rows(whole, slice(start, end)), self.limits[name])
+            name: _within(take(whole, slice(start, end)), self.limits[name])
             for name, start, end in zip(self.tasks, starts, ends, strict=True)
         }
 
+    def scores(
+        self,
+        played: Mapping[str, Evaluation],
+        shortest: Mapping[str, np.ndarray] | None = None,
+    ) -> list[Score]:
+        """The score of every set.
 
-def scores(
-    played: Mapping[str, Evaluation],
-    tasks: Mapping[str, State],
-    limits: Mapping[str, int],
-    shortest: Mapping[str, np.ndarray] | None = None,
-) -> list[Score]:
-    """The score of every set; with `shortest`, by set, compared with shortest plans.
-
-    Args:
-      played: what an `Evaluator` returned.
-      tasks: its tasks.
-      limits: its step limit of each set.
-      shortest: the lengths i32[B] of each set's shortest plans, if known.
-    """
-    made = []
-    for name, outcome in played.items():
-        solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
-        found = None
-        if shortest is not None:
-            found = Optimality.of(solved, length, shortest[name], limits[name])
-        layout = layout_numbers(name, tasks[name])
-        made.append(Score.of(name, label(name), solved, length, layout=layout, optimality=found))
-    return made
+        Args:
+          played: outcomes by set, as a call returned them.
+          shortest: the lengths i32[B] of each set's shortest plans, to compare with.
+        """
+        made = []
+        for name, outcome in played.items():
+            solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
+            found = None
+            if shortest is not None:
+                found = Optimality.of(solved, length, shortest[name], self.limits[name])
+            layout = layout_numbers(name, self.tasks[name])
+            score = Score.of(name, label(name), solved, length, layout=layout, optimality=found)
+            made.append(score)
+        return made
 
 
 def own_and_paper_sets(config: Config) -> tuple[str, ...]:
@@ -169,7 +169,3 @@ def _within(outcome: Evaluation, limit: int) -> Evaluation:
         solved=outcome.solved & (outcome.length <= limit),
         length=np.minimum(outcome.length, limit),
     )
-
-
-def _rows(tree: Any, index: Any) -> Any:
-    return jax.tree.map(lambda x: x[index], tree)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.curiosity.models import InverseFeatures
+from agents.curiosity.models import InverseModel
 from agents.networks import make_encoder
-from agents.networks.layers import init_module
+from agents.networks.layers import draw
 
 RIDGE = 0.1  # lambda of the paper
 
@@ -25,17 +25,18 @@ class E3B(Curiosity):
     """
 
     def __init__(self, config: Config):
-        self._models = InverseFeatures(config.hidden, make_encoder(config))
+        self._encoder, self._inverse = make_encoder(config), InverseModel(config.hidden)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of the encoder and of the inverse model."""
-        return init_module(self._models, key, board, board)
+        encoder_key = jax.random.fold_in(key, 0)
+        features, encoder = self._encoder.init_with_output(encoder_key, board)
+        params = {"encoder": encoder, "inverse": self._inverse.init(key, features, features)}
+        return draw(key, params)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features of its own encoder, f32[M, F]."""
-        features: Any = self._models.apply(
-            params, observation, method=lambda models, x: models.encoder(x)
-        )
+        features: Any = self._encoder.apply(params["encoder"], observation)
         return features
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
@@ -45,9 +46,7 @@ class E3B(Curiosity):
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """-log p(action) under the inverse model."""
         features = experience.features
-        action: Any = self._models.apply(
-            params, features[:-1], features[1:], method=lambda models, *x: models.inverse(*x)
-        )
+        action: Any = self._inverse.apply(params["inverse"], features[:-1], features[1:])
         return {"inverse_loss": -action.log_prob(experience.episodes.action)}
 
 

@@ -7,6 +7,7 @@ in RIDE (Raileanu and Rocktaeschel, 2020).
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from agents.acting.episodes import CELL_AGENT, CELL_FOOD, CELL_TOOL, Episodes
 from agents.acting.identity import first_visits
@@ -16,6 +17,7 @@ from agents.networks.grouping import hash_rows
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 
 NUM_KINDS = 3
+OFF_BOARD = np.uint32(2**32 - 1)  # in place of the hash of a look; 0 is that of black
 LOWEST_RATE = 1e-4  # effects a step, below which an effect does not pay more
 
 
@@ -78,4 +80,4 @@ def new_touches(episodes: Episodes) -> jax.Array:
     hand = jnp.clip(hand, 0, BOARD_SIZE - 1)
     time, episode = jnp.indices(hand.shape[:2])
     look = episodes.observations()[time, episode, hand[..., 0], hand[..., 1]]
-    return first_visits(jnp.where(on_board, hash_rows(look), 0)) * on_board
+    return first_visits(jnp.where(on_board, hash_rows(look), OFF_BOARD)) * on_board

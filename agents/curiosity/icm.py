@@ -5,38 +5,13 @@ Source: paper, section "Results"; Pathak et al. (2017); agents/agent.md, "Curios
 
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.curiosity.models import ForwardModel, InverseModel
-from agents.networks.actions import ActionDistribution
-from agents.networks.layers import init_module
-
-
-class Models(nn.Module):
-    """Forward and inverse model over the policy's embeddings.
-
-    Attributes:
-      hidden: units of the inverse model.
-    """
-
-    hidden: int
-
-    def setup(self) -> None:
-        """Declares the two models."""
-        self.forward = ForwardModel()
-        self.inverse = InverseModel(self.hidden)
-
-    def __call__(
-        self, embedding: jax.Array, next_embedding: jax.Array, action_embedding: jax.Array
-    ) -> tuple[jax.Array, ActionDistribution]:
-        """The squared errors f32[..., H] of the predicted next embedding; the inferred action."""
-        predicted = self.forward(embedding, action_embedding)
-        error = jnp.square(predicted - next_embedding)
-        return error, self.inverse(embedding, next_embedding)
+from agents.networks.layers import draw
 
 
 class ICM(Curiosity):
@@ -50,13 +25,17 @@ class ICM(Curiosity):
     needs_embeddings = True
 
     def __init__(self, config: Config):
-        self._models = Models(config.hidden)
-        self._widths = (config.hidden, config.hidden, 2 * config.embedding)
+        self._forward, self._inverse = ForwardModel(), InverseModel(config.hidden)
+        self._widths = (config.hidden, 2 * config.embedding)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of both models; `board` is not looked at."""
-        inputs = (jnp.zeros((1, width)) for width in self._widths)
-        return init_module(self._models, key, *inputs)
+        embedding, action = (jnp.zeros((1, width)) for width in self._widths)
+        params = {
+            "forward": self._forward.init(key, embedding, action),
+            "inverse": self._inverse.init(key, embedding, embedding),
+        }
+        return draw(key, params)
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The sum over units of the forward model's squared errors."""
@@ -73,5 +52,7 @@ class ICM(Curiosity):
 
     def predict(self, params: Params, experience: Experience) -> Any:
         """The squared errors f32[T, B, H] of h' as predicted, and the inferred action."""
-        x = experience
-        return self._models.apply(params, x.embedding, x.next_embedding, x.action_embedding)
+        here, there = experience.embedding, experience.next_embedding
+        predicted: Any = self._forward.apply(params["forward"], here, experience.action_embedding)
+        inferred = self._inverse.apply(params["inverse"], here, there)
+        return jnp.square(predicted - there), inferred

@@ -1,4 +1,4 @@
-"""The two models of an intrinsic curiosity module, and features that they shape.
+"""The two models of an intrinsic curiosity module.
 
 Source: Pathak et al. (2017); agents/agent.md, "Network".
 """
@@ -33,23 +33,3 @@ class ForwardModel(nn.Module):
         """f32[..., H] and f32[..., E] to f32[..., H]."""
         x = jnp.concatenate([embedding, action], axis=-1)
         return embedding + output_dense(embedding.shape[-1])(x)
-
-
-class InverseFeatures(nn.Module):
-    """An encoder of its own and an inverse model over its features.
-
-    Attributes:
-      hidden: units of the inverse model.
-      encoder: from observations u8[M, 12, 12, N] to features f32[M, F].
-    """
-
-    hidden: int
-    encoder: nn.Module
-
-    def setup(self) -> None:
-        """Declares the inverse model."""
-        self.inverse = InverseModel(self.hidden)
-
-    def __call__(self, observation: jax.Array, next_observation: jax.Array) -> ActionDistribution:
-        """The inferred action between two observations u8[M, 12, 12, N]."""
-        return self.inverse(self.encoder(observation), self.encoder(next_observation))

@@ -73,8 +73,6 @@ class Options:
         code.
       commit: the commit to note where git does not tell it.
       checkpoint_every: iterations from one checkpoint to the next.
-      no_cache: compile everything anew, instead of keeping compiled programs in
-        ~/.cache/trap_tube_jax from one time to the next.
     """
 
     experiment: Annotated[Literal["exp1", "exp2"], tyro.conf.Positional]
@@ -102,7 +100,6 @@ class Options:
     record: Path | None = None
     commit: str | None = None
     checkpoint_every: int = 10
-    no_cache: Flag = False
 
     def __post_init__(self) -> None:
         """Checks what no protocol checks.
@@ -156,8 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with plain_errors():
             options = tyro.cli(Options, args=arguments, prog=PROGRAM)
             become_devices(options.devices)
-            if not options.no_cache:
-                compilation.enable_cache()
+            compilation.enable_cache()
             run(options, console, stop)
     except (KeyboardInterrupt, Stopped):
         again = f"{PROGRAM} {shlex.join(arguments)}"

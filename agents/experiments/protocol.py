@@ -227,8 +227,6 @@ FIXED = (
     *("train_set", "sets", "imports", "preset", "tasks", "selection", "evaluate_every"),
     *("stop_when_solved", "settings"),
 )
-# What the folder of an earlier version does not say: it holds one of the paper's experiments.
-LATER = ("train_set", "sets", "imports")
 
 PROTOCOLS = {
     "exp1": Protocol(iterations=250),

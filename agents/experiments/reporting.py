@@ -1,7 +1,6 @@
 """What the runs of an experiment came to: the record, and its tables and figures."""
 
 import dataclasses
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,9 @@ from agents.experiments.records import Record, Steps
 from agents.experiments.training import AlgorithmRun, draw_tasks, find_runs
 from agents.networks.agent import Params
 from agents.runs.folder import read_json, write_json
-from agents.runs.metrics import read_metrics
-from agents.runs.tracking import outcome, steps_taken
-from trap_tube_jax.scoring.tasks import layout_numbers, shortest_lengths
+from agents.runs.tracking import steps_taken
+from trap_tube_jax.scoring.tasks import layout_numbers
+from trap_tube_jax.solver.search import solve_batch, take
 from trap_tube_jax.state import State
 
 SHORTEST_FILE = "shortest.json"
@@ -116,7 +115,7 @@ def find_shortest(path: Path, tasks: Mapping[str, State], console: Console) -> d
             lengths = found.setdefault(name, [])
             while len(lengths) < wanted[name]:
                 part = slice(len(lengths), min(len(lengths) + SOLVED_AT_ONCE, wanted[name]))
-                block = shortest_lengths(jax.tree.map(operator.itemgetter(part), states)).tolist()
+                block = solve_batch(take(states, part)).length.tolist()
                 lengths += block
                 write_json(path, found)
                 bar.advance(task, len(block))
@@ -149,36 +148,20 @@ def best_steps(entry: AlgorithmRun, seed: int, protocol: Protocol, play: Play) -
       By set i32[B]; None if the seed has not been evaluated yet.
 
     Raises:
-      ValueError: what the run wrote does not fit together.
+      ValueError: its parameters cannot be read.
     """
     best = records.best_row(records.of_seed(entry.rows, seed))
     if best is None:
         return None
     iteration = int(best["iteration"])
-    if protocol.selection == "paper":
-        return _selected_steps(entry, seed, iteration)
-    path, key = entry.folder.tested(seed), [iteration, protocol.reported]
+    path, key = entry.folder.tested(seed), [iteration, protocol.num_reported]
     known = read_json(path)
     if known is None or known["iteration_and_tasks"] != key:
-        kept = entry.folder.kept_best(seed)
-        where = kept.get(iteration) or kept.get(0) or entry.folder.best(seed, iteration)
-        policy = pretrained.load(where)
-        if policy.iteration != iteration:
-            raise ValueError(f"{where} is of iteration {policy.iteration}, not of {iteration}")
+        policy = pretrained.load(entry.folder.best(seed, iteration))
         steps = {name: list(map(int, taken)) for name, taken in play(policy.params).items()}
         known = {"iteration_and_tasks": key, "steps": steps}
         write_json(path, known)
     return known["steps"]
-
-
-def _selected_steps(entry: AlgorithmRun, seed: int, iteration: int) -> Steps:
-    """The steps in the tasks by which the evaluation of an iteration was chosen."""
-    rows = records.of_seed(read_metrics(entry.folder.outcomes), seed)
-    played = [row for row in rows if row["iteration"] == iteration]
-    if not played:
-        where = entry.folder.outcomes
-        raise ValueError(f"{where} lacks seed {seed}, iteration {iteration}, which metrics have")
-    return {name: steps.tolist() for name, (_, steps) in outcome(played[0]).items()}
 
 
 def _algorithm(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from agents.config import Config
-from agents.experiments.protocol import FIXED, LATER, Protocol
+from agents.experiments.protocol import FIXED, Protocol
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, is_done, read_json, write_json
@@ -62,8 +62,7 @@ def open_experiment(
     if stored is not None:
         if stored.pop("experiment", None) != experiment:
             raise ValueError(f"{root} holds another experiment than {experiment}")
-        earlier = {name: getattr(defaults, name) for name in LATER}
-        defaults = Protocol.from_dict({**earlier, **stored, "seed": defaults.seed})
+        defaults = Protocol.from_dict({**stored, "seed": defaults.seed})
     protocol = dataclasses.replace(defaults, **given)
     for field in FIXED if stored is not None else ():
         before, now = getattr(defaults, field), getattr(protocol, field)

@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.progress import TimeElapsedColumn as Elapsed
 
 from agents import train
 from agents.parallel.cores import available_cores
 from agents.runs.folder import EXTENDABLE, Run, RunFolder
-from agents.runs.metrics import read_metrics
 from agents.runs.stopping import Stopped, StopSignals
 
 POLL_SECONDS = 0.5
@@ -30,13 +29,11 @@ class Worker(NamedTuple):
       folder: the run's files.
       process: the process; it stops where its standard input ends.
       cores: those that it runs on.
-      bar: its line of progress.
     """
 
     folder: RunFolder
     process: subprocess.Popen
     cores: list[int]
-    bar: TaskID
 
 
 def default_processes() -> int:
@@ -56,7 +53,6 @@ def train_runs(
     processes: int,
     console: Console,
     stop: StopSignals,
-    arguments: Sequence[str] = (),
 ) -> list[RunFolder]:
     """Trains runs to their end as `python -m agents.train --resume` does, some at a time.
 
@@ -65,7 +61,6 @@ def train_runs(
       processes: how many at a time; each gets its share of the cores.
       console: where to show progress. What a run itself shows goes to its `log.txt`.
       stop: tells when to stop early.
-      arguments: further ones of `agents.train`.
 
     Returns:
       The runs that failed.
@@ -84,12 +79,13 @@ def train_runs(
         try:
             while working or (waiting and not stop.received):
                 while free and waiting and not stop.received:
-                    working.append(_start(*waiting.pop(0), free.pop(), arguments, bars))
+                    working.append(_start(*waiting.pop(0), free.pop()))
                 if stop.received and not told:
                     told = True
                     for worker in working:
                         worker.process.send_signal(stop.received)
-                for worker in [worker for worker in working if _has_ended(worker, bars)]:
+                for worker in [each for each in working if each.process.poll() is not None]:
+                    worker.process.communicate()  # closes its input
                     working.remove(worker)
                     free.append(worker.cores)
                     bars.advance(everything)
@@ -105,23 +101,20 @@ def train_runs(
     return failed
 
 
-def _command(folder: RunFolder, run: Run, arguments: Sequence[str]) -> list[str]:
+def _command(folder: RunFolder, run: Run) -> list[str]:
     path = folder.path
     limits = [(f"--{name.replace('_', '-')}", getattr(run.config, name)) for name in EXTENDABLE]
     parts = (
         *(sys.executable, "-m", __name__, "--resume", "--name", path.name, "--out", path.parent),
         *itertools.chain.from_iterable(limits),
-        *arguments,
     )
     return [str(part) for part in parts]
 
 
-def _start(
-    folder: RunFolder, run: Run, cores: list[int], arguments: Sequence[str], bars: Progress
-) -> Worker:
+def _start(folder: RunFolder, run: Run, cores: list[int]) -> Worker:
     with folder.log.open("a") as log:
         process = subprocess.Popen(
-            _command(folder, run, arguments),
+            _command(folder, run),
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,
@@ -129,18 +122,7 @@ def _start(
         )
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(process.pid, cores)  # before it starts threads, which inherit it
-    bar = bars.add_task(folder.path.name, total=run.config.iterations)
-    return Worker(folder, process, cores, bar)
-
-
-def _has_ended(worker: Worker, bars: Progress) -> bool:
-    if worker.process.poll() is None:
-        rows = read_metrics(worker.folder.metrics)
-        bars.update(worker.bar, completed=rows[-1]["iteration"] if rows else 0)
-        return False
-    worker.process.communicate()  # closes its input
-    bars.remove_task(worker.bar)
-    return True
+    return Worker(folder, process, cores)
 
 
 def _has_failed(worker: Worker, console: Console, stop: StopSignals) -> bool:

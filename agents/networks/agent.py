@@ -15,11 +15,13 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
 
+PARTS = ("encoder", "core", "heads")  # of the parameters of the policy network
+
 
 class Agent:
     """The functions of the policy network; holds its modules, never parameters.
 
-    Parameters are a dictionary with `encoder`, `core` and `heads`; other entries are ignored.
+    Parameters are a dictionary of `PARTS`; other entries are ignored.
 
     Attributes:
       config: the settings. Whoever plays heeds `facing` and `chunk`, which are not done here.

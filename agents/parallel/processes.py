@@ -75,8 +75,6 @@ class Job:
         """
         if self.is_alone:
             return
-        if jax.__version_info__ < (0, 7):
-            raise ValueError(f"several processes need jax 0.7 or newer, not {jax.__version__}")
         try:
             jax.distributed.initialize(
                 self.coordinator,

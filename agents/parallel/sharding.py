@@ -70,15 +70,6 @@ class Shards:
         flat, restore = ravel_pytree(tree)
         return restore(jax.lax.pmean(flat, EPISODES))
 
-    def places(self, total: int) -> jax.Array:
-        """This device's share i32[M] of `total` places, M the same on every device.
-
-        Where they do not divide evenly, the first ones are taken for the second time.
-        """
-        size = -(-total // self.count)
-        place = self._index() * size + jnp.arange(size)
-        return place % total
-
     def drawing(self, choose: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
         """`choose(key, outputs)`, drawn as on one device, of which each keeps its own part."""
         if self.count == 1:
@@ -148,10 +139,6 @@ class Placement:
     def episodes(self) -> Shards:
         """How the episodes of a seed are divided."""
         return ALONE if self.mesh is None else Shards(self.mesh.shape[EPISODES])
-
-    def local_seeds(self, seeds: int) -> int:
-        """How many of all seeds a device trains."""
-        return seeds if self.mesh is None else seeds // self.mesh.shape[SEEDS]
 
     def shard(self, advance: Callable[..., Any]) -> Callable[..., Any]:
         """Divides (states [S, ...], bool[S]) -> (states [S, ...], metrics [S]) over the mesh."""

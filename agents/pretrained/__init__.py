@@ -18,7 +18,7 @@ import numpy as np
 
 from agents.acting.policy import Policy
 from agents.config import Config
-from agents.ppo.learner import make_train
+from agents.networks.agent import PARTS, Agent
 from agents.runs.checkpoint import Arrays, digest, from_arrays, to_arrays
 
 FORMAT = "trap-tube-jax parameters 1"
@@ -64,8 +64,13 @@ def load(path: Path | Traversable) -> Policy:
     header, arrays = _read(path)
     try:
         config = Config.from_dict(header["config"])
-        arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
-        template = jax.eval_shape(make_train(config).init_params, jax.random.key(0))
+        wanted = tuple(f"{part}/" for part in PARTS)
+        arrays = {
+            name: array.astype(np.float32)
+            for name, array in arrays.items()
+            if name.startswith(wanted)
+        }
+        template = jax.eval_shape(Agent(config).init, jax.random.key(0))
         params = from_arrays(arrays, template)
     except ValueError as error:
         raise ValueError(f"{path} does not fit this version: {error}") from error

@@ -10,7 +10,7 @@ import tyro
 from agents import pretrained
 from agents.acting.policy import Policy
 from agents.runs.folder import RunFolder, check_name
-from agents.runs.loading import load
+from agents.runs.loading import load_policy
 from trap_tube_jax.command_line import Flag, plain_errors
 
 PROGRAM = "python -m agents.pretrained"
@@ -88,7 +88,7 @@ def find_policy(options: Export) -> Policy:
       ValueError: there is no such run, seed or checkpoint.
     """
     if not options.best:
-        return load(options.run, seed=options.seed, iteration=options.iteration)
+        return load_policy(options.run, options.seed, options.iteration)
     if options.iteration is not None:
         raise ValueError("--best and --iteration name different parameters; give one")
     folder, run = RunFolder.open(options.run)

@@ -21,8 +21,13 @@ def default_folder() -> Path:
 
 
 def enable_cache() -> None:
-    """Keeps compiled programs from one process to the next, in `default_folder()`."""
-    jax.config.update("jax_enable_compilation_cache", True)
+    """Keeps compiled programs from one process to the next, in `default_folder()`.
+
+    JAX's own settings go before it: `JAX_COMPILATION_CACHE_DIR` for another folder,
+    `JAX_ENABLE_COMPILATION_CACHE=0` to compile everything anew.
+    """
+    if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        return
     jax.config.update("jax_compilation_cache_dir", str(default_folder()))
     # By default only what took over a second is kept; a run compiles many smaller programs.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -120,7 +120,6 @@ class RunFolder:
       path: the folder.
       config: the settings.
       metrics: a row per seed and iteration.
-      outcomes: a row per evaluation on several sets: the steps of every task.
       checkpoints: one folder per checkpoint, named after its iteration.
       log: what its training showed, where it ran beside others.
       curves: the learning curves.
@@ -135,7 +134,6 @@ class RunFolder:
         self.path = path
         self.config = path / CONFIG_FILE
         self.metrics = path / "metrics.csv"
-        self.outcomes = path / "outcomes.csv"
         self.checkpoints = path / "checkpoints"
         self.log = path / "log.txt"
         self.curves = path / "curves.png"
@@ -150,16 +148,10 @@ class RunFolder:
         return self.path / f"best-seed{seed}-iteration{iteration}.npz"
 
     def kept_best(self, seed: int) -> dict[int, Path]:
-        """The files of these parameters that there are, by iteration, in order; the last is best.
-
-        An earlier version kept one file without an iteration in its name; its key is 0.
-        """
+        """The files of these parameters, by iteration, in order; the last is the best."""
         prefix = f"best-seed{seed}-iteration"
         paths = self.path.glob(f"{prefix}*.npz")
         kept = {int(path.stem.removeprefix(prefix)): path for path in paths}
-        nameless = self.path / f"best-seed{seed}.npz"
-        if nameless.exists():
-            kept[0] = nameless
         return dict(sorted(kept.items()))
 
     def tested(self, seed: int) -> Path:

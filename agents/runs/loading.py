@@ -7,48 +7,30 @@ import jax
 
 from agents import pretrained
 from agents.acting.policy import Policy
-from agents.ppo.learner import make_train
+from agents.networks.agent import PARTS, Agent
 from agents.runs.checkpoint import Checkpoints, from_arrays
 from agents.runs.folder import Run, RunFolder
 
 SEED = "seed "  # before its number, the name of a run's policy
 
 
-def load(
-    source: str | Path,
-    *,
-    seed: int | None = None,
-    iteration: int | None = None,
-    greedy: bool = True,
+def load_policy(
+    source: str | Path, seed: int | None = None, iteration: int | None = None
 ) -> Policy:
-    """A trained policy, which acts from observations alone.
-
-        policy = load("runs/mine")
-        carry = policy.initial(batch)
-        action, carry = policy.act(observation, carry, key)
-
-    Args:
-      source: a run's folder, a file of parameters, or the name of shipped parameters.
-      seed: which seed of a run; its first if absent.
-      iteration: the checkpoint of a run to take; the newest if absent.
-      greedy: take the most probable actions; false draws them.
-
-    Raises:
-      ValueError: there is no such policy, or it cannot be read.
-    """
+    """One greedy policy of a source; see `agents.load`."""
     found = {policy.name: policy for policy in load_policies(source, iteration)}
     name = next(iter(found)) if seed is None else f"{SEED}{seed}"
     if name not in found:
         seeds = [each.removeprefix(SEED) for each in found if each.startswith(SEED)]
         raise ValueError(f"{source} has no seed {seed}; allowed: {', '.join(seeds) or 'none'}")
-    return found[name]._replace(greedy=greedy)
+    return found[name]
 
 
 def load_policies(source: str | Path, iteration: int | None = None) -> list[Policy]:
     """All policies of a source: of a run one per seed, else one.
 
     Args:
-      source: as for `load`.
+      source: a run's folder, a file of parameters, or the name of shipped parameters.
       iteration: the checkpoint of a run to take; the newest if absent.
 
     Raises:
@@ -81,10 +63,11 @@ def load_run(path: Path, iteration: int | None = None) -> list[Policy]:
     """
     folder, run = RunFolder.open(path)
     keys = jax.random.split(jax.random.key(0), run.seeds)
-    expected = {"params": jax.eval_shape(jax.vmap(make_train(run.config).init_params), keys)}
+    expected = {"params": jax.eval_shape(jax.vmap(Agent(run.config).init), keys)}
     with Checkpoints(folder.checkpoints) as checkpoints:
         arrays, record = checkpoints.load(iteration)
-        stored = {name: array for name, array in arrays.items() if name.startswith("params/")}
+        wanted = tuple(f"params/{part}/" for part in PARTS)
+        stored = {name: array for name, array in arrays.items() if name.startswith(wanted)}
         try:
             params = from_arrays(stored, expected)["params"]
         except ValueError as error:
@@ -97,9 +80,10 @@ def policies(run: Run, params: Any, iterations: Any) -> list[Policy]:
 
     Args:
       run: the run.
-      params: the parameters [S, ...] of all seeds.
+      params: the parameters [S, ...] of all seeds; those of a curiosity are left out.
       iterations: i32[S], the iterations that they are after.
     """
+    params = {part: params[part] for part in PARTS}
     return [
         Policy(
             f"{SEED}{seed}",

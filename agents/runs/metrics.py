@@ -110,7 +110,7 @@ def is_last(row: Row, config: Config) -> bool:
     if config.stop_when_solved > 0 and row["evaluation"] >= config.stop_when_solved:
         return True
     limit = config.max_transitions
-    return limit is not None and row["transitions"] + config.longest_iteration > limit
+    return limit is not None and int(row["transitions"]) + config.longest_iteration > limit
 
 
 def _number(text: str) -> float | int:

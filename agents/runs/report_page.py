@@ -31,8 +31,9 @@ MAX_PICTURES = 600  # of all episodes, of at most two kilobytes each
 
 EPISODES_OF_A_SET = 2  # the first solved one and the first unsolved one
 
-# From the state of training and M tasks to the intrinsic reward f32[M, T] of its greedy play.
-Pay = Callable[[TrainState, State], jax.Array]
+# From the state of training, M tasks and which of them count, bool[M], to the intrinsic reward
+# f32[M, T] of its greedy play.
+Pay = Callable[[TrainState, State, np.ndarray], jax.Array]
 
 PAGE = string.Template("""<!doctype html>
 <html lang="en">
@@ -116,7 +117,7 @@ def save(
     curves: Path,
     evaluator: Evaluator,
     played: Mapping[str, Evaluation],
-    pay: Callable[[State], jax.Array],
+    pay: Callable[[State, np.ndarray], jax.Array],
 ) -> None:
     """Writes the page.
 
@@ -129,7 +130,8 @@ def save(
       curves: the PNG of the learning curves.
       evaluator: what played.
       played: what it returned of one policy, whose episodes are shown.
-      pay: from tasks to the intrinsic reward of this policy's play; see `compile_pay`.
+      pay: from tasks, and which of them count, to the intrinsic reward of this policy's play;
+        see `compile_pay`.
     """
     episodes, pictures = _episodes(evaluator, played, pay)
     data = json.dumps({"episodes": episodes, "pictures": pictures})
@@ -159,7 +161,7 @@ def _table(heads: Sequence[Any], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def compile_pay(config: Config, state: TrainState, evaluator: Evaluator) -> Pay:
-    """What the curiosity pays for greedy play of tasks, were it to be played next.
+    """What the curiosity pays for greedy play of tasks, were these all that is played next.
 
     Args:
       config: the settings.
@@ -170,17 +172,23 @@ def compile_pay(config: Config, state: TrainState, evaluator: Evaluator) -> Pay:
     longest = max(evaluator.limits.values())
     env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
 
-    def paid(state: TrainState, tasks: State) -> jax.Array:
+    def paid(state: TrainState, tasks: State, counts: jax.Array) -> jax.Array:
         _, trajectory = play_greedily(learner.agent, state.params, env, tasks)
+        episodes = trajectory.episodes
+        trajectory = trajectory._replace(
+            episodes=episodes._replace(mask=episodes.mask * counts[None])
+        )
         return learner.intrinsic_reward(state, trajectory)[0].swapaxes(0, 1)
 
     shown = EPISODES_OF_A_SET * len(evaluator.tasks)
     tasks = jax.tree.map(lambda x: jax.ShapeDtypeStruct((shown, *x.shape), x.dtype), env.base)
-    return compiled(jax.jit(paid).lower(state, tasks), config)
+    return compiled(jax.jit(paid).lower(state, tasks, np.ones(shown, bool)), config)
 
 
 def _episodes(
-    evaluator: Evaluator, played: Mapping[str, Evaluation], pay: Callable[[State], jax.Array]
+    evaluator: Evaluator,
+    played: Mapping[str, Evaluation],
+    pay: Callable[[State, np.ndarray], jax.Array],
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """The first solved and the first unsolved episode of each set, and their pictures as PNG.
 
@@ -195,8 +203,10 @@ def _episodes(
     states = [jax.tree.map(lambda x, i=i: x[i], evaluator.tasks[name]) for name, i in shown]
     plans = solver.solve_batch(jax.tree.map(lambda *x: np.stack(x), *states)).actions
     # Always as many, so that what plays them is compiled in time.
-    unused = [states[0]] * (EPISODES_OF_A_SET * len(evaluator.tasks) - len(states))
-    novelty = np.asarray(pay(jax.tree.map(lambda *x: np.stack(x), *states, *unused)))
+    places = np.arange(EPISODES_OF_A_SET * len(evaluator.tasks))
+    padded = [states[place] if place < len(states) else states[0] for place in places]
+    tasks = jax.tree.map(lambda *x: np.stack(x), *padded)
+    novelty = np.asarray(pay(tasks, places < len(states)))
     episodes: list[dict[str, Any]] = []
     pictures: dict[bytes, int] = {}
     for (name, index), state, plan, paid in zip(shown, states, plans, novelty, strict=False):

@@ -13,9 +13,9 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets, scores
+from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets
 from agents.acting.policy import Policy
-from agents.networks.agent import num_parameters
+from agents.networks.agent import PARTS, num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
@@ -131,10 +131,7 @@ class Session:
         self.summarize()
         if self._log is None:
             return
-        results = {
-            name: scores(outcome, evaluator.tasks, evaluator.limits)
-            for name, outcome in played.items()
-        }
+        results = {name: evaluator.scores(outcome) for name, outcome in played.items()}
         write_json(folder.evaluation, report.results_json(trained, results))
         env = tt.task_set(run.config.env_id)
         folder.animation.unlink(missing_ok=True)
@@ -196,7 +193,7 @@ class Session:
         begin = f"from iteration {iteration}" if iteration else "from the start"
         self._say([f"{count:,} parameters, {begin}. Compiling one iteration of training ..."])
         active = np.ones(self.run.seeds, bool)
-        per_device = make_advance(self._train, self._placement.local_seeds(self.run.seeds))
+        per_device = make_advance(self._train)
         advance = jax.jit(self._placement.shard(per_device), donate_argnums=0)
         program = compiled(advance.lower(self._state, active), self.run.config)
         seconds = time.perf_counter() - started
@@ -218,7 +215,7 @@ class Session:
         sets = own_and_paper_sets(config)
         evaluator = Evaluator.of_sets(config, sets, config.eval_episodes)
         state = jax.eval_shape(self._train.init, jax.random.key(0))
-        evaluator.compile(state.params)
+        evaluator.compile({part: state.params[part] for part in PARTS})
         return evaluator, report_page.compile_pay(config, state, evaluator)
 
     def _iterate(self, advance: Advance) -> list[Row]:
@@ -319,7 +316,7 @@ class Session:
         self._say([f"{name:>15}: {path}" for name, path in files.items()])
 
 
-def make_advance(train: Learner, num_seeds: int) -> Advance:
+def make_advance(train: Learner) -> Advance:
     """One iteration of every seed and the greedy evaluation after it, as a pure function.
 
     The function takes the states [S, ...] and bool[S], the seeds to advance; the others stay
@@ -341,14 +338,16 @@ def make_advance(train: Learner, num_seeds: int) -> Advance:
         after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
         return after, metrics
 
-    def advance_one(
-        state: TrainState, active: jax.Array
+    def advance_all(
+        states: TrainState, active: jax.Array
     ) -> tuple[TrainState, dict[str, jax.Array]]:
-        first = jax.tree.map(lambda x: x[0], (state, active))
+        if len(active) > 1:
+            return jax.vmap(advance)(states, active)
+        # A vmapped loop has to carry on until the slowest of its elements is done.
+        first = jax.tree.map(lambda x: x[0], (states, active))
         return jax.tree.map(lambda x: x[None], advance(*first))
 
-    # A vmapped loop has to carry on until the slowest of its elements is done.
-    return advance_one if num_seeds == 1 else jax.vmap(advance)
+    return advance_all
 
 
 def _wait(arrays: Any) -> None:

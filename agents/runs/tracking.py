@@ -1,8 +1,7 @@
-"""Greedy play on several task sets as training goes: outcomes on disk, the best parameters."""
+"""Greedy play on several task sets as training goes, and the best parameters."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -10,12 +9,11 @@ from agents import pretrained
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.acting.policy import Policy
 from agents.runs.folder import Run, RunFolder
-from agents.runs.metrics import MetricsLog, Row
+from agents.runs.metrics import Row
 from trap_tube_jax.state import State
 
 PREFIX = "greedy_"
 OVERALL = "greedy_overall"
-SEPARATOR = "/"
 
 
 class Tracker:
@@ -23,8 +21,7 @@ class Tracker:
 
     Each evaluation adds to the metrics the share of tasks solved of every set, `greedy_<set>`,
     and their mean over the ranked sets, `greedy_overall`; in between these are NaN. The run's
-    `outcomes.csv` gets the steps taken in every task, 0 where it is not solved, and
-    `best-seed<seed>-iteration<iteration>.npz` the parameters of the best overall evaluation so far.
+    `best-seed<seed>-iteration<iteration>.npz` gets the parameters of the best evaluation so far.
     Those of the best until a checkpoint stay at least until the next one, so that a run that is
     killed and continues from there finds them.
     """
@@ -52,11 +49,9 @@ class Tracker:
         self._ranked, self._every = tuple(ranked), every
         self._evaluator = Evaluator(run.config, tasks)
         self._best = dict.fromkeys(run.seed_range, -math.inf)
-        self._log: MetricsLog | None = None
 
     def resume(self, rows: Sequence[Row], iteration: int) -> None:
         """Continues after these rows of metrics, the last of which is of `iteration`."""
-        self._log = MetricsLog(self._folder.outcomes, last_iteration=iteration)
         for seed in self._best:
             for done, path in self._folder.kept_best(seed).items():
                 if done > iteration:
@@ -84,10 +79,7 @@ class Tracker:
 
     def evaluate(self, seed: int, policy: Policy) -> dict[str, float]:
         """Plays with the policy of one seed and returns the columns of its row."""
-        if self._log is None:
-            raise ValueError("call resume before evaluate")
         played = self._evaluator(policy.params)
-        self._log.append([{"seed": seed, "iteration": policy.iteration, **_columns(played)}])
         shares = {name: float(np.mean(outcome.solved)) for name, outcome in played.items()}
         overall = float(np.mean([shares[name] for name in self._ranked]))
         if overall > self._best[seed]:
@@ -96,27 +88,9 @@ class Tracker:
         return {**{PREFIX + name: share for name, share in shares.items()}, OVERALL: overall}
 
 
-def outcome(row: Row) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """What a row of `outcomes.csv` says of each set: solved bool[B] and steps i32[B]."""
-    steps: dict[str, list[Any]] = {}
-    for column in sorted(name for name in row if SEPARATOR in name):
-        steps.setdefault(column.split(SEPARATOR)[0], []).append(row[column])
-    counts = {name: np.array(values, np.int32) for name, values in steps.items()}
-    return {name: (values > 0, values) for name, values in counts.items()}
-
-
 def steps_taken(played: Mapping[str, Evaluation]) -> dict[str, np.ndarray]:
     """By set, the steps i32[B] taken in every task, 0 where it is not solved."""
     return {
         name: np.where(outcome.solved, outcome.length, 0).astype(np.int32)
         for name, outcome in played.items()
-    }
-
-
-def _columns(played: Mapping[str, Evaluation]) -> dict[str, int]:
-    """A column for each task, in the order of their names."""
-    return {
-        f"{name}{SEPARATOR}{index:05d}": int(count)
-        for name, steps in sorted(steps_taken(played).items())
-        for index, count in enumerate(steps)
     }

@@ -1,6 +1,7 @@
 """The Gymnasium adapter under Gymnasium's own tools."""
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -170,6 +171,10 @@ def test_several_seeds():
     np.testing.assert_array_equal(pair[1], envs.reset(seed=9)[0][0])
     with pytest.raises(ValueError, match="one or 2 integers, got 3"):
         envs.reset(seed=[1, 2, 3])
+    with pytest.raises(ValueError, match="seed must be an integer >= 0, got -1"):
+        envs.reset(seed=[1, -1])
+    seed: Any = np.int64(9)
+    np.testing.assert_array_equal(envs.reset(seed=seed)[0][0], pair[1])
 
 
 def test_pictures(easy_env):
@@ -206,6 +211,7 @@ def test_own_task_sets_can_be_registered():
         ({"task_set": "nonesuch"}, "unknown task set 'nonesuch'; allowed"),
         ({"render_mode": "human"}, "one of rgb_array, ansi, got 'human'"),
         ({"num_envs": 0}, "num_envs must be an integer >= 1, got 0"),
+        ({"cell_size": 0}, "cell_size must be an integer >= 1, got 0"),
         ({"autoreset_mode": "Disabled"}, "one of NextStep, SameStep, got 'Disabled'"),
         ({"task_set": tt.Environment(), "max_steps": 9}, "do not apply"),
     ],

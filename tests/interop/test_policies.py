@@ -34,7 +34,7 @@ def expected(tmp_path_factory):
         for name, cell in zip(NAMES, FOOD_BESIDE, strict=True):
             base = tt.base_state(1).replace(food=jnp.array(cell, jnp.int32))
             tt.register(name, (), base=base, max_steps=STEPS)
-        arguments = [str(folder / "mine.npz"), "--sets", *NAMES, "--no-cache"]
+        arguments = [str(folder / "mine.npz"), "--sets", *NAMES]
         evaluate.main([*arguments, "--json", str(folder / "table.json")])
         (table,) = json.loads((folder / "table.json").read_text())
         found = [score["percent"] for score in table["sets"]]

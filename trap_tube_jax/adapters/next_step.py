@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from trap_tube_jax.vector import VectorEnvironment, VectorState, draw_movable
-from trap_tube_jax.wrappers import AutoResetState, AutoResetTimeStep
+from trap_tube_jax.vector import VectorEnvironment, VectorState
+from trap_tube_jax.wrappers import AutoResetTimeStep, auto_reset_timestep
 
 
 class NextStepVectorEnvironment(VectorEnvironment):
@@ -16,15 +16,11 @@ class NextStepVectorEnvironment(VectorEnvironment):
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes one action i32[B, 2] in each, or starts it over if its episode has ended."""
         was_done = state.episodes.inner.terminated | state.episodes.inner.truncated
-        inner, timestep = jax.vmap(self.env.step)(state.episodes.inner, actions)
-        final_picture = jax.vmap(draw_movable)(inner, state.background)
-        stepped = VectorState(AutoResetState(inner, state.episodes.key), state.background)
+        stepped, timestep, final_picture = self._advance(state, actions)
         state, picture = self._start_over(was_done, stepped, final_picture)
-        return state, AutoResetTimeStep(
-            observation=picture.reshape(timestep.observation.shape),
-            reward=timestep.reward,
+        timestep = timestep.replace(
             terminated=timestep.terminated & ~was_done,
             truncated=timestep.truncated & ~was_done,
             discount=jnp.where(was_done, 1.0, timestep.discount),
-            final_observation=final_picture.reshape(timestep.observation.shape),
         )
+        return state, auto_reset_timestep(timestep, picture, final_picture)

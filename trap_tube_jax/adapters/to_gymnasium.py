@@ -1,6 +1,6 @@
 """The task sets as Gymnasium environments, one at a time or as one compiled batch.
 
-Importing `trap_tube_jax` registers them, where Gymnasium is installed:
+Importing `trap_tube_jax` registers them, where Gymnasium >= 1.1 is installed:
 
     gymnasium.make("trap_tube_jax/PerceptualTrapTube-v0")
     gymnasium.make_vec("trap_tube_jax/PerceptualTrapTube-v0", num_envs=1024)
@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import render_ascii
@@ -78,7 +79,7 @@ class TrapTubeEnv(gymnasium.Env):
         self.env = _environment(task_set, num_features, max_steps)
         self.flat_actions = flat_actions
         self.render_mode = _check_render_mode(render_mode)
-        self.cell_size = cell_size
+        self.cell_size = check_integer("cell_size", cell_size)
         self.observation_space = _observation_space(self.env)
         self.action_space = _action_space(flat_actions)
         self._programs = _single_programs(self.env)
@@ -173,15 +174,13 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
           ValueError: naming the value and what is allowed.
         """
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise ValueError(f"num_envs must be an integer >= 1, got {num_envs!r}")
+        self.num_envs = num_envs = check_integer("num_envs", num_envs)
         self.env = _environment(task_set, num_features, max_steps)
-        self.num_envs = num_envs
         self.autoreset_mode = _check_autoreset_mode(autoreset_mode)
         self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
         self.flat_actions = flat_actions
         self.render_mode = _check_render_mode(render_mode)
-        self.cell_size = cell_size
+        self.cell_size = check_integer("cell_size", cell_size)
         self.single_observation_space = _observation_space(self.env)
         self.single_action_space = _action_space(flat_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -203,7 +202,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
           options: ignored.
 
         Raises:
-          ValueError: there are not as many seeds as environments.
+          ValueError: there are not as many seeds as environments, or one is no integer >= 0.
         """
         if seed is not None or self._state is None:
             keys = _keys(self._seeds(seed))
@@ -252,12 +251,13 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
     def _seeds(self, seed: int | Sequence[int] | None) -> list[int]:
         """One seed per environment."""
         if seed is None or isinstance(seed, int | np.integer):
-            super().reset(seed=seed)
+            super().reset(seed=None if seed is None else int(seed))
             return [self.np_random_seed + index for index in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(f"seed must be one or {self.num_envs} integers, got {len(seed)}")
-        super().reset(seed=seed[0])
-        return list(seed)
+        seeds = [check_integer("seed", each, minimum=0) for each in seed]
+        super().reset(seed=seeds[0])
+        return seeds
 
     def _started(self) -> VectorState:
         if self._state is None:

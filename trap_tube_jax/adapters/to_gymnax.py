@@ -176,7 +176,8 @@ class FiveValueTrapTube(_TrapTube):
     """The environment of gymnax 0.x: (observation, state, reward, done, info).
 
     `done` is true for either end of an episode, and the state then returned starts the
-    next. `info` holds scalars: discount, terminated, truncated.
+    next. `info` holds scalars: discount, terminated, truncated; on request also
+    final_observation, u8[12, 12, N].
     """
 
     def __init__(
@@ -187,8 +188,16 @@ class FiveValueTrapTube(_TrapTube):
         num_features: int | None = None,
         final_observation: bool = False,
     ):
-        """See `SixValueTrapTube`; `final_observation` adds the observation before any
-        reset to `info`.
+        """Checks its arguments.
+
+        Args:
+          task_set: a registered id or short name, or an `Environment` of your own.
+          flat_actions: takes 4 * grasp + move in place of (grasp, move).
+          num_features: N, the feature channels of the observation.
+          final_observation: adds the observation before any reset to `info`.
+
+        Raises:
+          ValueError: naming the value and what is allowed.
         """
         super().__init__(task_set, flat_actions=flat_actions, num_features=num_features)
         self.final_observation = final_observation

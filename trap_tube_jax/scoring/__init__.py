@@ -1,1 +1,1 @@
-"""The benchmark's protocol: fixed tasks, scores, and play that comes to them."""
+"""The benchmark's protocol: fixed tasks, scores, and the evaluation of policies."""

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax._version import __version__
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
@@ -24,8 +25,8 @@ from trap_tube_jax.scoring.tasks import (
     PROTOCOL,
     evaluation_tasks,
     layout_numbers,
-    shortest_lengths,
 )
+from trap_tube_jax.solver.search import solve_batch, take
 from trap_tube_jax.state import State
 
 BLOCK = 1024  # tasks played at once: bounds the memory, whatever their number
@@ -78,7 +79,7 @@ def score(
       num_features: N, feature channels of the observation; see `make`.
 
     Raises:
-      ValueError: naming the argument and what is allowed, or an action is none.
+      ValueError: naming the argument and what is allowed, or an invalid action.
     """
     for name in ("initial", "act"):
         if not callable(getattr(policy, name, None)):
@@ -94,15 +95,15 @@ def score(
         total = len(states.time)
         block = min(BLOCK, total)
         played = [
-            program(env, _rows(states, np.arange(start, start + block) % total), block_key)
+            program(env, take(states, np.arange(start, start + block) % total), block_key)
             for start in range(0, total, block)
             for block_key in [jax.random.fold_in(key, start)]
         ]
         solved, length, is_valid = zip(*played, strict=True)
         if not np.all(is_valid):
             raise ValueError(
-                f"the policy's act returned an action that is none; allowed: (grasp, move), each "
-                f"in 0 to {NUM_DIRECTIONS - 1}"
+                f"the policy's act returned an invalid action; allowed: (grasp, move), each in "
+                f"0 to {NUM_DIRECTIONS - 1}"
             )
         return np.concatenate(solved)[:total], np.concatenate(length)[:total]
 
@@ -131,7 +132,7 @@ def score_gymnasium(
       num_features: as for `score`.
 
     Raises:
-      ValueError: naming the argument and what is allowed, or an action is none.
+      ValueError: naming the argument and what is allowed, or an invalid action.
     """
     act = getattr(agent, "predict", None) or getattr(agent, "act", None)
     if not callable(act):
@@ -143,7 +144,7 @@ def score_gymnasium(
     def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
         step = _compiled_step(entry.max_steps)
         states = jax.device_get(states)
-        ends = [_play_one(agent, act, step, _rows(states, i)) for i in range(len(states.time))]
+        ends = [_play_one(agent, act, step, take(states, i)) for i in range(len(states.time))]
         solved, length = zip(*ends, strict=True)
         return np.array(solved), np.array(length, np.int32)
 
@@ -158,11 +159,10 @@ def _scores(
     optimality: int,
     num_features: int | None,
 ) -> Scores:
-    """The scores of the sets, as far as `optimality` tasks compared with shortest plans."""
+    """The score of every set; its first `optimality` tasks are compared with shortest plans."""
     if isinstance(sets, str) or not sets:
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
-    if optimality < 0:
-        raise ValueError(f"optimality must be a number of tasks >= 0, got {optimality}")
+    check_integer("optimality", optimality, minimum=0)
     made = []
     for entry in [task_set(name) for name in sets]:
         states = evaluation_tasks(entry.short, tasks, num_features)
@@ -170,7 +170,7 @@ def _scores(
         found = None
         if optimality:
             part = slice(optimality)
-            shortest = shortest_lengths(_rows(states, part))
+            shortest = solve_batch(take(states, part)).length
             found = Optimality.of(solved[part], length[part], shortest, entry.max_steps)
         layout = layout_numbers(entry.short, states)
         made.append(
@@ -252,7 +252,3 @@ def _dynamics(max_steps: int) -> Environment:
 @functools.cache
 def _compiled_step(max_steps: int) -> Callable[..., Any]:
     return jax.jit(_dynamics(max_steps).step)
-
-
-def _rows(tree: Any, index: Any) -> Any:
-    return jax.tree.map(lambda x: x[index], tree)

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
-from trap_tube_jax.solver import solve_batch
 from trap_tube_jax.state import State
 from trap_tube_jax.transfers import Transfer, compose
 
@@ -25,12 +25,11 @@ Purpose = Literal["test", "validation"]
 # The version of the fixed tasks: what is scored under different ones does not compare.
 PROTOCOL = 1
 ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
-FEW_LAYOUTS = 5  # of a set, whatever their colours: so many are few, more are not
-# How many layouts a set of the paper has, where these are few.
-NUM_LAYOUTS = {"base": 1, "st": 1, "sy": 5, "stsy": 5}
+FEW_LAYOUTS = 5  # the most layouts, colours aside, of a set that counts as having few
+SETS_OF_FEW = ("base", "st", "sy", "stsy")  # of the paper's
 
-# "trap" and "tube", or "trap" and "vali". The first word of every `jax.random.key(seed)` is
-# 0, so no seed of training leads here.
+# "trap" and "tube", or "trap" and "vali". The first word of `jax.random.key(seed)` is 0 for every
+# seed from 0 to 2**32 - 1, so no seed of training leads here.
 _ROOTS: dict[Purpose, np.ndarray] = {
     "test": np.array([0x74726170, 0x74756265], np.uint32),
     "validation": np.array([0x74726170, 0x76616C69], np.uint32),
@@ -65,8 +64,7 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     Raises:
       ValueError: `num_tasks` is below 1.
     """
-    if num_tasks < 1:
-        raise ValueError(f"the number of evaluation tasks must be >= 1, got {num_tasks}")
+    check_integer("the number of evaluation tasks", num_tasks)
     count = num_tasks if env.transfers else 1
     # Transfers are compiled one by one: the sets share them, so eight sets take three
     # compilations, and a transfer has the same bits in each.
@@ -92,30 +90,25 @@ def _keys(root: jax.Array, number: jax.typing.ArrayLike, num_tasks: int) -> jax.
 def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
     """The layout i32[B] of each task, counted from 0; None unless the set has few.
 
-    A layout is a state without its colours. Sets other than the paper's have few if these tasks
-    hold at most `FEW_LAYOUTS` different ones, and some of them twice or one task only.
+    A layout is a state without its colours. A set other than the paper's has few if these tasks
+    hold at most `FEW_LAYOUTS` layouts, and one of them occurs twice or there is only one task.
 
     Args:
       name: the set's short name.
       tasks: B states at time 0.
     """
-    if name in ALL_SETS and name not in NUM_LAYOUTS:
+    if name in ALL_SETS and name not in SETS_OF_FEW:
         return None
     parts = (tasks.board, tasks.agent, tasks.tool, tasks.tool_extent, tasks.food)
     rows = np.concatenate([np.asarray(part).reshape(len(part), -1) for part in parts], axis=1)
     found, layout = np.unique(rows, axis=0, return_inverse=True)
     few = len(found) <= FEW_LAYOUTS and len(found) < max(len(rows), 2)
-    return layout.reshape(-1).astype(np.int32) if few or name in NUM_LAYOUTS else None
-
-
-def shortest_lengths(tasks: State) -> np.ndarray:
-    """i32[B]: the lengths of the shortest plans, -1 where unsolvable."""
-    return np.asarray(solve_batch(tasks).length)
+    return layout.reshape(-1).astype(np.int32) if few or name in SETS_OF_FEW else None
 
 
 def label(name: str) -> str:
     """A registered set's name in the paper's notation; any other name as it is."""
-    known = {task_set(id).short: task_set(id).label for id in registered_ids()}
+    known = {entry.short: entry.label for entry in map(task_set, registered_ids())}
     return known.get(name, name)
 
 

@@ -203,7 +203,7 @@ def _plan_json(options: Options, name: str, plan: Plan) -> str:
         "length": int(plan.length),
         "actions": plan.actions.tolist(),
     }
-    return json.dumps(report)
+    return json.dumps(report, indent=2)
 
 
 if __name__ == "__main__":

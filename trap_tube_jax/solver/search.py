@@ -6,7 +6,7 @@ Source: environment.md, "One step".
 """
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +16,12 @@ from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.environment import action_from_index
-from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
+from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.positions import NUM_POSITIONS, cells_at, position_id
 from trap_tube_jax.state import State, validate
 
-Record = TypeVar("Record", bound=struct.PyTreeNode)
+Record = TypeVar("Record")
 
-NO_DIRECTION = -1
 # Frontiers are padded to one of few sizes, since each size is compiled once.
 CHUNK_SIZES = (256, 1024, 4096)
 
@@ -35,8 +34,9 @@ class Plan(struct.PyTreeNode):
 
     Attributes:
       actions: i32[L, 2], the (grasp, move) of every step. In a batch i32[B, L, 2], L
-        being the longest length. Shorter plans end in (-1, -1). Under jit that changes
-        nothing; outside jit `Environment.step` raises ValueError for it.
+        being the longest length. Shorter plans end in (-1, -1), which moves nothing, though
+        in an unsolved task it counts as a step. `Environment.step` raises ValueError for it
+        where its numbers are concrete.
       length: i32[] or i32[B], the number of steps, which may exceed a step limit; -1 if
         unsolvable.
       solvable: bool[] or bool[B], whether any sequence of actions leads to the goal.
@@ -125,8 +125,8 @@ def checked(state: State) -> State:
     return validate(_to_host(state))
 
 
-def take(batch: Record, index: int | slice) -> Record:
-    """One record, or a part, of a batch of states or plans."""
+def take(batch: Record, index: Any) -> Record:
+    """A tree of arrays at an index of their first axis: an integer, a slice or integers."""
     return jax.tree.map(lambda field: field[index], batch)
 
 

@@ -16,7 +16,7 @@ from trap_tube_jax.solver.search import solve_batch, take
 from trap_tube_jax.state import State
 
 QUANTILES = (5, 25, 50, 75, 95)
-TASKS_PER_CALL = 100  # how often progress is told
+TASKS_PER_CALL = 100  # between updates of the progress
 
 
 @dataclasses.dataclass(frozen=True)

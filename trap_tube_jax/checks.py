@@ -1,0 +1,18 @@
+"""Checks of arguments that several modules share."""
+
+from typing import Any
+
+import numpy as np
+
+
+def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None = None) -> int:
+    """Returns `value` as an int if it is an integer within the bounds, both included.
+
+    Raises:
+      ValueError: naming the argument, its value and the bounds. A bool is no integer.
+    """
+    is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_integer or value < minimum or (maximum is not None and value > maximum):
+        upper = "" if maximum is None else f" and <= {maximum}"
+        raise ValueError(f"{name} must be an integer >= {minimum}{upper}, got {value!r}")
+    return int(value)
