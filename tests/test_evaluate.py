@@ -204,6 +204,23 @@ def test_each_set_has_its_own_limit_where_the_settings_leave_it(grey_play, monke
         Evaluator(config, {"mine": tasks["one"]})
 
 
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_progress_is_a_table_on_a_terminal_and_lines_elsewhere(is_terminal):
+    """A table as wide as the terminal allows; a line with all metrics for each iteration."""
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=is_terminal, width=60)
+    with report.LiveReport(console, total_iterations=5, num_seeds=2) as live:
+        for iteration in (1, 2):
+            row = dict.fromkeys((name for _, name, _ in report.LIVE_COLUMNS), 0.5)
+            live.update([row | {"iteration": iteration, "episodes": 7000 + iteration}] * 2, 1)
+    text = file.getvalue()
+    assert "7,001" in text
+    assert "1/2 solved" in text
+    assert "left at most" in text
+    assert ("iteration 2 of 5" in text) == is_terminal
+    assert ("entropy" in text) != is_terminal
+
+
 def test_solved_episode_becomes_a_gif(grey_play, tmp_path):
     evaluator, _, played = grey_play
     path = tmp_path / "solved.gif"

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import brute_force
 import jax
@@ -12,10 +13,11 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
-from trap_tube_jax.objects import EXIT, MAX_STEPS, TOOL, TRAP, TUBE1, TUBE2
+from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
+from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver.__main__ import _distances_line, main
 from trap_tube_jax.solver.distance import count_reachable
-from trap_tube_jax.solver.search import take
+from trap_tube_jax.solver.search import checked, levels, take
 from trap_tube_jax.solver.survey import draw_tasks, survey
 from trap_tube_jax.transfers import swap_with_tool
 
@@ -148,6 +150,27 @@ def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
     assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(NUM_DRAWN)
     assert plans.length.max() <= MAX_STEPS
     assert_paid_exactly_at_the_end(states, plans)
+
+
+@pytest.mark.slow
+def test_random_actions_solve_the_base_task_as_rarely_as_environment_md_says():
+    """The exact probability, over the graph of all states that can be reached."""
+    found = list(levels(checked(tt.base_state())))
+    nodes, successors, solved = (
+        np.concatenate([getattr(level, name) for level in found])
+        for name in ("nodes", "successors", "solved")
+    )
+    place = np.zeros(NUM_POSITIONS, np.int32)
+    place[nodes] = np.arange(len(nodes))
+    following = place[successors][~solved]
+    probability, total = np.eye(1, len(nodes))[0], 0.0
+    for _ in range(MAX_STEPS):
+        share = np.broadcast_to(probability[:, None] / NUM_ACTIONS, successors.shape)
+        total += share[solved].sum()
+        probability = np.bincount(following, share[~solved], len(nodes))
+    np.testing.assert_allclose(total + probability.sum(), 1)
+    page = Path(__file__).parent.parent / "trap_tube_jax" / "environment.md"
+    assert f"in {1e6 * total:.2f} of 1,000,000 episodes" in page.read_text()
 
 
 def test_no_plan_is_beaten_by_brute_force(rooms, room_plans):

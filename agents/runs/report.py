@@ -18,8 +18,7 @@ from agents.acting.evaluation import Evaluation, Evaluator
 from agents.acting.policy import Policy
 from agents.runs.metrics import FirstSolved, Row
 from agents.runs.table import NOTHING, STYLE, Table, number
-from trap_tube_jax.gallery import episode_frames
-from trap_tube_jax.rendering import save_gif
+from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.scoring.scores import Score
 
 LIVE_ROWS = 10
