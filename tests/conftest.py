@@ -52,3 +52,11 @@ def _optimisation(request: pytest.FixtureRequest) -> None:
     is_of_agents = re.search(r"^(from|import) agents\b", Path(request.path).read_text(), re.M)
     optimised = getattr(request.module, "OPTIMISED", is_of_agents is None)
     set_for_all_processes("jax_disable_most_optimizations", not optimised)
+
+
+@pytest.fixture
+def own_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Task sets that a test registers are gone after it."""
+    from trap_tube_jax import registry  # noqa: PLC0415  after the settings above
+
+    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))

@@ -12,3 +12,13 @@ def assert_refused(words: list[str], function: Any, *args: Any, **kwargs: Any) -
         function(*args, **kwargs)
     message = str(error.value)
     assert all(word in message for word in words), message
+
+
+def refused(capsys: pytest.CaptureFixture[str], command: Any, *arguments: Any) -> str:
+    """What a command line says that it refuses, without the frames that it draws."""
+    with pytest.raises(SystemExit) as exit_info:
+        command([str(argument) for argument in arguments])
+    assert exit_info.value.code == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err
+    return " ".join(re.sub("[│╭╰─╮╯]", " ", captured.err + captured.out).split())

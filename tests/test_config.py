@@ -10,7 +10,6 @@ import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.config import PRESETS
 from agents.runs.folder import Run
-from trap_tube_jax import registry
 
 
 def test_paper_preset_is_the_specification():
@@ -96,8 +95,7 @@ def test_unknown_preset_lists_the_known():
         Config.preset("quick")
 
 
-def test_the_sets_own_limit_holds_unless_the_settings_give_one(monkeypatch):
-    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+def test_the_sets_own_limit_holds_unless_the_settings_give_one(own_task_sets):
     tt.register("Short-v0", (), max_steps=30)
     config = Config(env_id="Short-v0")
     assert make_train(config).env.max_steps == config.step_limit("Short-v0") == 30

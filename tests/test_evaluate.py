@@ -23,7 +23,6 @@ from agents.config import Config
 from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
 from agents.runs import report, report_page
-from trap_tube_jax import registry
 from trap_tube_jax.dynamics import step
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.registry import PAPER_TASK_SETS
@@ -181,10 +180,9 @@ def test_blocks_change_nothing(grey_play, monkeypatch):
     assert_equal(blocks(params), played)
 
 
-def test_each_set_has_its_own_limit_where_the_settings_leave_it(grey_play, monkeypatch):
+def test_each_set_has_its_own_limit_where_the_settings_leave_it(grey_play, own_task_sets):
     """With a limit of 6 for both, and with 1 and 6: what took longer than 1 is not solved."""
     evaluator, params, played = grey_play
-    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
     for name, limit in (("one", 1), ("six", 6)):
         tt.register(name, (), base=tt.base_state(1), max_steps=limit)
     tasks: dict[str, tt.State] = dict.fromkeys(("one", "six"), evaluator.tasks["mine"])

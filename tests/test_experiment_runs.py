@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusal import refused
 from rich.console import Console
-from test_experiments import refused
 from test_train import TIMING_COLUMNS
 
 import trap_tube_jax as tt
@@ -301,9 +301,9 @@ def test_seeds_side_by_side_are_those_one_after_another(whole, tmp_path):
 
 def test_a_folder_holds_one_experiment(capsys, whole):
     where = ["--out", whole.parent, "--name", "x"]
-    assert "holds another experiment than exp2" in refused(capsys, "exp2", *where)
+    assert "holds another experiment than exp2" in refused(capsys, experiments.main, "exp2", *where)
     assert "x has tasks=4, not 5; use another --name" in refused(
-        capsys, "exp1", *where, "--tasks", 5
+        capsys, experiments.main, "exp1", *where, "--tasks", 5
     )
 
 

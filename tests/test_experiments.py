@@ -2,10 +2,10 @@
 
 import dataclasses
 import json
-import re
 import shlex
 
 import pytest
+from refusal import refused
 
 from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
@@ -15,14 +15,6 @@ from agents.experiments.tables import algorithm_label
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.metrics import MetricsLog
 from trap_tube_jax.scoring.tasks import ALL_SETS
-
-
-def refused(capsys, *arguments):
-    with pytest.raises(SystemExit) as exit_info:
-        experiments.main([*map(str, arguments)])
-    assert exit_info.value.code == 2
-    captured = capsys.readouterr()
-    return " ".join(re.sub("[│╭╰─╮╯]", " ", captured.err + captured.out).split())
 
 
 @pytest.mark.parametrize(
@@ -51,20 +43,22 @@ def refused(capsys, *arguments):
     ],
 )
 def test_impossible_experiments_are_refused(capsys, tmp_path, arguments, message):
-    assert message in refused(capsys, "exp1", *arguments.split(), "--out", tmp_path)
+    assert message in refused(
+        capsys, experiments.main, "exp1", *arguments.split(), "--out", tmp_path
+    )
     assert not list(tmp_path.iterdir())
 
 
 def test_a_dirty_tree_is_refused_before_training(capsys, tmp_path, monkeypatch):
     arguments = ["exp1", "--out", tmp_path, "--record", tmp_path / "x.json"]
     monkeypatch.setattr(records, "machine", lambda: {"commit": "abc-dirty"})
-    assert "this one of abc-dirty" in refused(capsys, *arguments)
+    assert "this one of abc-dirty" in refused(capsys, experiments.main, *arguments)
     assert not list(tmp_path.iterdir())
     monkeypatch.setattr(records, "machine", lambda: {"commit": "abc"})
     folder = RunFolder.create(tmp_path / "exp1-paper" / "ppo-seed0", Run(Config()))
     write_json(folder.machines, [{"commit": "def-dirty"}])
     MetricsLog(folder.metrics).append([{"seed": 0, "iteration": 1}])
-    assert "this one of def-dirty" in refused(capsys, *arguments)
+    assert "this one of def-dirty" in refused(capsys, experiments.main, *arguments)
     assert not (tmp_path / "exp1-paper" / "experiment.json").exists()
 
 

@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import TINY, final_state, refused, run, untimed
+from refusal import refused
+from test_train import TINY, final_state, run, untimed
 
 import agents
 import trap_tube_jax as tt
 from agents import Config, evaluate, make_train, pretrained, registry
 from agents.runs.folder import Run, RunFolder
-from agents.train import parse, select
-from trap_tube_jax import registry as task_registry
+from agents.train import main, parse, select
 from trap_tube_jax.imports import import_modules
 
 PAGE = (Path(__file__).parent.parent / "agents" / "extending.md").read_text()
@@ -34,11 +34,10 @@ def blocks(language):
 
 
 @pytest.fixture
-def own_tables(monkeypatch):
+def own_tables(monkeypatch, own_task_sets):
     """What a test registers or imports is gone after it."""
     for table in (registry.curiosities, registry.encoders):
         monkeypatch.setattr(table, "_factories", dict(table._factories))
-    monkeypatch.setattr(task_registry, "_task_sets", dict(task_registry._task_sets))
     monkeypatch.setattr(sys, "path", list(sys.path))
     yield
     sys.modules.pop("my_module", None)
@@ -122,8 +121,8 @@ def test_missing_modules_are_named(tmp_path, monkeypatch, capsys, own_tables):
     folder.config.write_text(json.dumps(values))
     reason = f"cannot import 'absent_module': there is no module 'absent_module' in {tmp_path}"
     for arguments in (["--resume", "--name", "x"], ["--import", "absent_module"]):
-        assert reason in refused(capsys, *arguments)
-    assert reason in refused(capsys, "runs/x", command=evaluate.main)
+        assert reason in refused(capsys, main, *arguments)
+    assert reason in refused(capsys, evaluate.main, "runs/x")
     with pytest.raises(ValueError, match=r"x/config\.json is not the settings of a run: cannot"):
         agents.load(tmp_path / "runs" / "x")
     (tmp_path / "needs_more.py").write_text("import absent_module")
@@ -138,14 +137,14 @@ def test_missing_modules_are_named(tmp_path, monkeypatch, capsys, own_tables):
 def test_another_module_is_another_run(here, capsys, own_tables):
     (here / "other.py").write_text("")
     RunFolder.create(here / "runs" / "x", Run(Config(imports=("my_module",))))
-    message = refused(capsys, "--resume", "--name", "x", "--import", "other")
+    message = refused(capsys, main, "--resume", "--name", "x", "--import", "other")
     assert "the run has imports=('my_module',), not ('other',)" in message
 
 
 def test_unknown_encoders_are_refused(capsys):
     with pytest.raises(ValueError, match="unknown encoder 'flat'; allowed: paper, objects"):
         Config(encoder="flat")
-    assert "unknown encoder 'flat'" in refused(capsys, "--encoder", "flat")
+    assert "unknown encoder 'flat'" in refused(capsys, main, "--encoder", "flat")
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from agents.acting.evaluation import Evaluator
 from agents.networks.agent import Agent
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.folder import Run, RunFolder
-from trap_tube_jax import registry
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 STEPS = 12
@@ -102,9 +101,8 @@ def test_a_loaded_policy_reaches_the_evaluators_outcomes(run_path, seed):
         np.testing.assert_array_equal(actions[index, :count], played.action[index, :count])
 
 
-def test_driving_scoring_and_evaluating_come_to_the_same(run_path, tmp_path, monkeypatch):
+def test_driving_scoring_and_evaluating_come_to_the_same(run_path, tmp_path, own_task_sets):
     """On the fixed tasks of a registered set."""
-    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
 
     def food_beside(key, state):
         cells = jnp.array(FOOD_BESIDE, jnp.int32)

@@ -1,12 +1,12 @@
 """Parameters as files: written, shipped, evaluated, and what is refused."""
 
 import json
-import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusal import refused
 
 import trap_tube_jax as tt
 from agents import evaluate, pretrained
@@ -115,14 +115,6 @@ def test_every_shipped_file_can_be_loaded():
         assert tt.task_set(policy.config.env_id).short == env
         total += len((pretrained._folder() / f"{name}.npz").read_bytes())
     assert total < 4_000_000
-
-
-def refused(capsys, command, *arguments):
-    with pytest.raises(SystemExit) as exit_info:
-        command([str(argument) for argument in arguments])
-    assert exit_info.value.code == 2
-    captured = capsys.readouterr()
-    return " ".join(re.sub("[│╭╰─╮╯]", " ", captured.err + captured.out).split())
 
 
 def test_impossible_exports_are_refused(run_path, tmp_path, capsys):

@@ -9,7 +9,6 @@ import pytest
 import trap_tube_jax as tt
 from agents.experiments import statistics
 from agents.experiments.records import read_record
-from trap_tube_jax import registry
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -34,8 +33,7 @@ def test_blocks_share_a_session(capsys):
     assert (output[1], output[-1]) == ("11", "21 1.0")
 
 
-def test_own_tasks(monkeypatch):
-    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+def test_own_tasks(own_task_sets):
     session: dict[str, object] = {}
     for block in blocks_of(ROOT / "trap_tube_jax" / "own_tasks.md"):
         exec(compile(block, "own_tasks.md", "exec"), session)
@@ -71,6 +69,5 @@ def test_the_leaderboard_is_of_the_records(agent, name):
 
 @pytest.mark.interop
 @pytest.mark.parametrize("block", OTHER_LIBRARIES)
-def test_blocks_of_other_libraries(block, monkeypatch):
-    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+def test_blocks_of_other_libraries(block, own_task_sets):
     exec(compile(block, "adapters", "exec"), {})

@@ -5,7 +5,6 @@ import pytest
 from refusal import assert_refused
 
 import trap_tube_jax as tt
-from trap_tube_jax import registry
 
 # environment.md, "Task sets".
 SPECIFIED = [
@@ -23,12 +22,6 @@ SPECIFIED = [
         (tt.perceptual, tt.structural, tt.symbolic),
     ),
 ]
-
-
-@pytest.fixture
-def own_registry(monkeypatch):
-    """What a test registers is gone after it."""
-    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
 
 
 def test_the_papers_sets_are_those_of_the_page():
@@ -54,7 +47,7 @@ def test_make_passes_its_options_on():
     assert tt.make("p", base=base, num_features=5).num_features == 5
 
 
-def test_register_adds_a_set(own_registry):
+def test_register_adds_a_set(own_task_sets):
     def to_the_top(key, state):
         del key
         return state.replace(agent=state.agent.at[0].set(0))
@@ -66,12 +59,12 @@ def test_register_adds_a_set(own_registry):
     assert tt.make("Top-v0").transfers == (tt.structural, to_the_top)
 
 
-def test_register_takes_transfers_of_any_iterable(own_registry):
+def test_register_takes_transfers_of_any_iterable(own_task_sets):
     entry = tt.register("Once-v0", (each for each in (tt.structural, tt.symbolic)))
     assert entry.transfers == tt.make("Once-v0").transfers == (tt.structural, tt.symbolic)
 
 
-def test_register_holds_base_state_and_step_limit(own_registry):
+def test_register_holds_base_state_and_step_limit(own_task_sets):
     base = tt.base_state(5).replace(agent=np.array((0, 0), np.int32))
     entry = tt.register("Own-v0", (), short="own", base=base, max_steps=20)
     assert (entry.base, entry.max_steps, entry.label) == (base, 20, "own")
@@ -84,11 +77,11 @@ def test_register_holds_base_state_and_step_limit(own_registry):
 
 
 @pytest.mark.parametrize("options", [{"base": tt.base_state()}, {"max_steps": 20}])
-def test_other_tasks_than_the_papers_have_no_label_of_the_papers(own_registry, options):
+def test_other_tasks_than_the_papers_have_no_label_of_the_papers(own_task_sets, options):
     assert tt.register("Own-v0", (tt.structural,), short="own", **options).label == "own"
 
 
-def test_register_takes_the_id_for_a_missing_short_name(own_registry):
+def test_register_takes_the_id_for_a_missing_short_name(own_task_sets):
     assert tt.register("Plain-v0", ()).short == "Plain-v0"
 
 
@@ -131,7 +124,7 @@ def test_make_refuses(options, words):
         ("Mine-v0", ("symbolic",), None, ["(key, state) -> state", "'symbolic'", "perceptual"]),
     ],
 )
-def test_register_refuses_a_name_or_transfer(own_registry, name, transfers, short, words):
+def test_register_refuses_a_name_or_transfer(own_task_sets, name, transfers, short, words):
     assert_refused(words, tt.register, name, transfers, short=short)
     assert "Mine-v0" not in tt.registered_ids()
 
@@ -146,6 +139,6 @@ def test_register_refuses_a_name_or_transfer(own_registry, name, transfers, shor
     ],
     ids=["base a name", "base solved", "no step", "no limit"],
 )
-def test_register_refuses_a_base_or_limit(own_registry, options, words):
+def test_register_refuses_a_base_or_limit(own_task_sets, options, words):
     assert_refused(words, tt.register, "Mine-v0", (), **options)
     assert "Mine-v0" not in tt.registered_ids()

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from refusal import refused
 
 from agents.acting.rollout import greedy_action
 from agents.config import Config
@@ -146,13 +147,6 @@ def test_a_killed_process_ends_the_other(joint):
     assert checkpoint(joint) >= before + 1
 
 
-def refused(capsys, arguments):
-    with pytest.raises(SystemExit) as exit_info:
-        main(arguments)
-    assert exit_info.value.code == 2
-    return " ".join(capsys.readouterr().err.replace("│", " ").split())
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -166,7 +160,7 @@ def refused(capsys, arguments):
     ],
 )
 def test_impossible_devices_are_refused(capsys, tmp_path, arguments, message):
-    assert message in refused(capsys, [*arguments.split(), "--out", str(tmp_path)])
+    assert message in refused(capsys, main, *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.iterdir())
 
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusal import refused
 from rich.console import Console
 
 from agents import evaluate, train
@@ -157,16 +158,6 @@ def test_evaluate_command_line(whole, tmp_path):
     assert str(tmp_path / "x.json") in output
 
 
-def refused(capsys, *arguments, command=main):
-    """What a command line says that it refuses."""
-    with pytest.raises(SystemExit) as exit_info:
-        command([str(argument) for argument in arguments])
-    assert exit_info.value.code == 2
-    captured = capsys.readouterr()
-    assert "Traceback" not in captured.err
-    return " ".join(re.sub("[│╭╰─╮╯]", " ", captured.err + captured.out).split())
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -188,17 +179,19 @@ def refused(capsys, *arguments, command=main):
     ],
 )
 def test_impossible_settings_are_refused(capsys, tmp_path, arguments, message):
-    assert message in refused(capsys, *arguments.split(), "--out", tmp_path)
+    assert message in refused(capsys, main, *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_run_is_not_overwritten(capsys, whole):
     folder, _ = whole
     out = ["--out", folder.parent, "--name", "whole"]
-    assert "give --resume to continue the run in it, or another --name" in refused(capsys, *out)
-    message = refused(capsys, *out, "--resume", "--hidden", 8)
+    assert "give --resume to continue the run in it, or another --name" in refused(
+        capsys, main, *out
+    )
+    message = refused(capsys, main, *out, "--resume", "--hidden", 8)
     assert "the run has hidden=4, not 8; only iterations, max_transitions and stop_when" in message
-    assert "the run has seed=0, not 1" in refused(capsys, *out, "--resume", "--seed", 1)
+    assert "the run has seed=0, not 1" in refused(capsys, main, *out, "--resume", "--seed", 1)
 
 
 def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
@@ -206,11 +199,11 @@ def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
     shutil.copytree(whole[0] / "checkpoints", tmp_path / "foreign" / "checkpoints")
     out = ["--resume", "--name", "foreign", "--out", tmp_path]
     settings = (tmp_path / "foreign" / "config.json").read_bytes()
-    assert "does not fit the run's settings" in refused(capsys, *out, "--iterations", 999)
+    assert "does not fit the run's settings" in refused(capsys, main, *out, "--iterations", 999)
     assert (tmp_path / "foreign" / "config.json").read_bytes() == settings
-    message = refused(capsys, tmp_path / "foreign", command=evaluate.main)
+    message = refused(capsys, evaluate.main, tmp_path / "foreign")
     assert f"checkpoint {tmp_path}/foreign/checkpoints/{ITERATIONS} does not fit" in message
-    assert "holds no run" in refused(capsys, tmp_path / "none", command=evaluate.main)
+    assert "holds no run" in refused(capsys, evaluate.main, tmp_path / "none")
 
 
 def parsed(*arguments):
@@ -244,7 +237,7 @@ def test_resumed_runs_keep_their_settings(tmp_path):
 def test_resumed_runs_keep_their_task_set(capsys, tmp_path):
     RunFolder.create(tmp_path / "x", Run(Config()))
     arguments = ["--resume", "--name", "x", "--out", str(tmp_path)]
-    message = refused(capsys, *arguments, "--env", "sy")
+    message = refused(capsys, main, *arguments, "--env", "sy")
     assert "x is of TrapTube-v0, not of --env sy; leave that out, or begin a new run" in message
     assert parsed(*arguments, "--env", "base")[0] == Run(Config())
 
@@ -287,7 +280,7 @@ def test_a_run_with_a_cooldown_is_not_extended(capsys, tmp_path):
     """Its step size has been falling towards the last iteration that was known then."""
     RunFolder.create(tmp_path / "x", Run(Config(iterations=20, cooldown=0.5)))
     arguments = ["--resume", "--name", "x", "--out", tmp_path]
-    message = refused(capsys, *arguments, "--iterations", 30)
+    message = refused(capsys, main, *arguments, "--iterations", 30)
     assert "the run has cooldown=0.5 and iterations=20, not 30" in message
     assert json.loads((tmp_path / "x/config.json").read_text())["config"]["iterations"] == 20
     Run(Config(iterations=30)).check_continues(Run(Config(iterations=20)))

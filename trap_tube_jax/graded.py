@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.geometry import cell_of
-from trap_tube_jax.layouts import NUM_FRAMES, layout_tables, padded
+from trap_tube_jax.layouts import NUM_FRAMES, layout_tables, padded, padded_by_frame
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State, base_state
@@ -159,9 +159,7 @@ def near_layouts(strength: float) -> NearLayouts:
         )
     food, num_food = padded(foods)
     tool, num_tools = padded(tools)
-    agent, num_agents = zip(*(padded(rows, len(tool[0])) for rows in agents), strict=True)
-    longest = max(rows.shape[1] for rows in agent)
-    agent = np.stack([np.pad(rows, ((0, 0), (0, longest - rows.shape[1]))) for rows in agent])
+    agent, num_agents = padded_by_frame(agents, len(tool[0]))
     near = _is_near(_layout_distances(), strength)
     return NearLayouts(
         np.argwhere(near).astype(np.int32),
@@ -170,7 +168,7 @@ def near_layouts(strength: float) -> NearLayouts:
         tool,
         num_tools,
         agent,
-        np.stack(num_agents),
+        num_agents,
     )
 
 

@@ -69,16 +69,15 @@ def layout_tables() -> LayoutTables:
         for frame, corners in zip(frames, tools, strict=True)
     ]
     tool, num_tools = padded([np.flatnonzero(corners) for corners in tools])
-    agent, num_agents = zip(*(padded(rows, len(tool[0])) for rows in agents), strict=True)
-    longest = max(rows.shape[1] for rows in agent)
+    agent, num_agents = padded_by_frame(agents, len(tool[0]))
     return LayoutTables(
         board=np.stack([_boards(*frame[:4]) for frame in frames]),
         food=np.stack([_food_cells(*frame[:4]) for frame in frames]),
         extent=np.array([_extent(*frame) for frame in frames], np.int32),
         tool=tool,
         num_tools=num_tools,
-        agent=np.stack([np.pad(rows, ((0, 0), (0, longest - rows.shape[1]))) for rows in agent]),
-        num_agents=np.stack(num_agents),
+        agent=agent,
+        num_agents=num_agents,
     )
 
 
@@ -140,3 +139,11 @@ def padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndar
         table[index, : len(row)] = row
         lengths[index] = len(row)
     return table, lengths
+
+
+def padded_by_frame(frames: list[list[np.ndarray]], num_rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """As `padded`, for the rows of every frame: u8[F, num_rows, A] and u32[F, num_rows]."""
+    tables, lengths = zip(*(padded(rows, num_rows) for rows in frames), strict=True)
+    longest = max(table.shape[1] for table in tables)
+    wide = [np.pad(table, ((0, 0), (0, longest - table.shape[1]))) for table in tables]
+    return np.stack(wide), np.stack(lengths)

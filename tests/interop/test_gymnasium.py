@@ -198,7 +198,7 @@ def test_observations_are_the_callers_to_change(easy_env):
         assert following.any()
 
 
-def test_own_task_sets_can_be_registered():
+def test_own_task_sets_can_be_registered(own_task_sets):
     tt.register("GymnasiumTest-v0", (tt.perceptual,))
     register()
     env = gymnasium.make("trap_tube_jax/GymnasiumTest-v0")

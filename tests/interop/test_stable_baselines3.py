@@ -3,7 +3,6 @@
 import pytest
 
 import trap_tube_jax as tt
-from trap_tube_jax import registry
 
 stable_baselines3 = pytest.importorskip("stable_baselines3")
 evaluation = pytest.importorskip("stable_baselines3.common.evaluation")
@@ -15,7 +14,7 @@ from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv
 pytestmark = [pytest.mark.interop, pytest.mark.filterwarnings("default")]
 
 
-def test_ppo_learns_the_easy_task(easy_env, monkeypatch):
+def test_ppo_learns_the_easy_task(easy_env, own_task_sets):
     torch.set_num_threads(1)  # its threads and JAX's would wait for each other
     env = monitor.Monitor(TrapTubeEnv(easy_env))
     model = stable_baselines3.PPO(
@@ -26,6 +25,5 @@ def test_ppo_learns_the_easy_task(easy_env, monkeypatch):
     after, _ = evaluation.evaluate_policy(model, env, n_eval_episodes=20)
     assert before < 0.6
     assert after == 1.0
-    monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
     tt.register("Easy-v0", (), base=easy_env.base, max_steps=easy_env.max_steps)
     assert tt.score_gymnasium(model, ["Easy-v0"], 1)["Easy-v0"].solved == 1
