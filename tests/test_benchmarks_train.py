@@ -6,7 +6,7 @@ import pytest
 
 from agents import Config
 from agents.networks.agent import Agent
-from benchmarks import scaling, train_throughput
+from benchmarks import harness, scaling, scaling_model, train_throughput
 
 CONFIG = Config(
     max_steps=4, episodes=4, minibatch=2, epochs=2, filters=(2, 3), hidden=4, embedding=2, chunk=4
@@ -45,6 +45,12 @@ def test_an_iteration_is_split_into_its_parts():
     assert encoder.flop > play.flop > core.flop > 0
     assert optimiser.flop == 0
     assert all(part.env == "base" for part in parts)
+
+
+def test_what_every_device_repeats_is_run_and_timed(monkeypatch):
+    timing = harness.Timing(first_s=9.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
+    monkeypatch.setattr(harness, "measure", lambda function, repeats: (function(), timing)[1])
+    assert scaling_model.repeated_seconds(CONFIG, repeats=1) == 2.0
 
 
 def test_points_are_drawn(tmp_path):

@@ -53,6 +53,8 @@ def test_the_turned_trap_makes_the_other_way_longer():
 
 
 def test_no_control_is_a_set_of_the_paper():
+    paper = {entry.id for entry in tt.PAPER_TASK_SETS}
+    assert not paper & {entry.id for entry in tt.CONTROL_TASK_SETS}
     assert {entry.max_steps for entry in tt.CONTROL_TASK_SETS} == {50}
     entry = tt.CONTROL_TASK_SETS[0]
     assert (entry.id, entry.short, entry.label) == (

@@ -51,9 +51,9 @@ def evaluate(
       shards: how devices divide the tasks among themselves, evenly or not.
     """
     num_tasks = len(tasks.time)
-    # Where they do not divide evenly, the first ones are played twice.
-    place = np.arange(-(-num_tasks // shards.count) * shards.count) % num_tasks
     if shards.count > 1:
+        # Where they do not divide evenly, the first ones are played twice.
+        place = np.arange(-(-num_tasks // shards.count) * shards.count) % num_tasks
         tasks = take(tasks, shards.part(jnp.asarray(place)))
     frame, played = play_greedily(agent, params, env, tasks)
     episodes = played.episodes

@@ -19,11 +19,10 @@ from agents.ppo.learner import TrainState, make_train
 from agents.runs.compilation import compiled
 from agents.runs.report import FEW_LAYOUTS, evaluation_table
 from trap_tube_jax import solver
-from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES
+from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES, NO_DIRECTION
 from trap_tube_jax.rendering import episode_frames
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import label
-from trap_tube_jax.solver.search import NO_DIRECTION
 from trap_tube_jax.state import State
 
 CELL_SIZE = 16  # pixels
