@@ -34,8 +34,7 @@ class Options:
       iteration: the checkpoint to evaluate; the newest if absent.
       gif: write the first solved episode to this file.
       json: write the results to this file.
-      optimality: compare with shortest plans, which are searched for first (a second for
-        each task of a perceptual set).
+      optimality: compare with shortest plans, which are searched for first.
     """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
@@ -102,6 +101,7 @@ def evaluate(options: Options) -> None:
         console.print(f"results: {options.json}", soft_wrap=True)
     if options.gif is not None:
         prefer = tt.task_set(config.env_id).short
+        options.gif.parent.mkdir(parents=True, exist_ok=True)
         shown = report.save_first_solved(options.gif, evaluator, played.values(), prefer)
         message = f"solved episode of {shown}: {options.gif}" if shown else "no episode is solved"
         console.print(message, soft_wrap=True)

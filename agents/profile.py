@@ -11,12 +11,12 @@ import tyro
 from rich.console import Console
 
 from agents.acting.policy import Policy
-from agents.experiments.records import check_clean, read_record, write_record
+from agents.experiments.records import check_clean, read_record
 from agents.pretrained import load_shipped
 from agents.profiles import figures, tables
 from agents.profiles.measure import SCHEMA, Settings, profile
 from agents.runs import compilation
-from agents.runs.folder import RunFolder, read_json
+from agents.runs.folder import RunFolder, read_json, write_json
 from agents.runs.loading import load_policy
 from trap_tube_jax.command_line import Imports, plain_errors
 from trap_tube_jax.imports import import_modules
@@ -117,7 +117,7 @@ def run(options: Options, arguments: Sequence[str]) -> None:
     )
     for table in tables.tables(found):
         console.print(table.to_rich())
-    write_record(options.out / "profile.json", found)
+    write_json(options.out / "profile.json", found)
     text = f"# Profile\n\n{tables.markdown(found)}\n"
     (options.out / "tables.md").write_text(text, encoding="utf-8")
     for name, save in figures.drawings(found, "profile").items():
@@ -125,7 +125,7 @@ def run(options: Options, arguments: Sequence[str]) -> None:
     console.print(f"record, tables and figures: {options.out}", soft_wrap=True, highlight=False)
     if options.record is not None:
         check_clean(found, options.commit)
-        write_record(options.record, found)
+        write_json(options.record, found)
         console.print(f"record: {options.record}", soft_wrap=True, highlight=False)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from agents.experiments.records import write_record
+from agents.runs.folder import write_json as write_record
 from agents.runs.machine import machine
 
 

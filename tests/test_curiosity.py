@@ -83,7 +83,7 @@ def test_a_curiosity_without_parameters_encodes_and_may_pay_anything_after_the_e
     np.testing.assert_array_equal(reward, episodes.mask)
 
 
-@pytest.mark.parametrize("name", ["value_loss", "success"])
+@pytest.mark.parametrize("name", ["value_loss", "success", "greedy_mine"])
 def test_losses_called_like_metrics_are_refused(name):
     register("plain", lambda config, env: Plain(name))
     train = make_train(Config.from_dict({**TINY, "curiosity": "plain"}))

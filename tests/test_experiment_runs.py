@@ -290,13 +290,32 @@ def test_more_seeds_and_iterations_add_to_what_is_there(whole, tmp_path):
     assert (root / "ppo-seed0" / "metrics.csv").read_bytes().startswith(kept)
 
 
-def test_seeds_side_by_side_are_those_one_after_another(whole, tmp_path):
-    folder = run(tmp_path, "--side-by-side") / "ppo-seed0to1"
+def test_seeds_side_by_side_are_those_one_after_another(tmp_path, monkeypatch):
+    """Seed 0 solves its set between two evaluations, so it is evaluated then, and no other."""
+
+    def evaluate(agent, params, env, tasks, shards):
+        number = jnp.ravel(jax.tree.leaves(params)[0])[0]
+        nothing = jnp.zeros(len(tasks.time), jnp.int32)
+        is_solved = (number >= 3) & (number < 100)
+        return evaluation.Evaluation((nothing == 0) & is_solved, nothing, nothing, nothing)
+
+    monkeypatch.setattr(session, "evaluate", evaluate)
+    apart = run(tmp_path / "apart")
+    folder = run(tmp_path / "together", "--side-by-side") / "ppo-seed0to1"
     rows = untimed(folder / "metrics.csv")
     for seed in (0, 1):
-        alone = untimed(whole / f"ppo-seed{seed}" / "metrics.csv")
+        alone = untimed(apart / f"ppo-seed{seed}" / "metrics.csv")
         assert [row for row in rows if row["seed"] == str(seed)] == alone
+    evaluated = {(row["seed"], row["iteration"]) for row in rows if row["greedy_p"] != "nan"}
+    assert evaluated == {("0", "3"), *((seed, each) for seed in "01" for each in "246")}
     assert [max(RunFolder(folder).kept_best(seed)) for seed in (0, 1)] == [4, 2]
+
+
+def test_runs_of_algorithms_that_are_not_registered_here_are_refused(capsys, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "x")
+    (tmp_path / "x" / "ppo-seed1").rename(tmp_path / "x" / "ppo+mine-seed1")
+    arguments = ["exp1", "--out", tmp_path, "--name", "x", "--report-only"]
+    assert "unknown algorithm 'ppo+mine'; allowed" in refused(capsys, experiments.main, *arguments)
 
 
 def test_a_folder_holds_one_experiment(capsys, whole):
@@ -359,8 +378,9 @@ def test_the_best_parameters_are_found_by_their_iteration(tmp_path, monkeypatch)
     entry = training.AlgorithmRun("ppo", RunFolder(tmp_path), Run(Config()), rows)
     policy = Policy("x", Config(), {"parameters": 0}, 2)
     monkeypatch.setattr(pretrained, "load", {tmp_path / name: policy}.__getitem__)
-    steps = reporting.best_steps(entry, 0, Protocol(), lambda params: {"p": [len(params)]})
-    assert steps == {"p": [1]}
+    played = evaluation.Evaluation(jnp.array([True, False]), jnp.array([3, 6]), *2 * [jnp.zeros(2)])
+    evaluator: Any = lambda params: {"p": played} if params == policy.params else None  # noqa: E731
+    assert reporting.best_steps(entry, 0, Protocol(), evaluator) == {"p": [3, 0]}
 
 
 def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
@@ -412,7 +432,6 @@ def test_the_quick_protocol_runs(tmp_path):
             "2",
             "--settings",
             *settings,
-            "--no-optimality",
             "--out",
             str(tmp_path),
         ],

@@ -151,7 +151,7 @@ def test_unknown_encoders_are_refused(capsys):
 def test_the_pages_experiment_runs(here):
     settings = ["episodes=2", "minibatch=2", "epochs=1", "filters=[2,2]", "hidden=4", "embedding=2"]
     counts = ["--seeds", 1, "--iterations", 1, "--tasks", 2, "--reported", 2]
-    rest = ["--settings", *settings, *counts, "--no-optimality"]
+    rest = ["--settings", *settings, *counts]
     output = command(EXPERIMENT, *rest, folder=here)
     record = json.loads((here / "runs" / "exp1-fast-cold" / "summary.json").read_text())
     assert [entry["name"] for entry in record["algorithms"]] == ["ppo", "ppo+tool-moved"]

@@ -14,7 +14,6 @@ from agents import profile as command
 from agents.acting.policy import Policy
 from agents.config import Config
 from agents.experiments import figures as experiment_figures
-from agents.experiments import records
 from agents.networks.agent import Agent
 from agents.profiles import measure, mistakes, summary, tables
 from agents.profiles.mistakes import (
@@ -29,6 +28,7 @@ from agents.profiles.mistakes import (
 )
 from agents.profiles.oracle import LOST, Oracle, replayed
 from agents.profiles.tasks import STRENGTHS, kinds, points
+from agents.runs.folder import write_json
 from benchmarks import readme_tables
 from trap_tube_jax.controls import trap_and_exit_exchanged, trap_exchanged
 
@@ -297,7 +297,7 @@ def test_a_policy_without_a_step_limit_plays_as_long_as_the_base_task():
 
 def test_a_profile_from_end_to_end(tiny, tmp_path, capsys):
     path = tmp_path / "mine.json"
-    records.write_record(path, tiny)
+    write_json(path, tiny)
     command.main(["--draw", str(path), "--out", str(tmp_path / "out")])
     shown = capsys.readouterr().out
     assert "Controls" in shown
@@ -334,7 +334,7 @@ def test_a_profile_holds_every_episode(tiny):
 
 def test_pages_hold_the_tables_of_a_profile(tiny, tmp_path):
     folder = tmp_path / "benchmarks" / "results"
-    records.write_record(folder / "mine.json", tiny)
+    write_json(folder / "mine.json", tiny)
     page = folder / "page.md"
     page.write_text("<!-- table: mine -->\nold\n<!-- end -->\n")
     readme_tables.main(readme_tables.Arguments(root=tmp_path, write=True))
@@ -348,7 +348,9 @@ def test_records_of_profiles_name_a_commit_known_before_measuring(tmp_path, monk
     arguments += ["--out", str(tmp_path / "out"), "--record", str(tmp_path / "x.json")]
     monkeypatch.setattr(command, "profile", None)
     for commit, message in (("abc-dirty", "this one of abc-dirty"), (None, "give --commit")):
-        monkeypatch.setattr(records, "machine", lambda commit=commit: {"commit": commit})
+        monkeypatch.setattr(
+            "agents.experiments.records.machine", lambda commit=commit: {"commit": commit}
+        )
         with pytest.raises(SystemExit):
             command.main(arguments)
         assert message in capsys.readouterr().err

@@ -10,7 +10,7 @@ import pytest
 from agents.experiments import figures, records, statistics, tables, training
 from agents.experiments.protocol import PROTOCOLS, Protocol
 from agents.runs import machine
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import Run, RunFolder, write_json
 from benchmarks import readme_tables
 
 
@@ -115,11 +115,11 @@ def test_one_seed_has_neither_deviation_nor_interval():
 
 def test_records_come_back_as_they_were_written(example, tmp_path):
     path = tmp_path / "new" / "x.json"
-    records.write_record(path, example)
+    write_json(path, example)
     assert tables.markdown(records.read_record(path)) == tables.markdown(example)
     assert figures.digest(records.read_record(path)) == figures.digest(example)
     assert '"shortest": [5, 10, -1]' in path.read_text()
-    records.write_record(path, {**example, "schema": "trap-tube-jax experiment 0"})
+    write_json(path, {**example, "schema": "trap-tube-jax experiment 0"})
     with pytest.raises(ValueError, match="schema 'trap-tube-jax experiment 0'; allowed: 'trap-"):
         records.read_record(path)
     path.write_text("[]")
@@ -226,7 +226,7 @@ def test_pages_and_figures_are_those_of_the_records():
 
 def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
     folder = tmp_path / "benchmarks" / "results"
-    records.write_record(folder / "mine.json", example)
+    write_json(folder / "mine.json", example)
     (folder / "other.json").write_text("{}")
     block = "a\n<!-- table: {} -->\nold\n<!-- end -->\nb\n"
     (tmp_path / "README.md").write_text(block.format("mine"))
@@ -242,7 +242,7 @@ def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
     assert (folder / "absent.md").read_text() == block.format("absent")
     readme_tables.main(check)
     example["algorithms"][0]["runs"][0]["curves"]["training"]["success"][0] = 0.5
-    records.write_record(folder / "mine.json", example)
+    write_json(folder / "mine.json", example)
     capsys.readouterr()
     with pytest.raises(SystemExit):
         readme_tables.main(check)

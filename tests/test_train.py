@@ -101,6 +101,8 @@ def test_a_run_leaves_its_results_and_says_where(whole):
         assert (folder / name).exists()
         assert str(folder / name) in output
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    written = [(folder / name).stat().st_mtime_ns for name in ("evaluation.json", "summary.json")]
+    assert written == sorted(written)  # where there is a summary, nothing else is missing
     rows = untimed(folder)
     assert [row["iteration"] for row in rows] == [str(i + 1) for i in range(ITERATIONS)]
     assert [row["episodes"] for row in rows] == [str(8 * i + 8) for i in range(ITERATIONS)]
@@ -149,13 +151,13 @@ def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
 def test_evaluate_command_line(whole, tmp_path):
     folder, _ = whole
     arguments = [folder, "--sets", "base", "StructuralTrapTube-v0", "--tasks", 3]
-    output = run("agents.evaluate", *arguments, "--json", tmp_path / "x.json", "--optimality")
-    (policy,) = json.loads((tmp_path / "x.json").read_text())
+    output = run("agents.evaluate", *arguments, "--json", tmp_path / "new/x.json", "--optimality")
+    (policy,) = json.loads((tmp_path / "new/x.json").read_text())
     assert policy["iteration"] == ITERATIONS
     assert [(score["set"], score["tasks"]) for score in policy["sets"]] == [("base", 1), ("st", 3)]
     assert policy["sets"][0]["optimality"]["solvable"] == 0  # 11 steps, of which it has 6
     assert "{St} (st)" in output
-    assert str(tmp_path / "x.json") in output
+    assert str(tmp_path / "new/x.json") in output
 
 
 @pytest.mark.parametrize(

@@ -8,36 +8,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from agents.config import Config
-from agents.curiosity.base import Curiosity, Experience, Params
-from agents.curiosity.models import InverseModel
-from agents.networks import make_encoder
-from agents.networks.layers import draw
+from agents.curiosity.base import Experience, Params
+from agents.curiosity.icm_detached import DetachedICM
 
 RIDGE = 0.1  # lambda of the paper
 
 
-class E3B(Curiosity):
+class E3B(DetachedICM):
     """reward_t = f_{t+1}' C_t^-1 f_{t+1}, with C_t = 0.1 I + the sum over i <= t of f_i f_i'.
 
     f_i are the features of the episode's observation i, by an encoder of its own, which the
     inverse loss alone shapes: the negative log-likelihood of the action between two of them.
     """
 
-    def __init__(self, config: Config):
-        self._encoder, self._inverse = make_encoder(config), InverseModel(config.hidden)
-
-    def init(self, key: jax.Array, board: jax.Array) -> Params:
-        """The parameters of the encoder and of the inverse model."""
-        encoder_key = jax.random.fold_in(key, 0)
-        features, encoder = self._encoder.init_with_output(encoder_key, board)
-        params = {"encoder": encoder, "inverse": self._inverse.init(key, features, features)}
-        return draw(key, params)
-
-    def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Features of its own encoder, f32[M, F]."""
-        features: Any = self._encoder.apply(params["encoder"], observation)
-        return features
+    def init_models(self, key: jax.Array, features: jax.Array) -> Params:
+        """The inverse model alone."""
+        return {"inverse": self._inverse.init(key, features, features)}
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """The bonus of every next observation."""

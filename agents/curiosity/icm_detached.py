@@ -37,12 +37,15 @@ class DetachedICM(ICM):
         """The parameters of the encoder and of both models."""
         encoder_key = jax.random.fold_in(key, 0)
         features, encoder = self._encoder.init_with_output(encoder_key, board)
-        params = {
-            "encoder": encoder,
-            "forward": self._forward.init(key, features, _one_hot(jnp.zeros((1, 2), jnp.int32))),
+        return draw(key, {"encoder": encoder, **self.init_models(key, features)})
+
+    def init_models(self, key: jax.Array, features: jax.Array) -> Params:
+        """What is trained on the features f32[1, F], still to be drawn."""
+        action = _one_hot(jnp.zeros((1, 2), jnp.int32))
+        return {
+            "forward": self._forward.init(key, features, action),
             "inverse": self._inverse.init(key, features, features),
         }
-        return draw(key, params)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Features of its own encoder, f32[M, F]."""

@@ -19,7 +19,7 @@ from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol, parse_setting
 from agents.parallel.cores import become_devices
 from agents.runs import compilation
-from agents.runs.folder import check_name, read_json
+from agents.runs.folder import check_name, read_json, write_json
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
@@ -68,7 +68,6 @@ class Options:
         one is given, and with -quick.
       out: the folder of all runs.
       report_only: train nothing; draw tables and figures from what there is.
-      no_optimality: do not search for shortest plans, to compare solved episodes with.
       record: also write the record to this file; refused unless all of it is of committed
         code.
       commit: the commit to note where git does not tell it.
@@ -96,7 +95,6 @@ class Options:
     name: str | None = None
     out: Path = Path("runs")
     report_only: Flag = False
-    no_optimality: Flag = False
     record: Path | None = None
     commit: str | None = None
     checkpoint_every: int = 10
@@ -188,13 +186,11 @@ def run(options: Options, console: Console, stop: StopSignals) -> None:
             checkpoint_every=options.checkpoint_every,
             commit=options.commit,
         )
-    record = reporting.make_record(
-        root, experiment, protocol, console, optimality=not options.no_optimality
-    )
+    record = reporting.make_record(root, experiment, protocol, console)
     reporting.report(root, record, console)
     if options.record is not None:
         records.check_clean(record, options.commit)
-        records.write_record(options.record, record)
+        write_json(options.record, record)
         console.print(f"    record: {options.record}", soft_wrap=True, highlight=False)
 
 

@@ -17,7 +17,7 @@ from agents.experiments import tables
 from agents.experiments.records import Record, rows_of
 from agents.runs.metrics import Row
 from agents.runs.report import over_episodes
-from agents.runs.tracking import OVERALL, PREFIX
+from agents.runs.tracking import GREEDY, OVERALL
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
 Curves = Mapping[str, Sequence[Row]]  # by algorithm, the rows of all its seeds
@@ -81,10 +81,10 @@ def _save_success(curves: Curves, path: Path, title: str, record: Record) -> Non
     Of many algorithms the mean alone: spreads would cover each other.
     """
     columns = dict.fromkeys(name for rows in curves.values() for row in rows for name in row)
-    found = [name.removeprefix(PREFIX) for name in columns if name.startswith(PREFIX)]
+    found = [name.removeprefix(GREEDY) for name in columns if name.startswith(GREEDY)]
     sets = [name for name in ALL_SETS if name in found]
-    sets += [name for name in found if name not in ALL_SETS and PREFIX + name != OVERALL]
-    panels = {"training, running mean": "success", **{label(name): PREFIX + name for name in sets}}
+    sets += [name for name in found if name not in ALL_SETS and GREEDY + name != OVERALL]
+    panels = {"training, running mean": "success", **{label(name): GREEDY + name for name in sets}}
     if OVERALL in columns:
         panels["overall"] = OVERALL
     is_few = len(curves) <= MOST_SHADED

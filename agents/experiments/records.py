@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 
 from agents.experiments.training import AlgorithmRun
-from agents.runs.folder import read_json, write_json
+from agents.runs.folder import read_json
 from agents.runs.machine import DIRTY, machine
 from agents.runs.metrics import Row, first_solved, is_last
-from agents.runs.tracking import OVERALL, PREFIX
+from agents.runs.tracking import GREEDY, OVERALL
 
 SCHEMA = "trap-tube-jax experiment 1"
 MAX_POINTS = 200  # of a curve
@@ -108,7 +108,7 @@ def curves(
       `training`: of training; `greedy`: of the evaluations on all sets; both thinned.
     """
     evaluated = _evaluated(rows)
-    names = [name for name in (evaluated or rows)[0] if name.startswith(PREFIX)]
+    names = [name for name in (evaluated or rows)[0] if name.startswith(GREEDY)]
     return {
         "training": _columns(_thinned(rows, total, 1), ("success", "evaluation")),
         "greedy": _columns(_thinned(evaluated, total, evaluate_every), names),
@@ -152,12 +152,6 @@ def check_clean(record: Record, commit: str | None = None) -> None:
             f"a record is of committed code, this one of {', '.join(dirty)}; commit the changes "
             "and run the experiment again"
         )
-
-
-def write_record(path: Path, record: Record) -> None:
-    """Writes a record, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, record)
 
 
 def read_record(path: Path, *schemas: str) -> Record:

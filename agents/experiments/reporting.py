@@ -1,14 +1,13 @@
 """What the runs of an experiment came to: the record, and its tables and figures."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress as Bar
 
 import trap_tube_jax as tt
 from agents import pretrained
@@ -17,23 +16,15 @@ from agents.experiments import figures, records, tables
 from agents.experiments.protocol import Protocol, algorithms
 from agents.experiments.records import Record, Steps
 from agents.experiments.training import AlgorithmRun, draw_tasks, find_runs
-from agents.networks.agent import Params
 from agents.runs.folder import read_json, write_json
-from agents.runs.tracking import steps_taken
 from trap_tube_jax.scoring.tasks import layout_numbers
 from trap_tube_jax.solver.search import solve_batch, take
 from trap_tube_jax.state import State
 
-SHORTEST_FILE = "shortest.json"
-NUM_COMPARED = 128  # tasks per set whose shortest plans are searched for
-SOLVED_AT_ONCE = 8  # tasks whose shortest plans are found between two saves
-
-Play = Callable[[Params], Steps]
+NUM_COMPARED = 128  # tasks per set whose shortest plans are searched for, in a second or two
 
 
-def make_record(
-    root: Path, experiment: str, protocol: Protocol, console: Console, *, optimality: bool
-) -> Record:
+def make_record(root: Path, experiment: str, protocol: Protocol, console: Console) -> Record:
     """The record of all runs in an experiment's folder.
 
     Args:
@@ -41,7 +32,6 @@ def make_record(
       experiment: which of `PROTOCOLS`.
       protocol: how it is run.
       console: where to show what is being done.
-      optimality: search for shortest plans, to compare solved episodes with.
 
     Raises:
       ValueError: there is no run yet, or one cannot be read.
@@ -50,10 +40,9 @@ def make_record(
     if not runs:
         raise ValueError(f"{root} holds no run with a first iteration yet")
     tasks = draw_tasks(runs[0].run.config, protocol.sets, protocol.num_reported, "test")
-    shortest = find_shortest(root / SHORTEST_FILE, tasks, console) if optimality else {}
-    order = list(algorithms())
+    order = {name: place for place, name in enumerate(algorithms())}
     names = dict.fromkeys(entry.algorithm for entry in runs)
-    names = sorted(names, key=lambda name: order.index(name.partition(",")[0]))
+    names = sorted(names, key=lambda name: order.get(name.partition(",")[0], len(order)))
     machines: list[Any] = []
     reached = []
     with console.status("Playing the reported tasks ..."):
@@ -71,7 +60,7 @@ def make_record(
         "sets": {
             name: {
                 "max_steps": runs[0].run.config.step_limit(name),
-                **_about(name, states, shortest),
+                **_about(name, states),
             }
             for name, states in tasks.items()
         },
@@ -86,7 +75,7 @@ def report(root: Path, record: Record, console: Console) -> None:
         "tables": root / "tables.md",
         "figure": root / "curves.png",
     }
-    records.write_record(files["summary"], record)
+    write_json(files["summary"], record)
     text = f"# {tables.title(record)}\n\n{tables.markdown(record)}\n"
     files["tables"].write_text(text, encoding="utf-8")
     figures.save(record, files["figure"])
@@ -96,30 +85,6 @@ def report(root: Path, record: Record, console: Console) -> None:
         console.print(line, soft_wrap=True, highlight=False)
     for name, path in files.items():
         console.print(f"{name:>10}: {path}", soft_wrap=True, highlight=False)
-
-
-def find_shortest(path: Path, tasks: Mapping[str, State], console: Console) -> dict[str, list[int]]:
-    """The lengths of the shortest plans of every set's first tasks, kept in a file as found.
-
-    Raises:
-      ValueError: the file cannot be read.
-    """
-    found: dict[str, list[int]] = read_json(path) or {}
-    wanted = {name: min(len(states.time), NUM_COMPARED) for name, states in tasks.items()}
-    missing = sum(count - len(found.get(name, ())) for name, count in wanted.items())
-    if missing <= 0:
-        return found
-    with Bar(console=console, transient=True) as bar:
-        task = bar.add_task("Shortest plans", total=missing)
-        for name, states in tasks.items():
-            lengths = found.setdefault(name, [])
-            while len(lengths) < wanted[name]:
-                part = slice(len(lengths), min(len(lengths) + SOLVED_AT_ONCE, wanted[name]))
-                block = solve_batch(take(states, part)).length.tolist()
-                lengths += block
-                write_json(path, found)
-                bar.advance(task, len(block))
-    return found
 
 
 def equal_to_base(tasks: State) -> float:
@@ -133,7 +98,9 @@ def equal_to_base(tasks: State) -> float:
     return 100 * float(np.mean(np.all(jax.tree.leaves(same), axis=0)))
 
 
-def best_steps(entry: AlgorithmRun, seed: int, protocol: Protocol, play: Play) -> Steps | None:
+def best_steps(
+    entry: AlgorithmRun, seed: int, protocol: Protocol, evaluator: Evaluator
+) -> Steps | None:
     """The steps that a seed's best policy takes in the reported tasks, 0 where unsolved.
 
     What was played is kept in the run's folder.
@@ -142,7 +109,7 @@ def best_steps(entry: AlgorithmRun, seed: int, protocol: Protocol, play: Play) -
       entry: the seed's run.
       seed: which one.
       protocol: how the experiment is run.
-      play: from parameters to steps, by set.
+      evaluator: plays the reported tasks.
 
     Returns:
       By set i32[B]; None if the seed has not been evaluated yet.
@@ -158,7 +125,8 @@ def best_steps(entry: AlgorithmRun, seed: int, protocol: Protocol, play: Play) -
     known = read_json(path)
     if known is None or known["iteration_and_tasks"] != key:
         policy = pretrained.load(entry.folder.best(seed, iteration))
-        steps = {name: list(map(int, taken)) for name, taken in play(policy.params).items()}
+        played = evaluator(policy.params).items()
+        steps = {name: (each.length * each.solved).tolist() for name, each in played}
         known = {"iteration_and_tasks": key, "steps": steps}
         write_json(path, known)
     return known["steps"]
@@ -173,17 +141,13 @@ def _algorithm(
 ) -> dict[str, Any]:
     config = entries[0].run.config
     evaluator = Evaluator(config, tasks)
-
-    def play(params: Params) -> Steps:
-        return steps_taken(evaluator(params))
-
     seeds = [
         records.seed_record(
             entry,
             seed,
             machines=machines,
             evaluate_every=protocol.evaluate_every,
-            steps=best_steps(entry, seed, protocol, play),
+            steps=best_steps(entry, seed, protocol, evaluator),
         )
         for entry in entries
         for seed in entry.run.seed_range
@@ -192,13 +156,12 @@ def _algorithm(
     return {"name": name, "config": config.to_dict(), "runs": seeds}
 
 
-def _about(name: str, tasks: State, shortest: Mapping[str, Sequence[int]]) -> dict[str, Any]:
+def _about(name: str, tasks: State) -> dict[str, Any]:
     layout = layout_numbers(name, tasks)
-    lengths = shortest.get(name)
     return {
         "equal_to_base": equal_to_base(tasks),
         "layout": None if layout is None else layout.tolist(),
-        "shortest": None if lengths is None else list(lengths[: len(tasks.time)]),
+        "shortest": solve_batch(take(tasks, slice(NUM_COMPARED))).length.tolist(),
     }
 
 

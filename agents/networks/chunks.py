@@ -67,21 +67,11 @@ def _map_rows_forward(
     num_remembered = min(REMEMBERED_BYTES // max(num_bytes, 1), num_chunks)
 
     def body(index: jax.Array, outputs: tuple[Any, Any]) -> tuple[Any, Any]:
-        results = fn(params, _take(padded, index, chunk), None)
-        # One more place than is remembered, for all chunks that are not.
-        places = (index, jnp.minimum(index, num_remembered))
-        return tuple(
-            jax.tree.map(lambda all_of, new, place=place: all_of.at[place].set(new), *both)
-            for place, *both in zip(places, outputs, results, strict=True)
-        )
+        features, memory = fn(params, _take(padded, index, chunk), None)
+        place = jnp.minimum(index, num_remembered)  # one more place, for all that are not kept
+        return _put(outputs[0], index, features), _put(outputs[1], place, memory)
 
-    def empty(length: int, leaf: jax.ShapeDtypeStruct) -> jax.Array:
-        return jnp.zeros((length, *leaf.shape), leaf.dtype)
-
-    outputs = tuple(
-        jax.tree.map(functools.partial(empty, length), shape)
-        for length, shape in zip((num_chunks, num_remembered + 1), shapes, strict=True)
-    )
+    outputs = _zeros(num_chunks, shapes[0]), _zeros(num_remembered + 1, shapes[1])
     features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, outputs)
     features = jax.tree.map(lambda x: jax.lax.collapse(x, 0, 2)[:num_rows], features)
     return features, (params, rows, count, memory)
@@ -156,3 +146,11 @@ def _take(rows: Any, index: jax.Array | int, chunk: int) -> Any:
     return jax.tree.map(
         lambda x: jax.lax.dynamic_slice_in_dim(x, index * chunk, chunk, axis=0), rows
     )
+
+
+def _put(table: Any, place: jax.Array, rows: Any) -> Any:
+    return jax.tree.map(lambda x, new: x.at[place].set(new), table, rows)
+
+
+def _zeros(length: int, shapes: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.zeros((length, *leaf.shape), leaf.dtype), shapes)

@@ -160,11 +160,11 @@ class Placement:
         """A state [S, ...] from the default device to the devices that train with it."""
         if self.mesh is None:
             return state
-        numbers = jax.tree.map(lambda x: np.asarray(_key_data(x)), state)
+        numbers = jax.tree.map(lambda x: np.asarray(key_data(x)), state)
 
         def whole(numbers: Any) -> Any:
             return jax.tree.map(
-                lambda x, like: jax.random.wrap_key_data(x) if _is_key(like) else x, numbers, state
+                lambda x, like: jax.random.wrap_key_data(x) if is_key(like) else x, numbers, state
             )
 
         # NumPy arrays, unlike those of a device, may go to devices of other processes.
@@ -202,12 +202,14 @@ def _same(tree: Any) -> Any:
     return tree
 
 
-def _is_key(x: jax.Array) -> bool:
+def is_key(x: Any) -> bool:
+    """Whether an array, or its shape, is of typed PRNG keys."""
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def _key_data(x: jax.Array) -> jax.Array:
-    return jax.random.key_data(x) if _is_key(x) else x
+def key_data(x: jax.Array) -> jax.Array:
+    """The numbers of keys; other arrays as they are."""
+    return jax.random.key_data(x) if is_key(x) else x
 
 
 def _is_even(devices: int, processes: int, config: Config, seeds: int) -> bool:

@@ -38,13 +38,14 @@ Metrics = dict[str, jax.Array]
 COUNTABLE = np.iinfo(np.int32).max  # by `TrainState.transitions`
 
 # The names of all other metrics, which a curiosity's losses may not have: those of play, of
-# gradient steps, and what a run adds to them.
+# gradient steps, and what a run adds to them. Those of evaluations begin with GREEDY.
 RESERVED_NAMES = {
     "success", "replayed_success", "episode_length", "intrinsic_reward", "distinct_observations",
     "policy_loss", "value_loss", "entropy_loss", "loss", "entropy", "steps",
     "gradient_norm", "seed", "iteration", "episodes", "transitions", "evaluation", "seconds",
     "transitions_per_second",
 }  # fmt: skip
+GREEDY = "greedy_"
 
 
 class TrainState(NamedTuple):
@@ -138,11 +139,11 @@ class Learner:
         )
 
     def init_params(self, key: jax.Array) -> Params:
-        """Fresh parameters of the policy network, and of the curiosity where it has any."""
+        """Fresh parameters of the policy network and of the curiosity, which may have none."""
         agent_key, curiosity_key = jax.random.split(key)
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         own = self.curiosity.init(curiosity_key, board)
-        return self.agent.init(agent_key) | ({"curiosity": own} if own else {})
+        return {**self.agent.init(agent_key), "curiosity": own}
 
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Plays, prepares, learns: the next state, and metrics f32[] each."""
@@ -238,8 +239,7 @@ class Learner:
             # Devices number their observations apart.
             everyones = observation_ids(experience.episodes)
             experience = experience._replace(observation_id=everyones)
-        own = state.params.get("curiosity", {})
-        reward, memory = self.curiosity.reward(own, state.memory, experience)
+        reward, memory = self.curiosity.reward(state.params["curiosity"], state.memory, experience)
         mask = experience.episodes.mask
         chex.assert_equal_shape([reward, mask])
         reward = jnp.where(mask > 0, reward, 0.0)
@@ -253,7 +253,7 @@ class Learner:
         observation_id = observation_ids(episodes)
         features = jnp.zeros((*observation_id.shape, 0))
         if type(self.curiosity).encode is not Curiosity.encode:
-            own = params.get("curiosity", {})
+            own = params["curiosity"]
 
             def encode(own: Params, rows: jax.Array, _: None) -> tuple[jax.Array, None]:
                 return self.curiosity.encode(own, rows), None
@@ -330,8 +330,8 @@ class Learner:
             "value_loss": config.value_coef * losses.padded_mean(value_error, mask),
             "entropy_loss": -config.entropy_coef * losses.padded_mean(entropy, mask),
         }
-        own = self.curiosity.losses(params.get("curiosity", {}), experience)
-        if taken := own.keys() & RESERVED_NAMES:
+        own = self.curiosity.losses(params["curiosity"], experience)
+        if taken := {name for name in own if name in RESERVED_NAMES or name.startswith(GREEDY)}:
             raise ValueError(
                 f"a curiosity's losses need names of their own, got {', '.join(sorted(taken))}"
             )
@@ -344,11 +344,11 @@ class Learner:
     def learning_experience(self, params: Params, batch: Batch) -> tuple[jax.Array, Experience]:
         """The GRU's outputs f32[T, B, hidden], and what the curiosity sees of a minibatch."""
         episodes = batch.episodes
-        read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
+        read = {name: params[name] for name in ("encoder", "curiosity")}
 
         def encode(params: Params, rows: jax.Array, remembered: Any) -> Any:
             features, remembered = self.agent.encode_rows(params, rows, remembered)
-            return (features, self.curiosity.encode(params.get("curiosity", {}), rows)), remembered
+            return (features, self.curiosity.encode(params["curiosity"], rows)), remembered
 
         features, own = encode_episodes(
             encode, read, episodes, batch.observation_id, chunk=self.config.chunk

@@ -16,7 +16,7 @@ A record holds what was measured and nothing derived from it:
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -31,14 +31,13 @@ from agents.profiles.mistakes import SUBGOALS, Push, Turns, first_push, subgoals
 from agents.profiles.oracle import Oracle, replayed
 from agents.profiles.tasks import ALL_LAYOUTS, BASE, PAIRS, PARTS, STRENGTHS, SWAPS, kinds, points
 from agents.runs.machine import machine
+from trap_tube_jax.solver import solve_batch
 from trap_tube_jax.state import State
 
 SCHEMA = "trap-tube-jax profile 2"
 # The points whose episodes are looked into, and those that are in pairs, where the parts hold them.
 LOOKED_INTO = ("colours 1", ALL_LAYOUTS, "both 1", *(f"both 1, swap {name}" for name in SWAPS))
 IN_PAIRS = {name for pair in PAIRS.values() for name in pair}
-
-Advance = Callable[[], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +103,10 @@ def profile(
     oracle = Oracle()
     columns = [*Progress.get_default_columns(), MofNCompleteColumn()]
     with Progress(*columns, console=console, transient=True) as bars:
-        shortest = _shortest(oracle, tasks, bars)
+        shortest = {
+            name: solve_batch(states).length
+            for name, states in bars.track(tasks.items(), description="Shortest plans")
+        }
         measured = [
             {
                 "name": name,
@@ -144,20 +146,6 @@ def _limited(policy: Policy) -> Policy:
     return policy._replace(config=dataclasses.replace(policy.config, max_steps=limit))
 
 
-def _shortest(oracle: Oracle, tasks: Mapping[str, State], bars: Progress) -> dict[str, np.ndarray]:
-    """By point i32[B], the lengths of the shortest plans, -1 where there is none."""
-    bar = bars.add_task("Shortest plans", total=sum(len(each.time) for each in tasks.values()))
-    found = {}
-    for name, states in tasks.items():
-        lengths = []
-        for state in rows(states):
-            cells = np.stack([state.agent, state.tool, state.food])
-            lengths.append(oracle.distance(state, cells))
-            bars.advance(bar)
-        found[name] = np.array(lengths)
-    return found
-
-
 class Played(NamedTuple):
     """A policy's episodes of a point; NumPy arrays.
 
@@ -190,47 +178,32 @@ def _measure(
     bars: Progress,
 ) -> dict[str, Any]:
     """What the record says of a policy beside its settings."""
-    bar = bars.add_task(f"{label}: playing", total=None)
     outcomes = Evaluator(policy.config, tasks)(policy.params)
     played = {name: Played.of(tasks[name], outcome) for name, outcome in outcomes.items()}
-    pushed = [name for name in tasks if name.startswith("control ") or name in IN_PAIRS]
-    into = [name for name in tasks if name in LOOKED_INTO]
-    total = sum(len(shortest[name]) for name in pushed)
-    total += sum(min(episodes, len(shortest[name])) for name in into)
-    bars.update(bar, description=f"{label}: where plans go wrong", total=total)
-
-    def advance() -> None:
-        bars.advance(bar)
-
-    return {
-        "steps": {name: each.steps.tolist() for name, each in played.items()},
-        "pushes": {name: _pushes(oracle, played[name], advance) for name in pushed},
-        "mistakes": {
-            name: _mistakes(oracle, played[name], shortest[name][:episodes], advance)
-            for name in into
-        },
-    }
+    pushes, mistakes = {}, {}
+    for name in bars.track(tasks, description=f"{label}: where plans go wrong"):
+        if name.startswith("control ") or name in IN_PAIRS:
+            pushes[name] = _pushes(oracle, played[name])
+        if name in LOOKED_INTO:
+            mistakes[name] = _mistakes(oracle, played[name], shortest[name][:episodes])
+    steps = {name: each.steps.tolist() for name, each in played.items()}
+    return {"steps": steps, "pushes": pushes, "mistakes": mistakes}
 
 
-def _pushes(oracle: Oracle, played: Played, advance: Advance) -> dict[str, list]:
+def _pushes(oracle: Oracle, played: Played) -> dict[str, list]:
     """The first pushes of a point's episodes, as columns."""
-    found = []
-    for state, cells in zip(rows(played.tasks), played.cells, strict=True):
-        found.append(first_push(oracle, state, cells))
-        advance()
+    episodes = zip(rows(played.tasks), played.cells, strict=True)
+    found = [first_push(oracle, state, cells) for state, cells in episodes]
     return {name: [getattr(push, name) for push in found] for name in Push._fields}
 
 
-def _mistakes(
-    oracle: Oracle, played: Played, shortest: np.ndarray, advance: Advance
-) -> dict[str, Any]:
+def _mistakes(oracle: Oracle, played: Played, shortest: np.ndarray) -> dict[str, Any]:
     """Where those of the first n episodes that took more than the shortest plan went wrong.
 
     Args:
       oracle: what knows the distances.
       played: the episodes.
       shortest: i32[n], the shortest plans of the first n of them.
-      advance: called once an episode.
 
     Returns:
       Columns, of which `task` says which episode.
@@ -247,7 +220,6 @@ def _mistakes(
             reached = subgoals(state, cells, played.action[index, :length])
             for name, value in zip(names, (index, *found, *reached), strict=True):
                 columns[name].append(value)
-        advance()
     return columns
 
 

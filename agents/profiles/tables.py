@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def tables(record: Record) -> list[Table]:
     made.append(_outcomes(record, heading, "kind", summary.by_kind))
     for whole, title in (("", "Base task"), ("both 1", "{P, St}")):
         heading = f"{title} by what the tool swaps its looks with, tool being no swap; {CELLS}"
-        made.append(_outcomes(record, heading, "swap", _swapped(whole)))
+        made.append(_outcomes(record, heading, "swap", partial(summary.swapped, whole=whole)))
     made += [controls_table(record), pairs_table(record)]
     made += [mistakes_table(record, policy) for policy in record["policies"]]
     return [table for table in made if table.rows]
@@ -141,10 +142,6 @@ def _by_length(record: Record, policy: Record) -> dict[str, Outcome]:
         f"{start}–{start + summary.BIN - 1}": each
         for start, each in zip(starts, found.values(), strict=True)
     }
-
-
-def _swapped(whole: str) -> Find:
-    return lambda record, policy: summary.swapped(record, policy, whole)
 
 
 def _outcomes(record: Record, title: str, first: str, find: Find) -> Table:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from agents.parallel.sharding import is_key, key_data
 from trap_tube_jax._version import __version__
 
 Tree = TypeVar("Tree")
@@ -209,17 +210,13 @@ def _name(path: Any) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=SEPARATOR)
 
 
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
 def _to_array(leaf: Any) -> np.ndarray:
     # A copy: on a CPU the array could be a view of memory that is donated next.
-    return np.array(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+    return np.array(key_data(leaf))
 
 
 def _to_leaf(name: str, array: np.ndarray, template: Any) -> jax.Array:
-    if _is_key(template):
+    if is_key(template):
         if array.dtype != np.uint32 or array.shape[:-1] != template.shape:
             raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, not PRNG keys")
         return jax.random.wrap_key_data(jnp.asarray(array))

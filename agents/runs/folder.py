@@ -231,7 +231,8 @@ def is_done(folder: RunFolder, run: Run) -> bool:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Writes a JSON file whole or not at all; a list of plain values takes one line."""
+    """Writes a JSON file whole or not at all, and its folder; plain values share a line."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     draft.write_text(_json(values) + "\n")
     draft.replace(path)

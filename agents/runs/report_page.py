@@ -34,76 +34,7 @@ EPISODES_OF_A_SET = 2  # the first solved one and the first unsolved one
 # f32[M, T] of its greedy play.
 Pay = Callable[[TrainState, State, np.ndarray], jax.Array]
 
-PAGE = string.Template("""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>$title</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; margin: 1rem 0 }
-th, td { padding: .2rem .7rem; text-align: right; border-bottom: 1px solid #ddd }
-th:first-child, td:first-child { text-align: left }
-img { max-width: 100% }
-figure { display: inline-block; margin: 0 1rem 0 0; width: min(24rem, 100%) }
-figure img { image-rendering: pixelated; width: 100% }
-</style>
-</head>
-<body>
-<h1>$title</h1>
-$sentences
-<h2>Greedy evaluation</h2>
-$scores
-<p>$few_layouts</p>
-<h2>Episodes</h2>
-<p><select id="episode" aria-label="episode"></select>
-<button id="back">Back</button> <button id="next">Next</button>
-<input id="step" type="range" min="0" value="0" aria-label="step"></p>
-<figure><img id="board" alt="the agent's board"><figcaption id="caption"></figcaption></figure>
-<figure><img id="ideal" alt="the shortest plan's board"><figcaption id="hint"></figcaption></figure>
-<h2>Learning curves</h2>
-<p><img src="data:image/png;base64,$curves" alt="learning curves"></p>
-<h2>Settings</h2>
-$settings
-<script type="application/json" id="data">$data</script>
-<script>
-const data = JSON.parse(document.getElementById("data").textContent);
-const [chosen, step, board, caption, ideal, hint] =
-  ["episode", "step", "board", "caption", "ideal", "hint"].map(id => document.getElementById(id));
-const picture = number => "data:image/png;base64," + data.pictures[number];
-data.episodes.forEach((each, index) => chosen.add(new Option(each.title, index)));
-function show() {
-  const each = data.episodes[chosen.value];
-  if (!each) { caption.textContent = "There are none."; return; }
-  const last = each.frames.length - 1, now = Math.min(Number(step.value), last);
-  board.src = picture(each.frames[now]);
-  const next = now < last
-    ? "; next: " + each.actions[now] + "; value " + each.values[now].toFixed(3) +
-      ", intrinsic reward " + each.novelty[now].toFixed(3)
-    : each.solved ? "; solved" : "; not solved";
-  caption.textContent = "The agent: step " + now + " of " + last + next;
-  const length = each.plan.actions.length, then = Math.min(Number(step.value), length);
-  ideal.src = picture(each.plan.frames[then]);
-  hint.textContent = !length ? "No plan solves this task." : "The shortest plan: step " + then +
-    " of " + length + (then < length ? "; next: " + each.plan.actions[then] : "; solved");
-}
-function choose() {
-  const each = data.episodes[chosen.value];
-  step.max = each ? Math.max(each.actions.length, each.plan.actions.length) : 0;
-  step.value = 0;
-  show();
-}
-function move(by) { step.value = Number(step.value) + by; show(); }
-chosen.onchange = choose;
-step.oninput = show;
-document.getElementById("back").onclick = () => move(-1);
-document.getElementById("next").onclick = () => move(1);
-choose();
-</script>
-</body>
-</html>
-""")
+PAGE = Path(__file__).with_name("report.html")  # its $names are filled in
 
 
 def save(
@@ -134,7 +65,7 @@ def save(
     """
     episodes, pictures = _episodes(evaluator, played, pay)
     data = json.dumps({"episodes": episodes, "pictures": pictures})
-    page = PAGE.substitute(
+    page = string.Template(PAGE.read_text(encoding="utf-8")).substitute(
         title=html.escape(title),
         sentences="\n".join(f"<p>{html.escape(line)}</p>" for line in sentences if line),
         scores="\n".join(_score_table(name, each) for name, each in scores.items()),

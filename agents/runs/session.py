@@ -110,7 +110,7 @@ class Session:
             while self._progress.active.any():
                 rows = self._iterate(advance)
                 live.update(rows, sum(first is not None for first in self._progress.solved))
-                if then_finish and self._results is None:
+                if then_finish and self._log is not None and self._results is None:
                     self._prepare_results()
                 # A signal may arrive at any time: what counts is what all agreed on here.
                 request = processes.agree(stop.received)
@@ -123,16 +123,16 @@ class Session:
     def finish(self) -> None:
         """Evaluates on all task sets, writes the results and says what they show."""
         run, folder = self.run, self.folder
-        self.console.print("Evaluating on all task sets ...")
-        evaluator, pay = self._ready() if self._results is None else self._results.result()
-        state = jax.tree.map(lambda x: x[0], self._placement.local(self._state))
-        trained = self._policies()
-        played = {policy.name: evaluator(policy.params) for policy in trained}
-        self.summarize()
+        state = self._local_state()
         if self._log is None:
             return
+        self.console.print("Evaluating on all task sets ...")
+        evaluator, pay = self._ready() if self._results is None else self._results.result()
+        trained = self._policies(state)
+        played = {policy.name: evaluator(policy.params) for policy in trained}
         results = {name: evaluator.scores(outcome) for name, outcome in played.items()}
         write_json(folder.evaluation, report.results_json(trained, results))
+        self._summarize(state, self._log)
         env = tt.task_set(run.config.env_id)
         folder.animation.unlink(missing_ok=True)
         report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
@@ -147,7 +147,7 @@ class Session:
             curves=folder.curves,
             evaluator=evaluator,
             played=played[trained[0].name],
-            pay=functools.partial(pay, state),
+            pay=functools.partial(pay, jax.tree.map(lambda x: x[0], state)),
         )
         self._say(story.before)
         for name, result in results.items():
@@ -160,11 +160,9 @@ class Session:
 
     def summarize(self) -> None:
         """Writes the summary and the learning curves."""
-        summary = self._summary()
-        if self._log is None:
-            return
-        write_json(self.folder.summary, summary)
-        report.save_curves(self._log.rows, self.folder.curves, self.folder.path.name)
+        state = self._local_state()
+        if self._log is not None:
+            self._summarize(state, self._log)
 
     def _start(self) -> tuple[TrainState, Progress]:
         keys = jax.vmap(jax.random.key)(np.array(self.run.seed_range, np.uint32))
@@ -239,40 +237,50 @@ class Session:
             if active[index]
         ]
         progress = progress._replace(iteration=iteration, seconds=seconds).after(self.run, rows)
-        rows = self._track(rows, is_due=progress.solved != self._progress.solved)
+        changes = zip(self.run.seed_range, self._progress.solved, progress.solved, strict=True)
+        rows = self._track(rows, just_solved={seed for seed, old, new in changes if old != new})
         if self._log is not None:
             self._log.append(rows)
         self._progress = progress
         return rows
 
-    def _track(self, rows: list[Row], *, is_due: bool) -> list[Row]:
-        """The rows of an iteration with what the tracker adds to them."""
+    def _track(self, rows: list[Row], just_solved: set[int]) -> list[Row]:
+        """The rows of an iteration with what the tracker adds to them.
+
+        A seed is evaluated when it would be if it were trained alone.
+        """
         tracker = self._tracker
         if tracker is None:
             return rows
-        if not (is_due or tracker.is_due(int(rows[0]["iteration"]))):
-            return [{**row, **tracker.skip()} for row in rows]
-        trained = dict(zip(self.run.seed_range, self._policies(), strict=True))
         by_seed = {int(row["seed"]): row for row in rows}
-        return [{**row, **tracker.evaluate(seed, trained[seed])} for seed, row in by_seed.items()]
+        due = set(by_seed) if tracker.is_due(int(rows[0]["iteration"])) else just_solved
+        policies = self._policies(self._local_state()) if due else []
+        found = {
+            seed: tracker.evaluate(seed, policy)
+            for seed, policy in zip(self.run.seed_range, policies, strict=bool(due))
+            if seed in due
+        }
+        return [{**row, **found.get(seed, tracker.skip())} for seed, row in by_seed.items()]
 
     def _save(self) -> None:
         record = {**self._progress.to_dict(), "run": self.run.to_dict(), "version": tt.__version__}
-        state = self._placement.local(self._state)
+        state = self._local_state()
         if self._checkpoints is not None:
             self._checkpoints.save(self._progress.iteration, state, record)
             if self._tracker is not None:
                 self._tracker.forget(self._checkpoints.iterations[0])
         self.saved = self._progress.iteration
 
-    def _policies(self) -> list[Policy]:
-        state = self._placement.local(self._state)
+    def _local_state(self) -> TrainState:
+        """The whole state on one device; every process has to call it."""
+        return self._placement.local(self._state)
+
+    def _policies(self, state: TrainState) -> list[Policy]:
         return policies(self.run, state.params, np.asarray(state.iteration))
 
-    def _summary(self) -> dict[str, Any]:
-        state = self._placement.local(self._state)
+    def _summarize(self, state: TrainState, log: MetricsLog) -> None:
         seeds = zip(self.run.seed_range, state.episodes, self._progress.solved, strict=True)
-        return {
+        summary = {
             "env_id": self.run.config.env_id,
             "iterations": self._progress.iteration,
             "training_seconds": round(self._progress.seconds, 3),
@@ -286,6 +294,8 @@ class Session:
                 for seed, episodes, first in seeds
             ],
         }
+        write_json(self.folder.summary, summary)
+        report.save_curves(log.rows, self.folder.curves, self.folder.path.name)
 
     def _introduce(self) -> None:
         run = self.run

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from agents import pretrained
-from agents.acting.evaluation import Evaluation, Evaluator
+from agents.acting.evaluation import Evaluator
 from agents.acting.policy import Policy
+from agents.ppo.learner import GREEDY
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import Row
 from trap_tube_jax.state import State
 
-PREFIX = "greedy_"
-OVERALL = "greedy_overall"
+OVERALL = f"{GREEDY}overall"
 
 
 class Tracker:
@@ -75,7 +75,7 @@ class Tracker:
 
     def skip(self) -> dict[str, float]:
         """The columns of an iteration without evaluation."""
-        return {**{PREFIX + name: math.nan for name in self._evaluator.tasks}, OVERALL: math.nan}
+        return {**{GREEDY + name: math.nan for name in self._evaluator.tasks}, OVERALL: math.nan}
 
     def evaluate(self, seed: int, policy: Policy) -> dict[str, float]:
         """Plays with the policy of one seed and returns the columns of its row."""
@@ -85,12 +85,4 @@ class Tracker:
         if overall > self._best[seed]:
             self._best[seed] = overall
             pretrained.save(self._folder.best(seed, policy.iteration), policy)
-        return {**{PREFIX + name: share for name, share in shares.items()}, OVERALL: overall}
-
-
-def steps_taken(played: Mapping[str, Evaluation]) -> dict[str, np.ndarray]:
-    """By set, the steps i32[B] taken in every task, 0 where it is not solved."""
-    return {
-        name: np.where(outcome.solved, outcome.length, 0).astype(np.int32)
-        for name, outcome in played.items()
-    }
+        return {**{GREEDY + name: share for name, share in shares.items()}, OVERALL: overall}
