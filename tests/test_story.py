@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from agents.config import Config
+from agents.runs import story as stories
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved
-from agents.runs.story import Story, resume_command
+from agents.runs.story import resume_command
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
@@ -27,7 +28,7 @@ def scores(own, percent, others):
 def story(tmp_path, own, percent, others, *, is_solved=True, **settings):
     run = Run(Config.preset("paper", env_id=own, iterations=7, **settings))
     folder = RunFolder(tmp_path / "x")
-    return Story.of(
+    return stories.story(
         folder,
         run,
         [scores(own, percent, others)],

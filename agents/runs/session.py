@@ -27,7 +27,7 @@ from agents.runs.loading import policies
 from agents.runs.metrics import MetricsLog, Row, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.stopping import Stopped, StopSignals
-from agents.runs.story import Story, resume_command
+from agents.runs.story import resume_command, story
 from agents.runs.tracking import Tracker
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
@@ -137,11 +137,13 @@ class Session:
         folder.animation.unlink(missing_ok=True)
         report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
         solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
-        story = Story.of(folder, run, results.values(), list(solved.values()), self.resume_command)
+        above, below = story(
+            folder, run, results.values(), list(solved.values()), self.resume_command
+        )
         report_page.save(
             folder.page,
             title=folder.path.name,
-            sentences=[*story.before, *story.after],
+            sentences=[*above, *below],
             settings={"preset": run.preset, **run.config.to_dict()},
             scores=results,
             curves=folder.curves,
@@ -149,14 +151,14 @@ class Session:
             played=played[trained[0].name],
             pay=functools.partial(pay, jax.tree.map(lambda x: x[0], state)),
         )
-        self._say(story.before)
+        self._say(above)
         for name, result in results.items():
             table = report.evaluation_table(result, f"{folder.path.name}, {name}")
             self.console.print(table.to_rich())
         self.console.print(report.FEW_LAYOUTS)
         self.console.print(report.summary_table(solved, env.id).to_rich())
         self._say_where()
-        self._say(story.after)
+        self._say(below)
 
     def summarize(self) -> None:
         """Writes the summary and the learning curves."""

@@ -4,7 +4,6 @@ import shlex
 import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import trap_tube_jax as tt
 from agents.runs.folder import Run, RunFolder
@@ -15,46 +14,31 @@ from trap_tube_jax.scoring.scores import Score
 LITTLE, MUCH = 20.0, 80.0
 
 
-class Story(NamedTuple):
-    """The sentences that a run ends with.
+def story(
+    folder: RunFolder,
+    run: Run,
+    results: Iterable[Sequence[Score]],
+    solved: Sequence[FirstSolved | None],
+    command: str,
+) -> tuple[list[str], list[str]]:
+    """The sentences that a run ends with: those above its tables, and those below them.
 
-    Attributes:
-      before: above the tables.
-      after: below them.
+    Args:
+      folder: its files.
+      run: what it trained.
+      results: the scores of every seed.
+      solved: when each seed first solved what it trains on.
+      command: the one that continues it.
     """
-
-    before: list[str]
-    after: list[str]
-
-    @classmethod
-    def of(
-        cls,
-        folder: RunFolder,
-        run: Run,
-        results: Iterable[Sequence[Score]],
-        solved: Sequence[FirstSolved | None],
-        command: str,
-    ) -> "Story":
-        """The story of a run.
-
-        Args:
-          folder: its files.
-          run: what it trained.
-          results: the scores of every seed.
-          solved: when each seed first solved what it trains on.
-          command: the one that continues it.
-        """
-        own = tt.task_set(run.config.env_id)
-        scores = [score for each in results for score in each]
-        percent = statistics.fmean(score.percent for score in scores if score.set == own.short)
-        others = [score.percent for score in scores if score.set != own.short]
-        watch = f"Watch a solved episode: {folder.animation}"
-        if not folder.animation.exists():
-            watch = "No episode of the evaluation is solved, so there is none to watch."
-        return cls(
-            before=["", _learnt(own, percent, solved), watch, _transfers(own, percent, others)],
-            after=["", f"Next: {_next_step(folder, run, percent, solved, command)}"],
-        )
+    own = tt.task_set(run.config.env_id)
+    scores = [score for each in results for score in each]
+    percent = statistics.fmean(score.percent for score in scores if score.set == own.short)
+    others = [score.percent for score in scores if score.set != own.short]
+    watch = f"Watch a solved episode: {folder.animation}"
+    if not folder.animation.exists():
+        watch = "No episode of the evaluation is solved, so there is none to watch."
+    above = ["", _learnt(own, percent, solved), watch, _transfers(own, percent, others)]
+    return above, ["", f"Next: {_next_step(folder, run, percent, solved, command)}"]
 
 
 def _learnt(own: tt.TaskSet, percent: float, solved: Sequence[FirstSolved | None]) -> str:
