@@ -226,6 +226,10 @@ def speed_up_table(rows: Sequence[dict[str, float | int | None]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m benchmarks.scaling_model")
+    if not options.latency >= 0:
+        raise ValueError(f"latency must be >= 0, got {options.latency}")
+    if not options.bandwidth > 0:
+        raise ValueError(f"bandwidth must be > 0, got {options.bandwidth}")
     config = Config.preset(options.preset, env_id=task_set(options.env).id)
     jax.config.update("jax_num_cpu_devices", COUNTED_DEVICES)
     found = compiled_exchanges(config, len(jax.devices()))

@@ -27,6 +27,7 @@ from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
 
 MATRIX = 4096
@@ -268,6 +269,8 @@ def _jitted(function: Callable[..., Any], train: Learner, *arrays: Any) -> Calla
 
 def main(arguments: Arguments) -> list[Part]:
     """Measures, prints a table, and writes JSON if asked to."""
+    check_integer("warm", arguments.warm, minimum=0)
+    check_integer("repeats", arguments.repeats)
     configs = [Config.preset(arguments.preset, env_id=task_set(env).id) for env in arguments.env]
     console = Console()
     console.print(harness.machine())

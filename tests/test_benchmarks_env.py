@@ -87,6 +87,60 @@ def test_an_unknown_set_ends_in_one_line(capsys, monkeypatch, module, option):
     assert capsys.readouterr().err.startswith("error: unknown task set 'typo'; allowed: ")
 
 
+@pytest.mark.parametrize(
+    ("module", "arguments", "message"),
+    [
+        *(
+            (module, (f"--{name.replace('_', '-')}", "0"), f"{name} must be an integer >= 1, got 0")
+            for module in (env_throughput, peers)
+            for name in ("num_envs", "num_steps", "repeats", "devices")
+        ),
+        (
+            env_throughput,
+            ("--num-envs", "4", "3", "--devices", "2"),
+            "num_envs must be multiples of devices=2, got 3",
+        ),
+        (
+            peers,
+            ("--num-envs", "3", "--devices", "2"),
+            "num_envs must be multiples of devices=2, got 3",
+        ),
+        (scaling, ("--num-envs", "4", "0"), "num_envs must be an integer >= 1, got 0"),
+        (scaling, ("--seeds", "1", "0"), "seeds must be an integer >= 1, got 0"),
+        (scaling, ("--episodes", "64", "9"), "episodes must be multiples of minibatch=32, got 9"),
+        (train_throughput, ("--repeats", "0"), "repeats must be an integer >= 1, got 0"),
+        (train_throughput, ("--warm", "-1"), "warm must be an integer >= 0, got -1"),
+        (scaling_model, ("--latency", "-1"), "latency must be >= 0, got -1.0"),
+        (scaling_model, ("--bandwidth", "0"), "bandwidth must be > 0, got 0.0"),
+    ],
+)
+def test_a_number_that_cannot_be_is_refused_before_measuring(
+    capsys, monkeypatch, module, arguments, message
+):
+    def fail(*args, **kwargs):
+        raise AssertionError("began before the check")
+
+    monkeypatch.setattr(harness, "measure", fail)
+    monkeypatch.setattr(scaling.subprocess, "run", fail)
+    monkeypatch.setattr(harness, "machine", fail)
+    monkeypatch.setattr(sys, "argv", ["x", *arguments])
+    with pytest.raises(SystemExit) as exit_info:
+        runpy.run_path(module.__file__, run_name="__main__")
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err == f"error: {message}\n"
+
+
+def test_the_sizes_by_default_divide_over_two_devices():
+    harness.check_counts(env_throughput.Arguments().num_envs, devices=2)
+    harness.check_counts((peers.Arguments().num_envs,), devices=2)
+
+
+def test_more_devices_than_accelerators_are_refused(monkeypatch):
+    monkeypatch.setattr(jax.config, "update", lambda *setting: None)
+    with pytest.raises(ValueError, match="devices must be at most 1, as many as there are, got 2"):
+        harness.use_devices(2)
+
+
 def test_compiling_is_what_the_first_call_took_more():
     timing = harness.Timing(first_s=5.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
     assert timing.compile_s == 3
