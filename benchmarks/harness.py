@@ -204,7 +204,7 @@ def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]
     return jax.jit(mapped)
 
 
-def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) -> float:
+def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
     """Bytes per second that a loop over a large array writes, reading as many.
 
     The array stays in place within a call, so that fresh pages from the operating system
@@ -216,7 +216,7 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) ->
     def rewrite(array):
         return jax.lax.fori_loop(0, passes, lambda i, old: old ^ i.astype(jnp.uint32), array)
 
-    return passes * num_bytes / measure(lambda: rewrite(source), repeats).median_s
+    return passes * num_bytes / measure(lambda: rewrite(source)).median_s
 
 
 def write_json(path: pathlib.Path, results: Sequence[Any], **extra: Any) -> None:

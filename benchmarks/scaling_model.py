@@ -131,7 +131,7 @@ def compiled_exchanges(config: Config, devices: int) -> list[Exchange]:
     return exchanges(advance.lower(state, np.ones(1, bool)).compile().as_text() or "")
 
 
-def share_seconds(config: Config, devices: int, repeats: int = 3) -> float:
+def share_seconds(config: Config, devices: int) -> float:
     """Seconds of an iteration of 1 / `devices` of the episodes and of every minibatch."""
     share = dataclasses.replace(
         config, episodes=config.episodes // devices, minibatch=config.minibatch // devices
@@ -139,10 +139,10 @@ def share_seconds(config: Config, devices: int, repeats: int = 3) -> float:
     train = make_train(share)
     state = jax.jit(train.init)(jax.random.key(0))
     iterate = jax.jit(train.iterate)
-    return harness.measure(lambda: iterate(state), repeats).median_s
+    return harness.measure(lambda: iterate(state), repeats=3).median_s
 
 
-def repeated_seconds(config: Config, repeats: int = 5) -> float:
+def repeated_seconds(config: Config) -> float:
     """Seconds of what every device does for all episodes: draws, rewards, advantages, ids."""
     curiosity = "counts" if config.curiosity == "counts" else "none"
     train = make_train(dataclasses.replace(config, curiosity=curiosity))
@@ -158,7 +158,7 @@ def repeated_seconds(config: Config, repeats: int = 5) -> float:
 
     reset_keys = jax.random.split(jax.random.key(1), config.episodes)
     trajectory = jax.jit(train.play)(state.params, reset_keys, jax.random.key(3))
-    return harness.measure(lambda: repeat(trajectory), repeats).median_s
+    return harness.measure(lambda: repeat(trajectory)).median_s
 
 
 def speed_up_rows(
