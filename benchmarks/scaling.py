@@ -66,7 +66,7 @@ class Point:
       steps_per_s: environment steps per second, all together; in training with one epoch
         of learning from each.
       peak_bytes: the largest resident memory of the process, JAX itself included.
-      compile_s: seconds of compiling.
+      compile_s: seconds of tracing and compiling; see `harness.Timing`.
     """
 
     kind: Kind

@@ -1,6 +1,6 @@
 """What several devices cost and gain: python -m benchmarks.scaling_model --help.
 
-Counts the bytes that devices exchange per update in the compiled program, and, with
+Counts the bytes that devices exchange per iteration in the compiled program, and, with
 --measure, times one device's share of the work for every number of devices. From both
 follows the speed-up, by the model in `benchmarks/results/scale.md`.
 """
@@ -231,8 +231,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not options.bandwidth > 0:
         raise ValueError(f"bandwidth must be > 0, got {options.bandwidth}")
     config = Config.preset(options.preset, env_id=task_set(options.env).id)
-    jax.config.update("jax_num_cpu_devices", COUNTED_DEVICES)
-    found = compiled_exchanges(config, len(jax.devices()))
+    harness.use_devices(COUNTED_DEVICES)
+    found = compiled_exchanges(config, COUNTED_DEVICES)
     print(exchange_table(found))
     rows = speed_up_rows(options, config, found) if options.measure else []
     if rows:

@@ -101,13 +101,16 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         state, _ = iterate(state)
     reset_key, action_key = jax.random.split(state.key)
     reset_keys = jax.random.split(reset_key, config.episodes)
-    play = jax.jit(lambda state: train.play(state.params, reset_keys, action_key))
-    trajectory = play(state)
+
+    def play(train: Learner, state: TrainState) -> Trajectory:
+        return train.play(state.params, reset_keys, action_key)
+
+    trajectory = _jitted(play, train, state)()
     batch, _, _ = jax.jit(train.prepare)(state, trajectory)
     flop = useful_flop(train, state, batch)
     parts: list[tuple[str, Callable[[], Any], float]] = [
-        ("iteration", lambda: iterate(state), sum(flop)),
-        ("rollout", lambda: play(state), flop.play),
+        ("iteration", _jitted(Learner.iterate, train, state), sum(flop)),
+        ("rollout", _jitted(play, train, state), flop.play),
         ("encoder", _jitted(_encoder_only, train, state, batch), flop.encode),
         (
             "recurrent part and heads",
@@ -263,6 +266,7 @@ def _optimizer_only(train: Learner, state: TrainState) -> Params:
 
 
 def _jitted(function: Callable[..., Any], train: Learner, *arrays: Any) -> Callable[[], Any]:
+    """A program of its own, which its first call compiles, whatever has been compiled before."""
     compiled = jax.jit(lambda *x: function(train, *x))
     return lambda: compiled(*arrays)
 

@@ -1,6 +1,7 @@
 """The benchmarks of training measure what they say."""
 
 import dataclasses
+import json
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import pytest
 
 from agents import Config
 from agents.networks.agent import Agent
+from agents.ppo.learner import Learner
 from benchmarks import harness, scaling, scaling_model, train_throughput
 from benchmarks.scaling_model import Exchange
 
@@ -55,16 +57,33 @@ def test_the_encoder_of_the_paper_costs_what_its_shapes_say():
 
 
 @pytest.mark.slow
-def test_an_iteration_is_split_into_its_parts():
-    parts = train_throughput.measure(CONFIG, warm=0, repeats=1)
+def test_an_iteration_is_split_into_its_parts(monkeypatch):
+    traced, own_play = [], Learner.play
+
+    def play(*arguments):
+        traced.append("play")
+        return own_play(*arguments)
+
+    def measure(function, repeats):
+        traced.append("measured")
+        function()
+        return TIMING
+
+    monkeypatch.setattr(Learner, "play", play)
+    monkeypatch.setattr(harness, "measure", measure)
+    parts = train_throughput.measure(CONFIG, warm=1, repeats=1)
     assert [part.name for part in parts] == [
         "iteration", "rollout", "encoder", "recurrent part and heads", "optimiser",
     ]  # fmt: skip
-    whole, play, encoder, core, optimiser = parts
-    assert whole.flop == play.flop + encoder.flop + core.flop
-    assert encoder.flop > play.flop > core.flop > 0
+    whole, rollout, encoder, core, optimiser = parts
+    assert whole.flop == rollout.flop + encoder.flop + core.flop
+    assert encoder.flop > rollout.flop > core.flop > 0
     assert optimiser.flop == 0
     assert all(part.env == "base" for part in parts)
+    first = traced.index("measured")
+    assert traced[first:] == ["measured", "play", "measured", "play", *3 * ["measured"]], (
+        "iteration and rollout compile in their first measured call"
+    )
 
 
 def test_operations_of_the_large_product_are_counted(monkeypatch, timed):
@@ -140,6 +159,23 @@ def test_the_speed_up_is_that_of_the_model(monkeypatch):
         {"devices": 8, "one_seed": None, "all_seeds": 8},
         {"devices": 16, "one_seed": None, "all_seeds": 8 * two},
         {"devices": 32, "one_seed": None, "all_seeds": 8 * four},
+    ]
+
+
+def test_exchanges_are_counted_on_as_many_devices_as_the_page_says(tmp_path, monkeypatch):
+    counted = []
+
+    def compiled_exchanges(config, devices):
+        counted.append(devices)
+        return [Exchange("all-reduce", 8, 3)]
+
+    monkeypatch.setattr(harness, "use_devices", counted.append)
+    monkeypatch.setattr(scaling_model, "compiled_exchanges", compiled_exchanges)
+    path = tmp_path / "scale.json"
+    scaling_model.main(["--output", str(path)])
+    assert counted == [8, 8]
+    assert json.loads(path.read_text())["results"] == [
+        {"kind": "all-reduce", "bytes": 8, "calls": 3}
     ]
 
 
