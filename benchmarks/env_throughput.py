@@ -27,7 +27,7 @@ class Arguments:
 
     Attributes:
       sets: ids or short names of task sets.
-      num_envs: batch sizes.
+      num_envs: batch sizes, each a multiple of `devices`.
       num_steps: steps of each environment per timed call; episodes last up to 50.
       repeats: timed calls; the median counts.
       devices: devices to divide the environments over; a CPU is made to appear as so many.
@@ -36,7 +36,7 @@ class Arguments:
     """
 
     sets: tuple[str, ...] = tuple(task_set.short for task_set in tt.PAPER_TASK_SETS)
-    num_envs: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384)
+    num_envs: tuple[int, ...] = (16, 256, 1024, 4096, 16384)
     num_steps: int = 100
     repeats: int = 20
     devices: int = 1
@@ -63,6 +63,12 @@ def sample_actions(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 def main(arguments: Arguments) -> list[harness.Throughput]:
     """Measures, prints a table, and writes JSON if asked to."""
+    harness.check_counts(
+        arguments.num_envs,
+        num_steps=arguments.num_steps,
+        repeats=arguments.repeats,
+        devices=arguments.devices,
+    )
     harness.use_devices(arguments.devices)
     subjects = [subject(name, plain=arguments.plain) for name in arguments.sets]
     console = Console()

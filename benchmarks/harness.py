@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from agents.runs.folder import write_json as write_record
 from agents.runs.machine import machine
+from trap_tube_jax.checks import check_integer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +95,44 @@ def measure(function: Callable[[], Any], repeats: int = 5) -> Timing:
     return Timing(first, statistics.median(later), min(later), max(later))
 
 
+def check_counts(
+    num_envs: Sequence[int], *, num_steps: int = 1, repeats: int = 1, devices: int = 1
+) -> None:
+    """Refuses what cannot be measured, before anything is.
+
+    Raises:
+      ValueError: naming what must be at least 1, or environments that the devices do not divide.
+    """
+    check_integer("num_steps", num_steps)
+    check_integer("repeats", repeats)
+    check_multiples("num_envs", num_envs, "devices", devices)
+
+
+def check_multiples(name: str, values: Sequence[int], divisor_name: str, divisor: int) -> None:
+    """Refuses values that are no positive multiples of the divisor.
+
+    Raises:
+      ValueError: naming the value and the divisor.
+    """
+    check_integer(divisor_name, divisor)
+    for value in values:
+        if check_integer(name, value) % divisor:
+            raise ValueError(f"{name} must be multiples of {divisor_name}={divisor}, got {value}")
+
+
 def use_devices(number: int) -> None:
-    """Makes a CPU appear as this many devices; before JAX is used for the first time."""
+    """Makes a CPU appear as this many devices; before JAX is used for the first time.
+
+    Raises:
+      ValueError: the accelerators that JAX uses instead are fewer.
+    """
     if number > 1:
         jax.config.update("jax_num_cpu_devices", number)
+    if number > jax.device_count():
+        raise ValueError(
+            f"devices must be at most {jax.device_count()}, as many as there are, got {number}; "
+            "JAX_PLATFORMS=cpu divides the CPU instead"
+        )
 
 
 def measure_throughput(
@@ -111,10 +146,9 @@ def measure_throughput(
     devices step a part of the environments each, and exchange nothing.
 
     Raises:
-      ValueError: the devices do not divide the environments.
+      ValueError: see `check_counts`.
     """
-    if num_envs % devices:
-        raise ValueError(f"devices must divide num_envs={num_envs}, got {devices}")
+    check_counts((num_envs,), num_steps=num_steps, repeats=repeats, devices=devices)
     own_envs = num_envs // devices
 
     def reset(keys):
@@ -170,7 +204,7 @@ def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]
     return jax.jit(mapped)
 
 
-def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) -> float:
+def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
     """Bytes per second that a loop over a large array writes, reading as many.
 
     The array stays in place within a call, so that fresh pages from the operating system
@@ -182,7 +216,7 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8, repeats: int = 5) ->
     def rewrite(array):
         return jax.lax.fori_loop(0, passes, lambda i, old: old ^ i.astype(jnp.uint32), array)
 
-    return passes * num_bytes / measure(lambda: rewrite(source), repeats).median_s
+    return passes * num_bytes / measure(lambda: rewrite(source)).median_s
 
 
 def write_json(path: pathlib.Path, results: Sequence[Any], **extra: Any) -> None:

@@ -25,7 +25,7 @@ class Arguments:
     """What to measure.
 
     Attributes:
-      num_envs: batch size.
+      num_envs: batch size, a multiple of `devices`.
       num_steps: steps of each environment per timed call.
       repeats: timed calls; the median counts.
       devices: devices to divide the environments over; a CPU is made to appear as so many.
@@ -153,7 +153,7 @@ def run(arguments: Arguments) -> tuple[list[harness.Throughput], dict[str, str]]
     """Measures our own sets and every peer; returns results and reasons of the skipped peers.
 
     Raises:
-      ValueError: one of our own sets is unknown, or the devices do not divide the environments.
+      ValueError: one of our own sets is unknown, or cannot be measured.
     """
 
     def measure(subject: harness.Subject) -> harness.Throughput:
@@ -179,6 +179,12 @@ def run(arguments: Arguments) -> tuple[list[harness.Throughput], dict[str, str]]
 
 def main(arguments: Arguments) -> None:
     """Measures, prints a table and the skipped peers, and writes JSON if asked to."""
+    harness.check_counts(
+        (arguments.num_envs,),
+        num_steps=arguments.num_steps,
+        repeats=arguments.repeats,
+        devices=arguments.devices,
+    )
     harness.use_devices(arguments.devices)
     console = Console()
     console.print(harness.machine())

@@ -22,6 +22,7 @@ from rich.table import Table
 from agents import Config, make_train
 from benchmarks import harness
 from benchmarks.env_throughput import subject
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.registry import task_set
 
@@ -40,7 +41,7 @@ class Arguments:
     Attributes:
       sets: task sets of the environment's points, by id or short name.
       num_envs: batch sizes of the environment.
-      episodes: episodes per iteration of training, on base.
+      episodes: episodes per iteration of training, on base; whole minibatches of the fast preset.
       seeds: seeds trained side by side, 256 episodes each, on base.
       json: file to write the results to.
       figure: picture to write them to.
@@ -65,7 +66,7 @@ class Point:
       steps_per_s: environment steps per second, all together; in training with one epoch
         of learning from each.
       peak_bytes: the largest resident memory of the process, JAX itself included.
-      compile_s: seconds of compiling.
+      compile_s: seconds of tracing and compiling; see `harness.Timing`.
     """
 
     kind: Kind
@@ -150,7 +151,13 @@ def save_figure(points: Sequence[Point], path: pathlib.Path) -> None:
 
 def main(arguments: Arguments) -> list[Point]:
     """Measures all points, prints tables, and writes what is asked for."""
-    sets = [task_set(name).short for name in arguments.sets]  # refuses unknown ones at once
+    # What cannot be measured is refused at once, not after what can.
+    sets = [task_set(name).short for name in arguments.sets]
+    harness.check_counts(arguments.num_envs)
+    for seeds in arguments.seeds:
+        check_integer("seeds", seeds)
+    minibatch = Config.preset("fast").minibatch
+    harness.check_multiples("episodes", arguments.episodes, "minibatch", minibatch)
     console = Console()
     console.print(harness.machine())
     wanted: list[tuple[Kind, str, int]] = [

@@ -1,6 +1,6 @@
 """What several devices cost and gain: python -m benchmarks.scaling_model --help.
 
-Counts the bytes that devices exchange per update in the compiled program, and, with
+Counts the bytes that devices exchange per iteration in the compiled program, and, with
 --measure, times one device's share of the work for every number of devices. From both
 follows the speed-up, by the model in `benchmarks/results/scale.md`.
 """
@@ -131,7 +131,7 @@ def compiled_exchanges(config: Config, devices: int) -> list[Exchange]:
     return exchanges(advance.lower(state, np.ones(1, bool)).compile().as_text() or "")
 
 
-def share_seconds(config: Config, devices: int, repeats: int = 3) -> float:
+def share_seconds(config: Config, devices: int) -> float:
     """Seconds of an iteration of 1 / `devices` of the episodes and of every minibatch."""
     share = dataclasses.replace(
         config, episodes=config.episodes // devices, minibatch=config.minibatch // devices
@@ -139,10 +139,10 @@ def share_seconds(config: Config, devices: int, repeats: int = 3) -> float:
     train = make_train(share)
     state = jax.jit(train.init)(jax.random.key(0))
     iterate = jax.jit(train.iterate)
-    return harness.measure(lambda: iterate(state), repeats).median_s
+    return harness.measure(lambda: iterate(state), repeats=3).median_s
 
 
-def repeated_seconds(config: Config, repeats: int = 5) -> float:
+def repeated_seconds(config: Config) -> float:
     """Seconds of what every device does for all episodes: draws, rewards, advantages, ids."""
     curiosity = "counts" if config.curiosity == "counts" else "none"
     train = make_train(dataclasses.replace(config, curiosity=curiosity))
@@ -158,7 +158,7 @@ def repeated_seconds(config: Config, repeats: int = 5) -> float:
 
     reset_keys = jax.random.split(jax.random.key(1), config.episodes)
     trajectory = jax.jit(train.play)(state.params, reset_keys, jax.random.key(3))
-    return harness.measure(lambda: repeat(trajectory), repeats).median_s
+    return harness.measure(lambda: repeat(trajectory)).median_s
 
 
 def speed_up_rows(
@@ -226,9 +226,13 @@ def speed_up_table(rows: Sequence[dict[str, float | int | None]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
     options = tyro.cli(Options, args=arguments, prog="python -m benchmarks.scaling_model")
+    if not options.latency >= 0:
+        raise ValueError(f"latency must be >= 0, got {options.latency}")
+    if not options.bandwidth > 0:
+        raise ValueError(f"bandwidth must be > 0, got {options.bandwidth}")
     config = Config.preset(options.preset, env_id=task_set(options.env).id)
-    jax.config.update("jax_num_cpu_devices", COUNTED_DEVICES)
-    found = compiled_exchanges(config, len(jax.devices()))
+    harness.use_devices(COUNTED_DEVICES)
+    found = compiled_exchanges(config, COUNTED_DEVICES)
     print(exchange_table(found))
     rows = speed_up_rows(options, config, found) if options.measure else []
     if rows:

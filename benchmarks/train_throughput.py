@@ -27,6 +27,7 @@ from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
 
 MATRIX = 4096
@@ -100,13 +101,16 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         state, _ = iterate(state)
     reset_key, action_key = jax.random.split(state.key)
     reset_keys = jax.random.split(reset_key, config.episodes)
-    play = jax.jit(lambda state: train.play(state.params, reset_keys, action_key))
-    trajectory = play(state)
+
+    def play(train: Learner, state: TrainState) -> Trajectory:
+        return train.play(state.params, reset_keys, action_key)
+
+    trajectory = _jitted(play, train, state)()
     batch, _, _ = jax.jit(train.prepare)(state, trajectory)
     flop = useful_flop(train, state, batch)
     parts: list[tuple[str, Callable[[], Any], float]] = [
-        ("iteration", lambda: iterate(state), sum(flop)),
-        ("rollout", lambda: play(state), flop.play),
+        ("iteration", _jitted(Learner.iterate, train, state), sum(flop)),
+        ("rollout", _jitted(play, train, state), flop.play),
         ("encoder", _jitted(_encoder_only, train, state, batch), flop.encode),
         (
             "recurrent part and heads",
@@ -164,11 +168,11 @@ def matrix_flop(jaxpr: ClosedJaxpr | Jaxpr) -> float:
     return total
 
 
-def matrix_product_flops(repeats: int = 5) -> float:
+def matrix_product_flops() -> float:
     """Floating-point operations per second of a large float32 matrix product."""
     matrix = jnp.ones((MATRIX, MATRIX))
     multiply = jax.jit(jnp.matmul)
-    timing = harness.measure(lambda: multiply(matrix, matrix), repeats)
+    timing = harness.measure(lambda: multiply(matrix, matrix))
     return 2.0 * MATRIX**3 / timing.median_s
 
 
@@ -262,12 +266,15 @@ def _optimizer_only(train: Learner, state: TrainState) -> Params:
 
 
 def _jitted(function: Callable[..., Any], train: Learner, *arrays: Any) -> Callable[[], Any]:
+    """A program of its own, which its first call compiles, whatever has been compiled before."""
     compiled = jax.jit(lambda *x: function(train, *x))
     return lambda: compiled(*arrays)
 
 
 def main(arguments: Arguments) -> list[Part]:
     """Measures, prints a table, and writes JSON if asked to."""
+    check_integer("warm", arguments.warm, minimum=0)
+    check_integer("repeats", arguments.repeats)
     configs = [Config.preset(arguments.preset, env_id=task_set(env).id) for env in arguments.env]
     console = Console()
     console.print(harness.machine())

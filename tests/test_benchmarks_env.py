@@ -10,11 +10,26 @@ import jax.numpy as jnp
 import pytest
 
 from benchmarks import env_throughput, harness, peers, scaling, scaling_model, train_throughput
+from trap_tube_jax.vector import VectorState
+from trap_tube_jax.wrappers import AutoResetState
+
+TIMING = harness.Timing(first_s=9.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
 
 
-def test_measures_the_fast_path_and_writes_json(tmp_path, monkeypatch):
-    timing = harness.Timing(first_s=9.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
-    monkeypatch.setattr(harness, "measure", lambda function, repeats: (function(), timing)[1])
+@pytest.fixture
+def timed(monkeypatch):
+    """What the measured functions have returned; each takes two seconds."""
+    returned = []
+
+    def measure(function, repeats=5):
+        returned.append(function())
+        return TIMING
+
+    monkeypatch.setattr(harness, "measure", measure)
+    return returned
+
+
+def test_measures_the_fast_path_and_writes_json(tmp_path, monkeypatch, timed):
     monkeypatch.setattr(harness, "copy_bandwidth", lambda: 1e9)
     path = tmp_path / "results" / "env.json"
     arguments = env_throughput.Arguments(
@@ -25,27 +40,60 @@ def test_measures_the_fast_path_and_writes_json(tmp_path, monkeypatch):
     assert record["machine"]["jax"] == jax.__version__
     assert record["results"][0]["name"] == "base"
     assert result.observation_bytes == 12 * 12 * 3
-    assert (result.steps_per_s, result.timing) == (2 * 2 / 2.0, timing)
+    assert (result.steps_per_s, result.timing) == (2 * 2 / 2.0, TIMING)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.uint8, jnp.bool_])
-def test_consumes_every_observation_of_any_dtype(dtype):
-    seen = []
+@pytest.mark.parametrize(("plain", "kept"), [(False, VectorState), (True, AutoResetState)])
+def test_plain_measures_what_the_fast_path_is_compared_with(monkeypatch, plain, kept):
+    subjects = []
 
-    def step(state, actions):
-        jax.debug.callback(lambda a: seen.append(a.tolist()), actions)
-        return state + actions, jnp.ones((len(actions), 3), dtype)
+    def measure_throughput(subject, num_envs, **options):
+        subjects.append(subject)
+        return harness.Throughput(subject.name, num_envs, 1, 1, 1.0, 1, TIMING)
+
+    monkeypatch.setattr(harness, "copy_bandwidth", lambda: 1e9)
+    monkeypatch.setattr(harness, "measure_throughput", measure_throughput)
+    env_throughput.main(env_throughput.Arguments(sets=("base",), num_envs=(2,), plain=plain))
+    (subject,) = subjects
+    state, _ = jax.eval_shape(subject.reset, jax.random.split(jax.random.key(0), 2))
+    assert type(state) is kept
+
+
+@pytest.mark.parametrize(
+    ("dtype", "values", "folded"),
+    [
+        (jnp.uint8, (1, 2, 3, 4), 1 ^ 2 ^ 3 ^ 4),
+        (jnp.float32, (1, 2, 3, 4), 0x3F800000 ^ 0x40000000 ^ 0x40400000 ^ 0x40800000),
+        (jnp.bool_, (1, 1, 1, 0), 1),
+    ],
+)
+def test_consumes_every_observation_of_any_dtype(timed, dtype, values, folded):
+    observed = jnp.array((0, *values), dtype)
+
+    def observe(count):
+        return count, jnp.broadcast_to(observed[count][:, None], (len(count), 3))
 
     subject = harness.Subject(
         "counter",
-        reset=lambda keys: (jnp.zeros(len(keys), jnp.int32), jnp.ones((len(keys), 3), dtype)),
-        step=step,
+        reset=lambda keys: observe(jnp.zeros(len(keys), jnp.int32)),
+        step=lambda count, actions: observe(count + actions),
         sample_actions=lambda key, shape: jnp.ones(shape, jnp.int32),
     )
-    result = harness.measure_throughput(subject, 2, num_steps=3, repeats=1)
-    jax.effects_barrier()
+    result = harness.measure_throughput(subject, 2, num_steps=4)
     assert result.observation_bytes == 3 * jnp.dtype(dtype).itemsize
-    assert len(seen) == 2 * 3, "a first call and one repeat, three steps each"
+    assert timed[0].tolist() == [[[folded] * 3] * 2], "on one device, in two environments"
+
+
+def test_a_measurement_is_a_first_call_and_the_repeats(monkeypatch):
+    called, clock = [], iter([0, 9, 10, 12, 20, 21, 30, 33])
+    monkeypatch.setattr(harness, "time", SimpleNamespace(perf_counter=clock.__next__))
+    assert harness.measure(lambda: called.append(1), repeats=3) == TIMING
+    assert len(called) == 1 + 3
+
+
+def test_copied_bytes_are_those_of_all_passes(timed):
+    assert harness.copy_bandwidth(num_bytes=16, passes=3) == 3 * 16 / 2.0
+    assert timed[0].tolist() == [0 ^ 1 ^ 2] * 4
 
 
 def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):
@@ -87,9 +135,62 @@ def test_an_unknown_set_ends_in_one_line(capsys, monkeypatch, module, option):
     assert capsys.readouterr().err.startswith("error: unknown task set 'typo'; allowed: ")
 
 
+@pytest.mark.parametrize(
+    ("module", "arguments", "message"),
+    [
+        *(
+            (module, (f"--{name.replace('_', '-')}", "0"), f"{name} must be an integer >= 1, got 0")
+            for module in (env_throughput, peers)
+            for name in ("num_envs", "num_steps", "repeats", "devices")
+        ),
+        (
+            env_throughput,
+            ("--num-envs", "4", "3", "--devices", "2"),
+            "num_envs must be multiples of devices=2, got 3",
+        ),
+        (
+            peers,
+            ("--num-envs", "3", "--devices", "2"),
+            "num_envs must be multiples of devices=2, got 3",
+        ),
+        (scaling, ("--num-envs", "4", "0"), "num_envs must be an integer >= 1, got 0"),
+        (scaling, ("--seeds", "1", "0"), "seeds must be an integer >= 1, got 0"),
+        (scaling, ("--episodes", "64", "9"), "episodes must be multiples of minibatch=32, got 9"),
+        (train_throughput, ("--repeats", "0"), "repeats must be an integer >= 1, got 0"),
+        (train_throughput, ("--warm", "-1"), "warm must be an integer >= 0, got -1"),
+        (scaling_model, ("--latency", "-1"), "latency must be >= 0, got -1.0"),
+        (scaling_model, ("--bandwidth", "0"), "bandwidth must be > 0, got 0.0"),
+    ],
+)
+def test_a_number_that_cannot_be_is_refused_before_measuring(
+    capsys, monkeypatch, module, arguments, message
+):
+    def fail(*args, **kwargs):
+        raise AssertionError("began before the check")
+
+    monkeypatch.setattr(harness, "measure", fail)
+    monkeypatch.setattr(scaling.subprocess, "run", fail)
+    monkeypatch.setattr(harness, "machine", fail)
+    monkeypatch.setattr(sys, "argv", ["x", *arguments])
+    with pytest.raises(SystemExit) as exit_info:
+        runpy.run_path(module.__file__, run_name="__main__")
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err == f"error: {message}\n"
+
+
+def test_the_sizes_by_default_divide_over_two_devices():
+    harness.check_counts(env_throughput.Arguments().num_envs, devices=2)
+    harness.check_counts((peers.Arguments().num_envs,), devices=2)
+
+
+def test_more_devices_than_accelerators_are_refused(monkeypatch):
+    monkeypatch.setattr(jax.config, "update", lambda *setting: None)
+    with pytest.raises(ValueError, match="devices must be at most 1, as many as there are, got 2"):
+        harness.use_devices(2)
+
+
 def test_compiling_is_what_the_first_call_took_more():
-    timing = harness.Timing(first_s=5.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
-    assert timing.compile_s == 3
+    assert TIMING.compile_s == 9 - 2
 
 
 @pytest.mark.parametrize(("platform", "unit"), [("darwin", 1), ("linux", 1024)])
