@@ -58,6 +58,23 @@ def test_next_step_spends_a_step_on_the_reset():
     assert not timestep.reward.any()
 
 
+def test_a_solved_episode_ends_once():
+    base = tt.State.from_ascii(["AF.........T"] + ["............"] * 11)
+    batch = NextStepVectorEnvironment(tt.Environment(base=base))
+    step = jax.jit(batch.step)
+    state, _ = jax.jit(batch.reset)(jax.random.split(jax.random.key(0), 2))
+    state, timestep = step(state, np.array([[0, 3], [0, 1]]))  # the first onto the food
+    assert timestep.terminated.tolist() == [True, False]
+    assert timestep.discount.tolist() == [0, 1]
+    assert timestep.reward.tolist() == [1, 0]
+    state, timestep = step(state, np.array([[0, 3], [0, 0]]))
+    assert not timestep.done.any()
+    assert timestep.discount.tolist() == [1, 1]
+    assert not timestep.reward.any()
+    assert state.episodes.inner.agent.tolist() == [[0, 0], [0, 0]]
+    assert state.episodes.inner.time.tolist() == [0, 2]
+
+
 @pytest.mark.parametrize("library", ["gymnasium", "gymnax"])
 def test_an_adapter_without_its_library_says_what_to_install(library, monkeypatch):
     name = f"trap_tube_jax.adapters.to_{library}"

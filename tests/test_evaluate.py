@@ -17,7 +17,6 @@ from rich.console import Console
 
 import trap_tube_jax as tt
 from agents import make_train
-from agents.acting import evaluation
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.config import Config
 from agents.networks.agent import Agent
@@ -26,6 +25,7 @@ from agents.runs import report, report_page
 from trap_tube_jax.dynamics import step
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.registry import PAPER_TASK_SETS
+from trap_tube_jax.scoring import benchmark
 from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, wilson_interval
 from trap_tube_jax.scoring.tasks import (
     evaluation_keys,
@@ -175,7 +175,7 @@ def test_own_tasks_are_evaluated(grey_play):
 
 def test_blocks_change_nothing(grey_play, monkeypatch):
     evaluator, params, played = grey_play
-    monkeypatch.setattr(evaluation, "BLOCK", 3)
+    monkeypatch.setattr(benchmark, "BLOCK", 3)
     blocks = Evaluator(Config(**TINY, num_features=1), evaluator.tasks)
     assert_equal(blocks(params), played)
 

@@ -1,5 +1,6 @@
 """Playing by hand: keys, hints, recordings and the screen, without a terminal."""
 
+import dataclasses
 import functools
 import os
 import pty
@@ -37,6 +38,8 @@ def test_a_new_game_is_the_environments_task(game):
     np.testing.assert_array_equal(game.state.board, tt.base_state().board)
     with pytest.raises(ValueError, match="unknown task set 'nonesuch'"):
         play.new_game("nonesuch", 0)
+    with pytest.raises(ValueError, match="seed must be an integer >= 0 and <= 4294967295, got -1"):
+        play.new_game("base", -1)
 
 
 @pytest.mark.parametrize(
@@ -75,6 +78,8 @@ def test_undo_and_restart(game):
 
 def test_next_task(game):
     assert play.press(press_all(game, "k"), "n").seed == 1
+    last = dataclasses.replace(game, seed=2**32 - 1)
+    assert play.press(last, "n").seed == 0
 
 
 def test_unknown_keys_change_nothing(game):
@@ -122,6 +127,18 @@ def test_recordings(game, tmp_path):
         assert getattr(gif, "n_frames", 1) == 8
     with pytest.raises(ValueError, match=r"ends in .gif or .npz, got '.*episode.mp4'"):
         play.save(game, tmp_path / "episode.mp4")
+
+
+def test_a_recording_of_a_solved_episode(game, tmp_path):
+    near = game.state.replace(food=game.state.agent.at[1].add(2))
+    solved = press_all(dataclasses.replace(game, seed=7, states=(near,)), [RIGHT, RIGHT])
+    play.save(solved, tmp_path / "episode.npz")
+    with np.load(tmp_path / "episode.npz") as record:
+        assert record["seed"] == 7
+        assert record["rewards"].tolist() == [0, 1]
+        assert record["terminated"].tolist() == [False, False, True]
+        assert not record["truncated"].any()
+        assert record["time"].tolist() == [0, 1, 2]
 
 
 def test_what_cannot_be_saved_does_not_end_the_game(game, tmp_path, monkeypatch):

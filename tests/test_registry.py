@@ -1,5 +1,7 @@
 """The task sets by name."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from refusal import assert_refused
@@ -109,6 +111,14 @@ def test_make_refuses(options, words):
     assert_refused(words, tt.make, "TrapTube-v0", **options)
 
 
+@dataclasses.dataclass
+class Unhashable:
+    by: int
+
+    def __call__(self, key, state):
+        return state.replace(agent=state.agent - self.by)
+
+
 @pytest.mark.parametrize(
     ("name", "transfers", "short", "words"),
     [
@@ -122,6 +132,7 @@ def test_make_refuses(options, words):
         ("Mine-v0", tt.symbolic, None, ["transfers", "sequence", "symbolic"]),
         ("Mine-v0", None, None, ["transfers", "sequence", "None"]),
         ("Mine-v0", ("symbolic",), None, ["(key, state) -> state", "'symbolic'", "perceptual"]),
+        ("Mine-v0", (Unhashable(3),), None, ["hashable", "a frozen dataclass", "Unhashable(by=3)"]),
     ],
 )
 def test_register_refuses_a_name_or_transfer(own_task_sets, name, transfers, short, words):

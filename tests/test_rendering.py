@@ -78,6 +78,25 @@ def test_the_tool_is_one_bar_and_hidden_below_the_agent():
     np.testing.assert_array_equal(tiles[4, 1], alone[4, 1])
 
 
+def test_a_horizontal_tool_is_the_vertical_one_turned():
+    def draw(tool, extent):
+        state = tt.base_state().replace(tool=jnp.array(tool), tool_extent=jnp.array(extent))
+        return cells(tt.render(state, CELL, grid=False))
+
+    lying, standing = draw([2, 3], [1, 4])[2, 3:7], draw([3, 2], [4, 1])[3:7, 2]
+    np.testing.assert_array_equal(lying, standing.swapaxes(1, 2))
+    assert (lying != objects.BASE_COLORS[objects.TOOL]).any()
+
+
+def test_the_exits_sign_is_a_ring():
+    exit = cells(tt.render(tt.base_state(), CELL, grid=False))[5, 7]
+    inked = (exit != objects.BASE_COLORS[objects.EXIT]).any(-1)
+    middle = CELL // 2
+    assert not inked[middle - 1 : middle + 1, middle - 1 : middle + 1].any()
+    assert inked[middle, middle + 4]
+    assert not inked[0].any()
+
+
 def test_grid_lines_surround_the_cells():
     state = tt.base_state()
     changed = np.asarray(tt.render(state, 8) != tt.render(state, 8, grid=False)).any(-1)
@@ -142,10 +161,22 @@ def test_episode_frames_show_every_state_and_grasp():
     assert len(rendering.episode_frames(state, [], 8)) == 1
 
 
-@pytest.mark.parametrize("actions", [[3, 7, 1, 2], [[0.0, 1.0]], [[0, 1, 2]]])
+@pytest.mark.parametrize("actions", [5, [3, 7, 1, 2], [[0.0, 1.0]], [[0, 1, 2]]])
 def test_episode_frames_refuse_other_actions(actions):
     with pytest.raises(ValueError, match=r"actions must be integer\[T, 2\]"):
         rendering.episode_frames(tt.base_state(), actions)
+
+
+@pytest.mark.parametrize("action", [(9, 9), (0, 4), (4, 0), (-1, 2), (2, -1), (-2, -2)])
+def test_episode_frames_refuse_other_directions(action):
+    with pytest.raises(ValueError, match=rf"0 to 3, or \(-1, -1\), got \({action[0]}, {action[1]}"):
+        rendering.episode_frames(tt.base_state(), [[0, 0], action])
+
+
+def test_the_padding_of_a_plan_is_drawn_as_a_step_that_moves_nothing():
+    state = tt.base_state()
+    frames = rendering.episode_frames(state, [[-1, -1]] * 2, 8)
+    np.testing.assert_array_equal(frames, np.stack([tt.render(state, 8)] * 3))
 
 
 def test_gif_holds_the_frames(tmp_path):
@@ -164,6 +195,17 @@ def test_gif_holds_the_frames(tmp_path):
     assert durations == [100, 100, 600]
 
 
+def test_equal_frames_of_a_gif_become_one_and_others_do_not(tmp_path):
+    path = tmp_path / "still.gif"
+    frames = np.zeros((68, 4, 4, 3), np.uint8)
+    frames[-1] = 255
+    frames[:2, 0] = 255
+    tt.save_gif(frames, path, fps=0.1, hold=0)
+    with Image.open(path) as gif:
+        durations = [gif.seek(index) or gif.info["duration"] for index in range(3)]
+    assert durations == [20_000, 650_000, 10_000]
+
+
 def test_gif_of_more_colors_than_it_can_hold(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3)).astype(np.uint8)
     tt.save_gif(noise, tmp_path / "noise.gif")
@@ -180,7 +222,10 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
         (np.zeros((4, 4, 3), np.uint8), {}, r"got uint8\[4, 4, 3\]"),
         (np.zeros((0, 4, 4, 3), np.uint8), {}, "at least one"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 0}, "at most 50, got 0"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 51}, "at most 50, got 51"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"hold": -1}, "got -1"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"hold": np.inf}, "got inf"),
+        (np.zeros((66, 4, 4, 3), np.uint8), {"fps": 0.1}, "at most 655.35 s, got 661.0 s"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"hold": 700}, "at most 655.35 s"),
     ],
 )

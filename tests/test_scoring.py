@@ -3,6 +3,7 @@
 import json
 import re
 import zlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,14 @@ from refusal import assert_refused
 import trap_tube_jax as tt
 from trap_tube_jax import registry
 from trap_tube_jax.scoring import benchmark
-from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, evaluation_tasks, layout_numbers
+from trap_tube_jax.scoring.scores import Optimality
+from trap_tube_jax.scoring.tasks import (
+    ALL_SETS,
+    PROTOCOL,
+    evaluation_keys,
+    evaluation_tasks,
+    layout_numbers,
+)
 
 # Of the first 32 tasks of every set. Other tasks need another version of the protocol.
 DIGESTS = {
@@ -22,7 +30,7 @@ DIGESTS = {
         "pst": 1365254835, "psy": 246488204, "stsy": 327823811, "pstsy": 3988046806,
     },
 }  # fmt: skip
-UP, RIGHT = 0, 3
+UP, DOWN, RIGHT = 0, 1, 3
 
 
 class Rightward:
@@ -44,6 +52,15 @@ class Random:
 
     def act(self, observation, carry, key):
         return jax.random.randint(key, (len(observation), 2), 0, 4), carry
+
+
+class Detour(Rightward):
+    """As `Rightward`, after a step up and one down."""
+
+    def act(self, observation, carry, key):
+        action, following = super().act(observation, carry, key)
+        move = jnp.select([carry == 0, carry == 1], [UP, DOWN], RIGHT)
+        return action.at[:, 1].set(move), following
 
 
 class Single:
@@ -95,9 +112,11 @@ def rightward_food(tasks):
     return np.asarray(tasks.food[:, 0] == tasks.agent[:, 0])
 
 
+@pytest.mark.parametrize("partitionable", [True, False])
 @pytest.mark.parametrize("name", ALL_SETS)
-def test_the_tasks_of_a_version_of_the_protocol_never_change(name):
-    tasks = evaluation_tasks(name, 32)
+def test_the_tasks_of_a_version_of_the_protocol_never_change(name, partitionable):
+    with jax.threefry_partitionable(partitionable):
+        tasks = evaluation_tasks(name, 32)
     parts = (tasks.board, tasks.palette, tasks.agent, tasks.tool, tasks.tool_extent, tasks.food)
     data = b"".join(np.asarray(part, np.uint8).tobytes() for part in parts)
     assert zlib.crc32(data) == DIGESTS[PROTOCOL][name]
@@ -136,9 +155,39 @@ def test_few_layouts_are_those_that_return():
     assert numbers("sy", [0, 1, 2]) == [0, 1, 2]
 
 
+@pytest.mark.parametrize("part", ["board", "agent", "tool", "tool_extent", "food"])
+def test_layouts_differ_by_every_part(part):
+    base = jax.tree.map(np.asarray, tt.base_state())
+    other = base.replace(**{part: getattr(base, part) + 1}, palette=base.palette[::-1])
+    tasks = jax.tree.map(lambda *fields: np.stack(fields), base, other)
+    layout = layout_numbers("sy", tasks)
+    assert layout is not None
+    assert sorted(layout.tolist()) == [0, 1]
+
+
 def test_blocks_change_nothing(scores, monkeypatch):
     monkeypatch.setattr(benchmark, "BLOCK", 8)
     assert tt.score(Rightward(), ["near"], tasks=20)["near"] == scores["near"]
+
+
+def test_every_step_of_every_block_has_its_own_key(near, monkeypatch):
+    """Three blocks of five steps, of which none ends early."""
+    monkeypatch.setattr(benchmark, "BLOCK", 8)
+    seen = []
+
+    def record(data):
+        seen.append(tuple(data.tolist()))
+
+    class Recorder(Random):
+        def act(self, observation, carry, key):
+            jax.debug.callback(
+                lambda data: seen.append(tuple(data.tolist())), jax.random.key_data(key)
+            )
+            return jnp.zeros((len(observation), 2), jnp.int32), carry
+
+    assert tt.score(Recorder(), ["near"], tasks=20)["near"].solved == 0
+    jax.effects_barrier()
+    assert len(seen) == len(set(seen)) == 15
 
 
 @pytest.mark.parametrize(("max_steps", "counts"), [(2, False), (3, True)])
@@ -171,9 +220,34 @@ def test_optimality_compares_the_first_tasks():
     assert "of solvable %" in str(scores)
 
 
+def test_optimality_of_what_is_solved(near):
+    """Two steps are lost on the detour. What is not in the agent's row is beyond 5 steps."""
+
+    def far_if_below(key, state):
+        state = near.transfers[0](key, state)
+        is_below = state.food[0] > state.agent[0]
+        return state.replace(food=state.food + jnp.stack([0, 3 * is_below]))
+
+    tt.register("Far-v0", (far_if_below,), base=near.base, max_steps=5)
+    near_ones = rightward_food(evaluation_tasks("Far-v0", 6)).sum()
+    assert 0 < near_ones < 6
+    score = tt.score(Detour(), ["Far-v0"], tasks=8, optimality=6)["Far-v0"]
+    assert score.mean_steps == 5
+    assert score.optimality == Optimality(near_ones, 100, 3 / 5, 3 / 5)
+
+
+@pytest.mark.parametrize("function", [tt.score, tt.score_gymnasium])
+def test_the_number_of_features_is_that_of_the_tasks(near, function):
+    agent = Rightward() if function is tt.score else Single(RIGHT)
+    assert_refused(["num_features=5", "has 3"], function, agent, ["near"], num_features=5)
+
+
 def test_draws_are_those_of_the_seed_whatever_else_is_scored(near):
-    first, other = (tt.score(Random(), ["near"], 64, seed=seed)["near"] for seed in (0, 1))
-    assert first != other
+    one: Any = np.int64(1)
+    first, other = (tt.score(Random(), ["near"], 64, seed=seed) for seed in (0, one))
+    assert json.loads(json.dumps(other.to_dict()))["seed"] == 1
+    first = first["near"]
+    assert first != other["near"]
     assert 0 < first.solved < 64
     assert tt.score(Random(), ["base", "near"], 64)["near"] == first
 
@@ -208,6 +282,19 @@ def test_refusals():
     assert_refused([">= 1", "0"], tt.score, Rightward(), ["sy"], 0)
     assert_refused(["optimality", ">= 0", "-1"], tt.score, Rightward(), ["sy"], optimality=-1)
     assert_refused(["predict(observation)", "neither"], tt.score_gymnasium, object())
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 2**70, 1.5, True, None, "0"])
+def test_seeds_are_checked(seed):
+    words = ["seed", ">= 0 and <= 4294967295", repr(seed)]
+    assert_refused(words, tt.score, Random(), ["base"], seed=seed)
+
+
+def test_the_purpose_of_tasks_is_checked():
+    words = ["purpose", "test, validation", "'train'"]
+    purpose: Any = "train"
+    assert_refused(words, evaluation_tasks, "base", 1, purpose=purpose)
+    assert_refused(words, evaluation_keys, "TrapTube-v0", 1, purpose)
 
 
 @pytest.mark.parametrize("action", [16, -1, (0, 4), (0, 1, 2), (), 0.0, "up", None])

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import brute_force
 import jax
@@ -15,10 +16,11 @@ from PIL import Image
 import trap_tube_jax as tt
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
-from trap_tube_jax.solver.__main__ import _distances_line, main
+from trap_tube_jax.solver import pictures
+from trap_tube_jax.solver.__main__ import _caption, _distances_line, main
 from trap_tube_jax.solver.distance import count_reachable
 from trap_tube_jax.solver.search import checked, levels, take
-from trap_tube_jax.solver.survey import draw_tasks, survey
+from trap_tube_jax.solver.survey import Survey, draw_tasks, survey
 from trap_tube_jax.transfers import swap_with_tool
 
 NUM_ROOMS = 30
@@ -98,6 +100,11 @@ def room_plans(rooms) -> tt.Plan:
 @pytest.fixture(scope="module")
 def workshop() -> tt.State:
     return tt.State.from_ascii(WORKSHOP)
+
+
+@pytest.fixture(scope="module")
+def workshop_distances(workshop) -> tt.Distances:
+    return tt.distances(workshop)
 
 
 @pytest.fixture(scope="module")
@@ -219,10 +226,39 @@ def test_equal_tasks_of_a_batch_get_equal_plans(base_plan):
     np.testing.assert_array_equal(plans.actions, np.stack([base_plan.actions] * 2))
 
 
-def test_dtypes_are_those_documented(base_plan, room_plans):
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"board": np.array([[0] * 5, [0, 0, TUBE1, 0, 0], [0] * 5])},
+        {"tool_extent": (2, 1)},
+        {"food": (0, 4)},
+        {"tool": (1, 2)},
+        {"agent": (0, 0)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_tasks_of_a_batch_that_differ_in_anything_have_plans_of_their_own(change):
+    parts = {"agent": (1, 0), "food": (1, 4), "tool": (0, 2), "tool_extent": (1, 1)}
+    board = np.full((12, 12), TUBE1)
+    states = []
+    for changed in ({}, change):
+        fields = {"board": np.zeros((3, 5)), **parts, **changed}
+        board[:3, :5] = fields.pop("board")
+        states.append(tt.State.create(board=board.copy(), **fields))
+    one, other = map(tt.solve, states)
+    assert one.actions.tolist() != other.actions.tolist()
+    plans = tt.solve_batch(stack(states))
+    for index, plan in enumerate((one, other)):
+        found = take(plans, index)
+        np.testing.assert_array_equal(found.actions[: found.length], plan.actions)
+
+
+def test_dtypes_are_those_documented(base_plan, room_plans, workshop):
     for plan in (base_plan, room_plans):
         dtypes = [field.dtype for field in (plan.actions, plan.length, plan.solvable)]
         assert dtypes == [np.int32, np.int32, np.bool_]
+    for _, level in zip(range(3), levels(checked(workshop)), strict=False):
+        assert [field.dtype for field in level] == [np.int32, np.int32, np.bool_, np.int64]
 
 
 @pytest.mark.parametrize("num_features", [1, 5])
@@ -253,12 +289,12 @@ def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
     np.testing.assert_array_equal(tt.solve(state).actions, base_plan.actions[4:])
 
 
-def test_distances_equal_those_of_brute_force(workshop):
+def test_distances_equal_those_of_brute_force(workshop, workshop_distances):
     task, start = brute_force.read(workshop)
     edges = brute_force.graph(task, start)
     from_start = brute_force.distances_from(start, edges)
     to_goal = brute_force.distances_to_goal(edges)
-    found = tt.distances(workshop)
+    found = workshop_distances
     assert found.num_reachable == len(edges) == count_reachable(workshop)
     for agent, tool, food in edges:
         place = (*food, *tool, *agent)
@@ -267,8 +303,8 @@ def test_distances_equal_those_of_brute_force(workshop):
     assert np.count_nonzero(found.to_goal >= 0) == len(to_goal)
 
 
-def test_distances_satisfy_bellmans_equation(workshop):
-    found = tt.distances(workshop)
+def test_distances_satisfy_bellmans_equation(workshop, workshop_distances):
+    found = workshop_distances
     cells = np.argwhere(found.to_goal > 0).astype(np.int32)
     states = jax.vmap(lambda cell: workshop.replace(food=cell[:2], tool=cell[2:4], agent=cell[4:]))(
         cells
@@ -281,8 +317,8 @@ def test_distances_satisfy_bellmans_equation(workshop):
     np.testing.assert_array_equal(found.lookup(states), 1 + best)
 
 
-def test_distances_count_down_along_the_plan(workshop):
-    found, plan = tt.distances(workshop), tt.solve(workshop)
+def test_distances_count_down_along_the_plan(workshop, workshop_distances):
+    found, plan = workshop_distances, tt.solve(workshop)
     state = workshop
     for time, action in enumerate(plan.actions):
         assert found.lookup(state) == plan.length - time
@@ -313,11 +349,51 @@ def test_refused_states():
         tt.solve(stack([base, base]))
 
 
-def test_survey_refuses_numbers_out_of_range():
-    with pytest.raises(ValueError, match="tasks must be >= 1, got 0"):
-        survey(tt.task_set("p"), tasks=0, graphs=0)
-    with pytest.raises(ValueError, match="graphs must be from 0 to tasks=2, got 3"):
-        survey(tt.task_set("p"), tasks=2, graphs=3)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tasks": 0, "graphs": 0}, "tasks must be an integer >= 1, got 0"),
+        ({"tasks": 2, "graphs": 3}, "graphs must be an integer >= 0 and <= 2, got 3"),
+        ({"tasks": 2, "graphs": -1}, "graphs must be an integer >= 0 and <= 2, got -1"),
+        ({"tasks": 2, "graphs": 0, "seed": 2**32}, "seed must be .* <= 4294967295, got 4294967296"),
+    ],
+)
+def test_survey_refuses(options, message):
+    with pytest.raises(ValueError, match=message):
+        survey(tt.task_set("p"), **options)
+
+
+def test_survey_takes_every_task_of_the_seed_once(monkeypatch):
+    """Numbers stand for the tasks, and for what is found in them."""
+    for name, replacement in {
+        "TASKS_PER_CALL": 2,
+        "draw_tasks": lambda entry, tasks, seed: 10 * seed + np.arange(tasks),
+        "solve_batch": lambda tasks: SimpleNamespace(length=tasks),
+        "count_reachable": lambda task: task,
+    }.items():
+        monkeypatch.setattr(f"trap_tube_jax.solver.survey.{name}", replacement)
+    done = []
+    found = survey(tt.task_set("p"), tasks=5, graphs=3, seed=4, advance=done.append)
+    assert found.length.tolist() == [40, 41, 42, 43, 44]
+    assert found.reachable.tolist() == [40, 41, 42]
+    assert found.seed == 4
+    assert done == [2, 2, 1, 1, 1, 1]
+
+
+def test_the_figures_of_a_survey():
+    lengths, reachable = np.array([4, -1, 8, 6, -1]), np.array([10, 40])
+    found = Survey(tt.task_set("p"), 3, lengths, reachable).summary()
+    quantiles = found.pop("quantiles")
+    assert found == {
+        "id": "PerceptualTrapTube-v0",
+        "tasks": 5,
+        "seed": 3,
+        "solvable": 0.6,
+        "mean": 6,
+        "longest": 8,
+        "reachable": {"tasks": 2, "mean": 25, "fewest": 10, "most": 40},
+    }
+    assert quantiles == pytest.approx({"5": 4.2, "25": 5, "50": 6, "75": 7, "95": 7.8})
 
 
 def test_command_line_surveys_task_sets(tmp_path, capsys):
@@ -333,7 +409,9 @@ def test_command_line_surveys_task_sets(tmp_path, capsys):
         assert image.format == "PNG"
 
 
-def test_command_line_shows_a_plan(tmp_path, capsys):
+def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypatch):
+    for module in ("matplotlib", "trap_tube_jax.solver.pictures"):
+        monkeypatch.setitem(sys.modules, module, None)
     animation = tmp_path / "plan.gif"
     arguments = ["--show", "SymbolicTrapTube-v0", "--seed", "3", "--output", str(animation)]
     main([*arguments, "--json"])
@@ -357,6 +435,50 @@ def test_command_line_draws_distances(tmp_path, capsys):
         assert image.format == "PNG"
 
 
+def test_pictures_of_distances_count_the_steps_that_are_left(
+    workshop, workshop_distances, tmp_path, monkeypatch
+):
+    drawn = []
+
+    def draw(axis, state, steps, scale):
+        drawn.append((axis, state, steps))
+        pictures_draw(axis, state, steps, scale)
+
+    pictures_draw = pictures._draw_distances
+    monkeypatch.setattr(pictures, "_draw_distances", draw)
+    monkeypatch.setattr(pictures.Figure, "savefig", lambda *_, **__: None)
+    plan, found = tt.solve(workshop), workshop_distances
+    pictures.save_distances(workshop, plan, found, tmp_path / "none.png")
+    assert len(drawn) == pictures.MOMENTS
+    for axis, state, steps in drawn:
+        left, agent = found.lookup(state), tuple(np.asarray(state.agent).tolist())
+        assert axis.get_title() == f"{left} steps left"
+        assert steps[agent] == left
+        numbers = {text.get_position()[::-1]: int(text.get_text()) for text in axis.texts}
+        cells = {tuple(cell) for cell in np.argwhere(steps >= 0).tolist()}
+        assert numbers == {cell: steps[cell] for cell in cells - {agent}}
+    assert found.lookup(drawn[0][1]) == plan.length > found.lookup(drawn[-1][1])
+
+
+def test_captions_of_a_plan():
+    actions = np.array([[0, 3], [1, 2]], np.int32)
+    plan = tt.Plan(actions, np.array(2), np.array(True))
+    assert [_caption(plan, time) for time in range(3)] == [
+        "start (2 steps)",
+        "step 1: grasp up, move right",
+        "step 2: grasp down, move left",
+    ]
+    unsolvable = tt.Plan(actions[:0], np.array(-1), np.array(False))
+    assert _caption(unsolvable, 0) == "start (unsolvable)"
+
+
+def test_the_command_line_says_how_far_the_goal_is():
+    plan = tt.Plan(np.zeros((2, 2), np.int32), np.array(2), np.array(True))
+    found = tt.Distances(from_start=np.arange(-1, 1234), to_goal=np.arange(1235) % 9 - 1)
+    line = "1,234 reachable states, 1,097 of them with a way to the goal, at most 7 steps; 2 steps"
+    assert _distances_line(plan, found) == f"{line} from the start"
+
+
 def test_the_command_line_says_that_no_state_leads_to_the_goal():
     plan = tt.Plan(np.zeros((0, 2), np.int32), np.array(-1), np.array(False))
     found = tt.Distances(from_start=np.arange(1234), to_goal=np.full(1234, -1))
@@ -369,7 +491,9 @@ def test_the_command_line_says_that_no_state_leads_to_the_goal():
     [
         (["--show", "p", "--distances", "p"], "exclude each other"),
         (["--show", "nowhere"], "unknown task set 'nowhere'"),
-        (["--tasks", "0"], "tasks must be >= 1"),
+        (["--tasks", "0"], "tasks must be an integer >= 1"),
+        (["--seed", str(2**32)], "seed must be an integer >= 0 and <= 4294967295"),
+        (["--show", "base", "--seed", "-1"], "seed must be an integer >= 0"),
         (["--sets"], "--sets must name at least one task set"),
     ],
 )

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+LARGEST_SEED = 2**32 - 1  # `jax.random.key` drops what is beyond
+
 
 def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None = None) -> int:
     """Returns `value` as an int if it is an integer within the bounds, both included.
@@ -16,3 +18,12 @@ def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None =
         upper = "" if maximum is None else f" and <= {maximum}"
         raise ValueError(f"{name} must be an integer >= {minimum}{upper}, got {value!r}")
     return int(value)
+
+
+def check_seed(seed: Any) -> int:
+    """Returns `seed` as an int if it is an integer from 0 to 2**32 - 1.
+
+    Raises:
+      ValueError: naming the seed and the bounds.
+    """
+    return check_integer("seed", seed, 0, LARGEST_SEED)

@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
+from trap_tube_jax.checks import check_integer, check_seed
 from trap_tube_jax.command_line import Flag, plain_errors
 from trap_tube_jax.objects import BOARD_SIZE, NUM_OBJECTS, OBJECT_NAMES
 from trap_tube_jax.observation import visible_objects
@@ -39,7 +40,7 @@ class Arguments:
       out: the folder for gallery.png and the GIFs; made if missing.
       tasks: different tasks per set, at least 2; fewer where a set has fewer.
       cell_size: pixels per cell and side of the contact sheet, at least 8.
-      seed: which tasks are drawn.
+      seed: which tasks are drawn, 0 to 2**32 - 1.
       gifs: also writes a solved episode of base, p, st, sy and pstsy each.
     """
 
@@ -64,17 +65,16 @@ def contact_sheet(
       tasks: the most tasks per set, at least 2. They all differ; there are fewer where 64
         draws hold fewer. The base has one: the legend takes the place of the others.
       cell_size: pixels per cell and side, at least 8.
-      seed: which tasks are drawn.
+      seed: which tasks are drawn, 0 to 2**32 - 1.
 
     Raises:
       ValueError: naming the value and what is allowed.
     """
-    if tasks < 2:
-        raise ValueError(f"tasks must be >= 2, got {tasks}")
-    if cell_size < 8:
-        raise ValueError(f"cell_size must be >= 8, got {cell_size}")
-    if not ids:
-        raise ValueError(f"ids must name at least one task set, got {ids!r}")
+    tasks = check_integer("tasks", tasks, 2)
+    cell_size = check_integer("cell_size", cell_size, 8)
+    seed = check_seed(seed)
+    if isinstance(ids, str) or not ids:
+        raise ValueError(f"ids must name at least one task set, as in ('base', 'p'), got {ids!r}")
     panels = [_panel(task_set(name), tasks, cell_size, seed) for name in ids]
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)

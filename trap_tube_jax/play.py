@@ -16,6 +16,7 @@ import jax
 import numpy as np
 import tyro
 
+from trap_tube_jax.checks import LARGEST_SEED, check_seed
 from trap_tube_jax.command_line import Imports, plain_errors
 from trap_tube_jax.dynamics import holds_tool
 from trap_tube_jax.imports import import_modules
@@ -74,7 +75,7 @@ class Arguments:
 
     Attributes:
       task_set: an id such as PerceptualTrapTube-v0, or a short name such as p.
-      seed: the first task; the next ones follow it.
+      seed: the first task, 0 to 2**32 - 1; the next ones follow it.
       out: the folder for recordings.
       imports: modules of your own to import first, for the sets that they register.
     """
@@ -138,9 +139,9 @@ def new_game(name: str, seed: int) -> Game:
     """The task that `make(name).reset(jax.random.key(seed))` draws.
 
     Raises:
-      ValueError: there is no such task set.
+      ValueError: there is no such task set, or `seed` is not an integer from 0 to 2**32 - 1.
     """
-    entry = task_set(name)
+    entry, seed = task_set(name), check_seed(seed)
     state = _draw_task(entry.id)(jax.random.key(seed))
     return Game(entry.id, seed, (state,))
 
@@ -288,7 +289,7 @@ def _restart(game: Game) -> Game:
 
 
 def _next_task(game: Game) -> Game:
-    return new_game(game.task_set, game.seed + 1)
+    return new_game(game.task_set, (game.seed + 1) % (LARGEST_SEED + 1))
 
 
 COMMANDS = {"?": _hint, "\n": _take_hint, "u": _undo, "r": _restart, "n": _next_task}

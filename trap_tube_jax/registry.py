@@ -141,8 +141,8 @@ def register(
 
     Raises:
       ValueError: a name is taken or has other characters than letters, digits, "_", "." and
-        "-", a transfer is not a function, or the base state or the step limit is invalid; the
-        message says what is allowed.
+        "-", a transfer is not a function or not hashable, or the base state or the step limit is
+        invalid; the message says what is allowed.
     """
     short = id if short is None else short
     taken = {name for entry in _task_sets.values() for name in (entry.id, entry.short)}

@@ -10,6 +10,7 @@ white, whichever stands out from the object's colour:
 """
 
 import functools
+import itertools
 import os
 from typing import Any
 
@@ -27,6 +28,7 @@ from trap_tube_jax.objects import (
     EXIT,
     FOOD,
     LUMA,
+    NO_DIRECTION,
     NUM_DIRECTIONS,
     NUM_OBJECTS,
     TOOL,
@@ -118,7 +120,8 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
 
     Args:
       state: one unbatched state, unfinished.
-      actions: i32[T, 2], (grasp, move) pairs; T may be 0.
+      actions: i32[T, 2], (grasp, move) pairs, each 0 up, 1 down, 2 left, 3 right; or (-1, -1),
+        the padding of a `Plan`, which moves nothing. T may be 0.
       cell_size: s >= 1, pixels per cell and side.
 
     Raises:
@@ -126,12 +129,19 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
     """
     cell_size = check_integer("cell_size", cell_size)
     actions = np.asarray(actions)
-    if not len(actions):
+    if not actions.size:
         actions = np.zeros((0, 2), np.int32)
-    if actions.shape != (len(actions), 2) or actions.dtype.kind not in "iu":
+    if actions.shape[1:] != (2,) or actions.dtype.kind not in "iu":
         raise ValueError(
             "actions must be integer[T, 2], (grasp, move) pairs, got "
             f"{actions.dtype}{list(actions.shape)}"
+        )
+    in_range = ((actions >= 0) & (actions < NUM_DIRECTIONS)).all(axis=1)
+    wrong = actions[~in_range & (actions != NO_DIRECTION).any(axis=1)]
+    if len(wrong):
+        raise ValueError(
+            f"actions must be pairs of directions, each 0 to {NUM_DIRECTIONS - 1}, or "
+            f"({NO_DIRECTION}, {NO_DIRECTION}), got {tuple(wrong[0].tolist())}"
         )
     return np.asarray(_episode_frames(state, actions.astype(np.int32), cell_size=cell_size))
 
@@ -145,7 +155,8 @@ def save_gif(
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1.
       path: the file to write.
       fps: frames per second, over 0 and at most 50.
-      hold: seconds by which the last frame stays longer. No frame may last longer than 655.35.
+      hold: seconds by which the last frame stays longer. Equal frames in a row become one, as
+        long as they together. No frame may last longer than 655.35.
 
     Raises:
       ValueError: naming the value and what is allowed.
@@ -161,16 +172,26 @@ def save_gif(
         raise ValueError(f"fps must be over 0 and at most {MAX_FPS}, got {fps}")
     if not 0 <= hold < np.inf:
         raise ValueError(f"hold must be a number of seconds >= 0, got {hold}")
-    durations = [round(1000 / fps)] * len(pictures)
+    images = _indexed(pictures)
+    durations = [round(1000 / fps)] * len(images)
     durations[-1] += round(1000 * hold)
-    if durations[-1] > 1000 * LONGEST_FRAME:
+    longest = _longest_shown(images, durations)
+    if longest > 1000 * LONGEST_FRAME:
         raise ValueError(
-            f"a frame of a GIF lasts at most {LONGEST_FRAME} s, got 1 / fps + hold = "
-            f"{durations[-1] / 1000} s"
+            f"a frame of a GIF lasts at most {LONGEST_FRAME} s, got {longest / 1000} s: 1 / fps "
+            "for each of the equal frames in a row, and hold for the last"
         )
-    first, *rest = _indexed(pictures)
+    first, *rest = images
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
     first.save(path, format="GIF", duration=durations, loop=0, **options)
+
+
+def _longest_shown(images: list[Any], durations: list[int]) -> int:
+    """The longest duration of a picture: Pillow joins equal ones in a row."""
+    shown = itertools.groupby(
+        zip(images, durations, strict=True), key=lambda pair: pair[0].convert("RGB").tobytes()
+    )
+    return max(sum(duration for _, duration in pairs) for _, pairs in shown)
 
 
 def _indexed(pictures: np.ndarray) -> list[Any]:

@@ -45,7 +45,7 @@ def compose(*transfers: Transfer) -> Transfer:
     Transfer i gets `jax.random.fold_in(key, i)`, a key of the same type as `key`.
 
     Raises:
-      ValueError: one of them is not callable.
+      ValueError: one of them is not callable, or not hashable.
     """
     for transfer in transfers:
         if not callable(transfer):
@@ -53,6 +53,12 @@ def compose(*transfers: Transfer) -> Transfer:
                 f"a transfer is a function (key, state) -> state, got {transfer!r}; "
                 "allowed: trap_tube_jax.perceptual, structural, symbolic or your own"
             )
+        try:
+            hash(transfer)
+        except TypeError as error:
+            raise ValueError(
+                f"a transfer must be hashable, for example a frozen dataclass, got {transfer!r}"
+            ) from error
 
     def composed(key: jax.Array, state: State) -> State:
         for index, transfer in enumerate(transfers):

@@ -14,7 +14,7 @@ from agents.config import Config
 from agents.networks.agent import Agent, Params
 from agents.parallel.sharding import ALONE, Shards
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.scoring.benchmark import BLOCK
+from trap_tube_jax.scoring.benchmark import blocks
 from trap_tube_jax.scoring.scores import Optimality, Score
 from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks, label, layout_numbers
 from trap_tube_jax.solver.search import take
@@ -95,12 +95,8 @@ class Evaluator:
         self.tasks = dict(tasks)
         self.limits = {name: config.step_limit(name) for name in self.tasks}
         self._total = sum(len(states.time) for states in self.tasks.values())
-        block = min(BLOCK, self._total)
         together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
-        self._blocks = [
-            take(together, np.arange(start, start + block) % self._total)
-            for start in range(0, self._total, block)
-        ]
+        self._blocks = [take(together, block) for block in blocks(self._total)]
         # All sets are played up to the largest limit; `__call__` cuts off what is beyond a set's.
         longest = max(self.limits.values())
         env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)

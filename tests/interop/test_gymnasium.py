@@ -173,6 +173,11 @@ def test_several_seeds():
         envs.reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="seed must be an integer >= 0, got -1"):
         envs.reset(seed=[1, -1])
+    for seed in (-1, 1.5, True, "9"):
+        with pytest.raises(ValueError, match=f"seed must be an integer >= 0, got {seed!r}"):
+            envs.reset(seed=seed)
+    # Those that Gymnasium draws without a seed are as large as these.
+    np.testing.assert_array_equal(envs.reset(seed=[2**32 + 5, 2**96 + 9])[0], pair)
     seed: Any = np.int64(9)
     np.testing.assert_array_equal(envs.reset(seed=seed)[0][0], pair[1])
 

@@ -144,6 +144,16 @@ def test_refused_arguments(arguments, message):
         to_gymnax.make(task_set, **options)
 
 
+@pytest.mark.parametrize("index", [16, -1, jnp.int32(99), np.int64(16)])
+def test_refused_indices(easy, easy_env, index):
+    env, params = easy
+    key = jax.random.key(0)
+    _, state = env.reset(key, params)
+    for each in (env, to_gymnax.SixValueTrapTube(easy_env)):
+        with pytest.raises(ValueError, match=f"from 0 to 15, got .*{int(index)}"):
+            each.step_env(key, state, index, params)
+
+
 def test_purejaxrl_learns_the_easy_task(easy):
     info = jax.jit(purejaxrl_loop.make_train(*easy))(jax.random.PRNGKey(0))
     assert info["returned_episode"].shape == (24, 16, 32)

@@ -250,8 +250,8 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
 
     def _seeds(self, seed: int | Sequence[int] | None) -> list[int]:
         """One seed per environment."""
-        if seed is None or isinstance(seed, int | np.integer):
-            super().reset(seed=None if seed is None else int(seed))
+        if seed is None or isinstance(seed, int) or np.ndim(seed) == 0:
+            super().reset(seed=None if seed is None else check_integer("seed", seed, minimum=0))
             return [self.np_random_seed + index for index in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(f"seed must be one or {self.num_envs} integers, got {len(seed)}")

@@ -18,12 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.core import Tracer
 
 from trap_tube_jax.environment import Environment, action_from_index
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     MAX_STEPS,
     MAX_TOOL_LENGTH,
+    NO_DIRECTION,
     NUM_ACTIONS,
     NUM_DIRECTIONS,
     NUM_OBJECTS,
@@ -164,12 +166,17 @@ class _TrapTube(environment.Environment):
 
     def _transition(self, state: State, action: Any, params: EnvParams) -> tuple[State, TimeStep]:
         """The environment's step under the step limit in `params`."""
-        action = jnp.asarray(action)
-        state, timestep = self._env.step(
-            state, action_from_index(action) if self.flat_actions else action
-        )
+        state, timestep = self._env.step(state, _pair(action) if self.flat_actions else action)
         truncated = self.is_truncated(state, params)
         return state.replace(truncated=truncated), timestep.replace(truncated=truncated)
+
+
+def _pair(index: Any) -> jax.Array:
+    """The action i32[2] of an index 0 to 15; raises ValueError for other concrete numbers."""
+    pair = action_from_index(index)
+    if not isinstance(pair, Tracer) and np.any(np.asarray(pair) == NO_DIRECTION):
+        raise ValueError(f"an action's index must be from 0 to {NUM_ACTIONS - 1}, got {index!r}")
+    return pair
 
 
 class FiveValueTrapTube(_TrapTube):
@@ -223,7 +230,11 @@ class FiveValueTrapTube(_TrapTube):
     def step_env(
         self, key: jax.Array, state: State, action: Any, params: EnvParams
     ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action and stays at the end of the episode, if it is one."""
+        """Takes one action and stays at the end of the episode, if it is one.
+
+        Raises:
+          ValueError: the action is none, where its numbers are concrete; see `Environment.step`.
+        """
         del key
         state, timestep = self._transition(state, action, params)
         info = {
@@ -252,7 +263,11 @@ class SixValueTrapTube(_TrapTube):
     def step_env(
         self, key: jax.Array, state: State, action: Any, params: EnvParams
     ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action: (observation, state, reward, terminated, info)."""
+        """Takes one action: (observation, state, reward, terminated, info).
+
+        Raises:
+          ValueError: the action is none, where its numbers are concrete; see `Environment.step`.
+        """
         del key
         state, timestep = self._transition(state, action, params)
         info = {"discount": timestep.discount}

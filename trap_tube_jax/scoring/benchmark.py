@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import check_integer
+from trap_tube_jax.checks import check_integer, check_seed
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
@@ -73,7 +73,7 @@ def score(
       policy: an object with the functions of `Policy`; one of `agents.load`, for example.
       sets: ids or short names; the paper's eight if absent.
       tasks: how many of each set, at least 1. A set without transfers has one.
-      seed: of the policy's draws.
+      seed: of the policy's draws, 0 to 2**32 - 1.
       optimality: how many of the first tasks of each set to compare with shortest plans, which
         are searched for, a second for each task of a perceptual set.
       num_features: N, feature channels of the observation; see `make`.
@@ -87,17 +87,16 @@ def score(
                 f"a policy has initial(batch) and act(observation, carry, key); "
                 f"{type(policy).__name__} has no {name}"
             )
+    seed = check_seed(seed)
     program = jax.jit(functools.partial(_play, policy), static_argnums=0)
 
     def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
         env = _dynamics(entry.max_steps)
         key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(entry.id.encode()))
         total = len(states.time)
-        block = min(BLOCK, total)
         played = [
-            program(env, take(states, np.arange(start, start + block) % total), block_key)
-            for start in range(0, total, block)
-            for block_key in [jax.random.fold_in(key, start)]
+            program(env, take(states, block), jax.random.fold_in(key, block[0]))
+            for block in blocks(total)
         ]
         solved, length, is_valid = zip(*played, strict=True)
         if not np.all(is_valid):
@@ -177,6 +176,16 @@ def _scores(
             Score.of(entry.short, entry.label, solved, length, layout=layout, optimality=found)
         )
     return Scores(PROTOCOL, __version__, seed, tuple(made))
+
+
+def blocks(total: int) -> list[np.ndarray]:
+    """The indices of `total` tasks, in blocks i64[b] that are played at once.
+
+    All are of one size, the smaller of `BLOCK` and `total`, so that they share a compilation: after
+    the last task the last block goes on with the first ones.
+    """
+    size = min(BLOCK, total)
+    return [np.arange(start, start + size) % total for start in range(0, total, size)]
 
 
 def _play(

@@ -59,10 +59,11 @@ def evaluation_tasks(
 def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = "test") -> State:
     """As `evaluation_tasks`, for any environment; `name` sets its tasks apart from others'.
 
-    They are the tasks that `env.reset` draws from `evaluation_keys(name, B, purpose)`.
+    They are the tasks that `env.reset` draws from `evaluation_keys(name, B, purpose)` where
+    `jax_threefry_partitionable` is on, as JAX has it. Here it plays no part.
 
     Raises:
-      ValueError: `num_tasks` is below 1.
+      ValueError: `num_tasks` is below 1, or `purpose` is unknown.
     """
     check_integer("the number of evaluation tasks", num_tasks)
     count = num_tasks if env.transfers else 1
@@ -70,14 +71,21 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     # compilations, and a transfer has the same bits in each.
     draw = compose(*map(_compiled, env.transfers))
     base = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), env.base)
-    return jax.device_put(jax.vmap(draw)(evaluation_keys(name, count, purpose), base))
+    keys = evaluation_keys(name, count, purpose)
+    with jax.threefry_partitionable(True):  # the user's setting must not choose other tasks
+        return jax.device_put(jax.vmap(draw)(keys, base))
 
 
 def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax.Array:
     """The PRNG keys [B] of the evaluation tasks of the set with this id.
 
     More tasks begin with the same ones. No key serves two purposes or sets.
+
+    Raises:
+      ValueError: `purpose` is neither "test" nor "validation".
     """
+    if purpose not in tuple(_ROOTS):
+        raise ValueError(f"purpose must be one of {', '.join(_ROOTS)}, got {purpose!r}")
     return _keys(jnp.asarray(_ROOTS[purpose]), np.uint32(zlib.crc32(name.encode())), num_tasks)
 
 

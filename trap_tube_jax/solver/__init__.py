@@ -7,7 +7,7 @@ whole frontier at a time, so that there is one set of rules.
     search.py      breadth-first search; shortest plans
     distance.py    distances from the start and to the goal, for every reachable state
     survey.py      the figures of a task set
-    pictures.py    what the command line draws
+    pictures.py    what the command line draws as PNG
     __main__.py    the command line: python -m trap_tube_jax.solver --help
 """
 

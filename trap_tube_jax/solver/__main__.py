@@ -14,11 +14,13 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
+from trap_tube_jax.checks import check_seed
 from trap_tube_jax.command_line import Flag, Imports, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
+from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.solver.distance import Distances, distances
 from trap_tube_jax.solver.search import Plan, replay, solve
 from trap_tube_jax.solver.survey import QUANTILES, Survey, survey
@@ -36,7 +38,7 @@ class Options:
       sets: ids or short names of task sets.
       tasks: tasks to solve per set.
       graphs: of how many of them to count the distinct reachable states (a second each).
-      seed: the seed of the tasks.
+      seed: the seed of the tasks, 0 to 2**32 - 1.
       show: id of a set: the plan of its task with this seed, as text and GIF instead.
       distances: id of a set: the distances to the goal in its task with this seed, as
         PNG instead.
@@ -129,8 +131,6 @@ def _number(value: float | None, digits: int, unit: int = 1) -> str:
 
 
 def _show(options: Options, name: str) -> None:
-    from trap_tube_jax.solver.pictures import save_plan  # noqa: PLC0415
-
     state = _task(name, options.seed)
     plan = solve(state)
     if options.json:
@@ -139,7 +139,7 @@ def _show(options: Options, name: str) -> None:
         for time, at in enumerate(replay(state, plan)):
             print(f"{_caption(plan, time)}\n{render_ascii(at)}\n")
     path = options.output or Path("plan.gif")
-    save_plan(state, plan, path)
+    save_gif(episode_frames(state, plan.actions, cell_size=32), path, fps=4)
     print(f"animation: {path}", file=sys.stderr)
 
 
@@ -181,7 +181,7 @@ def _distances_line(plan: Plan, found: Distances) -> str:
 
 
 def _task(name: str, seed: int) -> State:
-    return make(name).reset(jax.random.key(seed))[0]
+    return make(name).reset(jax.random.key(check_seed(seed)))[0]
 
 
 def _caption(plan: Plan, time: int) -> str:

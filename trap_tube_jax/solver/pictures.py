@@ -1,4 +1,4 @@
-"""What the solver's command line draws: a plan as GIF, distances and lengths as PNG."""
+"""What the solver's command line draws with matplotlib: distances and lengths as PNG."""
 
 import os
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from trap_tube_jax.objects import BOARD_SIZE
-from trap_tube_jax.rendering import episode_frames, render, save_gif
+from trap_tube_jax.rendering import render
 from trap_tube_jax.solver.distance import Distances
 from trap_tube_jax.solver.search import Plan, replay
 from trap_tube_jax.solver.survey import Survey
@@ -17,11 +17,6 @@ from trap_tube_jax.state import State
 
 CELL_SIZE = 32  # pixels
 MOMENTS = 4  # pictures of distances along a plan
-
-
-def save_plan(state: State, plan: Plan, path: str | os.PathLike[str]) -> None:
-    """Writes a GIF of a plan; the agent's hand shows where each action is about to grasp."""
-    save_gif(episode_frames(state, plan.actions, CELL_SIZE), path, fps=4)
 
 
 def save_distances(

@@ -54,7 +54,7 @@ class Level(NamedTuple):
       nodes: i32[n], in the order of the first shortest plan that leads to each.
       successors: i32[n, 16], the node after each action.
       solved: bool[n, 16], whether that action solves the task.
-      origin: i32[n], the flat index into the previous level's `successors` at which
+      origin: i64[n], the flat index into the previous level's `successors` at which
         each node was found first; empty at the start.
     """
 
@@ -142,7 +142,7 @@ def levels(state: State) -> Iterator[Level]:
     # Colours play no part; without them there is one compilation for every N.
     layout = jax.device_put(state.replace(palette=np.zeros((0, 0), np.uint8)))
     nodes = np.array([position_id(state)], np.int32)
-    origin = np.empty(0, np.int32)
+    origin = np.empty(0, np.int64)
     is_known = np.zeros(NUM_POSITIONS, bool)
     is_known[nodes] = True
     while len(nodes):
@@ -183,8 +183,6 @@ def _expand_all(layout: State, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarra
         size = next(size for size in CHUNK_SIZES if size >= len(chunk))
         padded = np.resize(chunk, size)
         parts.append([array[: len(chunk)] for array in jax.device_get(_expand(layout, padded))])
-    if len(parts) == 1:
-        return parts[0][0], parts[0][1]
     successors, solved = zip(*parts, strict=True)
     return np.concatenate(successors), np.concatenate(solved)
 

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from trap_tube_jax.checks import check_integer, check_seed
 from trap_tube_jax.registry import TaskSet, make
 from trap_tube_jax.solver.distance import count_reachable
 from trap_tube_jax.solver.search import solve_batch, take
@@ -74,17 +75,17 @@ def survey(
     Args:
       task_set: the set; its id is registered.
       tasks: how many to draw, at least 1.
-      graphs: of how many to count the reachable states, at least 0, a second each.
-      seed: the tasks are those of the keys `jax.random.split(jax.random.key(seed), tasks)`.
+      graphs: of how many to count the reachable states, 0 to `tasks`, a second each.
+      seed: 0 to 2**32 - 1; the tasks are those of the keys
+        `jax.random.split(jax.random.key(seed), tasks)`.
       advance: called with the number of tasks and graphs done since its last call.
 
     Raises:
-      ValueError: a number is out of range.
+      ValueError: naming the number and what is allowed.
     """
-    if tasks < 1:
-        raise ValueError(f"tasks must be >= 1, got {tasks}")
-    if not 0 <= graphs <= tasks:
-        raise ValueError(f"graphs must be from 0 to tasks={tasks}, got {graphs}")
+    tasks = check_integer("tasks", tasks)
+    graphs = check_integer("graphs", graphs, 0, tasks)
+    seed = check_seed(seed)
     states = draw_tasks(task_set, tasks, seed)
     lengths = []
     for start in range(0, tasks, TASKS_PER_CALL):
