@@ -75,7 +75,7 @@ def score(
       tasks: how many of each set, at least 1. A set without transfers has one.
       seed: of the policy's draws, 0 to 2**32 - 1.
       optimality: how many of the first tasks of each set to compare with shortest plans, which
-        are searched for, a second for each task of a perceptual set.
+        are searched for first.
       num_features: N, feature channels of the observation; see `make`.
 
     Raises:
