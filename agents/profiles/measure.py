@@ -99,7 +99,6 @@ def profile(
         )
     drawn = points(settings.parts, settings.strengths, settings.tasks, channels.pop())
     tasks = {name: jax.device_get(point.tasks) for name, point in drawn.items()}
-    pairs = {name: pair for name, pair in PAIRS.items() if {*pair} <= {*drawn}}
     oracle = Oracle()
     columns = [*Progress.get_default_columns(), MofNCompleteColumn()]
     with Progress(*columns, console=console, transient=True) as bars:
@@ -108,12 +107,7 @@ def profile(
             for name, states in bars.track(tasks.items(), description="Shortest plans")
         }
         measured = [
-            {
-                "name": name,
-                "iteration": policy.iteration,
-                "config": policy.config.to_dict(),
-                **_measure(name, policy, oracle, tasks, shortest, settings.episodes, bars),
-            }
+            _measure(name, policy, oracle, tasks, shortest, settings.episodes, bars)
             for name, policy in policies.items()
         ]
     return {
@@ -132,7 +126,7 @@ def profile(
             }
             for name, point in drawn.items()
         },
-        "pairs": {name: list(pair) for name, pair in pairs.items()},
+        "pairs": {name: list(pair) for name, pair in PAIRS.items() if {*pair} <= {*drawn}},
         "policies": measured,
     }
 
@@ -177,7 +171,7 @@ def _measure(
     episodes: int,
     bars: Progress,
 ) -> dict[str, Any]:
-    """What the record says of a policy beside its settings."""
+    """What the record says of a policy."""
     outcomes = Evaluator(policy.config, tasks)(policy.params)
     played = {name: Played.of(tasks[name], outcome) for name, outcome in outcomes.items()}
     pushes, mistakes = {}, {}
@@ -186,8 +180,14 @@ def _measure(
             pushes[name] = _pushes(oracle, played[name])
         if name in LOOKED_INTO:
             mistakes[name] = _mistakes(oracle, played[name], shortest[name][:episodes])
-    steps = {name: each.steps.tolist() for name, each in played.items()}
-    return {"steps": steps, "pushes": pushes, "mistakes": mistakes}
+    return {
+        "name": label,
+        "iteration": policy.iteration,
+        "config": policy.config.to_dict(),
+        "steps": {name: each.steps.tolist() for name, each in played.items()},
+        "pushes": pushes,
+        "mistakes": mistakes,
+    }
 
 
 def _pushes(oracle: Oracle, played: Played) -> dict[str, list]:
