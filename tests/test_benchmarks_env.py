@@ -8,25 +8,11 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import pytest
+from timings import TIMING
 
 from benchmarks import env_throughput, harness, peers, scaling, scaling_model, train_throughput
 from trap_tube_jax.vector import VectorState
 from trap_tube_jax.wrappers import AutoResetState
-
-TIMING = harness.Timing(first_s=9.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
-
-
-@pytest.fixture
-def timed(monkeypatch):
-    """What the measured functions have returned; each takes two seconds."""
-    returned = []
-
-    def measure(function, repeats=5):
-        returned.append(function())
-        return TIMING
-
-    monkeypatch.setattr(harness, "measure", measure)
-    return returned
 
 
 def test_measures_the_fast_path_and_writes_json(tmp_path, monkeypatch, timed):

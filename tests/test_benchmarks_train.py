@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import pytest
+from timings import TIMING
 
 from agents import Config
 from agents.networks.agent import Agent
@@ -18,21 +19,6 @@ from benchmarks.scaling_model import Exchange
 CONFIG = Config(
     max_steps=4, episodes=4, minibatch=2, epochs=2, filters=(2, 3), hidden=4, embedding=2, chunk=4
 )
-
-TIMING = harness.Timing(first_s=9.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
-
-
-@pytest.fixture
-def timed(monkeypatch):
-    """What the measured functions have returned; each takes two seconds."""
-    returned = []
-
-    def measure(function, repeats=5):
-        returned.append(function())
-        return TIMING
-
-    monkeypatch.setattr(harness, "measure", measure)
-    return returned
 
 
 def test_operations_of_matrix_products_are_counted():
