@@ -22,7 +22,7 @@ from agents.config import PRESETS, Config
 from agents.networks.actions import ActionDistribution
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import make_train
-from agents.runs.session import make_advance
+from agents.runs.programs import Programs
 from agents.runs.table import Table, number
 from benchmarks import harness
 from trap_tube_jax.command_line import Flag, plain_errors
@@ -79,23 +79,24 @@ class Exchange:
     calls: int
 
 
-def exchanges(hlo: str) -> list[Exchange]:
-    """The collectives of an HLO module, counted through loops of known length.
+def exchanges(*modules: str) -> list[Exchange]:
+    """The collectives of HLO modules, counted through loops of known length.
 
     Raises:
       ValueError: one runs in a loop whose length depends on the data.
     """
-    lines: dict[str, list[str]] = {}
-    entry = name = ""
-    for line in hlo.splitlines():
-        if match := COMPUTATION.match(line):
-            name = match["name"]
-            lines[name] = []
-            entry = name if line.startswith("ENTRY") else entry
-        elif name:
-            lines[name].append(line)
     found: Counter[tuple[str, int]] = Counter()
-    _count(lines, entry, 1, found)
+    for hlo in modules:
+        lines: dict[str, list[str]] = {}
+        entry = name = ""
+        for line in hlo.splitlines():
+            if match := COMPUTATION.match(line):
+                name = match["name"]
+                lines[name] = []
+                entry = name if line.startswith("ENTRY") else entry
+            elif name:
+                lines[name].append(line)
+        _count(lines, entry, 1, found)
     return [Exchange(kind, size, calls) for (kind, size), calls in sorted(found.items())]
 
 
@@ -127,8 +128,8 @@ def compiled_exchanges(config: Config, devices: int) -> list[Exchange]:
     placement = Placement.of(devices, config, 1)
     train = make_train(config, shards=placement.episodes)
     state = placement.put(jax.jit(jax.vmap(train.init))(jax.random.split(jax.random.key(0), 1)))
-    advance = jax.jit(placement.shard(make_advance(train)))
-    return exchanges(advance.lower(state, np.ones(1, bool)).compile().as_text() or "")
+    programs = Programs(train, placement, state, np.ones(1, bool))
+    return exchanges(*(program.as_text() or "" for program in programs.compiled))
 
 
 def share_seconds(config: Config, devices: int) -> float:

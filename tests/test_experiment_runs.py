@@ -30,7 +30,7 @@ from agents.experiments import figures, records, reporting, statistics, tables, 
 from agents.experiments.protocol import Protocol
 from agents.parallel.sharding import ALONE, Placement
 from agents.ppo.learner import make_train
-from agents.runs import report, session, stopping, tracking
+from agents.runs import programs, report, session, stopping, tracking
 from agents.runs.checkpoint import Checkpoints, digest, to_arrays
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import MetricsLog
@@ -65,17 +65,23 @@ def fake_train(config, shards=ALONE):
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         return zeros._replace(key=key)
 
-    def iterate(state):
+    def collect(state):
+        return (
+            state._replace(transitions=state.transitions + 48),
+            (),
+            {"success": jnp.float32(0.25)},
+        )
+
+    def learn(state, batch):
         iteration, seed = state.iteration + 1, jax.random.key_data(state.key)[-1]
         state = state._replace(
             params=jax.tree.map(lambda x: jnp.zeros_like(x) + 100 * seed + iteration, state.params),
             iteration=iteration,
             episodes=state.episodes + 8,
-            transitions=state.transitions + 48,
         )
-        return state, {"success": jnp.float32(0.25)}
+        return state, {}
 
-    return SimpleNamespace(**vars(real), init=init, iterate=iterate)
+    return SimpleNamespace(**vars(real), init=init, collect=collect, learn=learn)
 
 
 class FakeEvaluator:
@@ -108,7 +114,7 @@ def lab():
     }
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(session, "make_train", fake_train)
-        patch.setattr(session, "evaluate", fake_evaluate)
+        patch.setattr(programs, "evaluate", fake_evaluate)
         patch.setattr(report, "save_curves", lambda *args: None)
         for module in (tracking, reporting):
             patch.setattr(module, "Evaluator", FakeEvaluator)
@@ -299,7 +305,7 @@ def test_seeds_side_by_side_are_those_one_after_another(tmp_path, monkeypatch):
         is_solved = (number >= 3) & (number < 100)
         return evaluation.Evaluation((nothing == 0) & is_solved, nothing, nothing, nothing)
 
-    monkeypatch.setattr(session, "evaluate", evaluate)
+    monkeypatch.setattr(programs, "evaluate", evaluate)
     apart = run(tmp_path / "apart")
     folder = run(tmp_path / "together", "--side-by-side") / "ppo-seed0to1"
     rows = untimed(folder / "metrics.csv")
@@ -391,7 +397,7 @@ def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
         nothing = jnp.zeros(4, jnp.int32)
         return evaluation.Evaluation(jnp.arange(4) < iteration, nothing, nothing, nothing)
 
-    monkeypatch.setattr(session, "evaluate", evaluate)
+    monkeypatch.setattr(programs, "evaluate", evaluate)
     sizes = {"max_steps": 6, "filters": (2, 2), "hidden": 4, "embedding": 2, "curiosity": "none"}
 
     def train(name, share):

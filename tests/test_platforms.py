@@ -19,7 +19,7 @@ import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.parallel.sharding import EPISODES, SEEDS, Placement
 from agents.registry import curiosities
-from agents.runs.session import make_advance
+from agents.runs.programs import make_phases
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 TINY = Config(
@@ -136,10 +136,12 @@ def test_training_compiles_for_several_gpus(gpus, settings):
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 4))
     states = jax.eval_shape(jax.vmap(make_train(config).init), keys)
     train = make_train(config, shards=placement.episodes)
-    advance = placement.shard(make_advance(train))
-    code = machine_code(
-        NamedSharding(mesh, PartitionSpec(SEEDS)), advance, states, jax.ShapeDtypeStruct((4,), bool)
-    )
-    assert code is not None
+    sharding = NamedSharding(mesh, PartitionSpec(SEEDS))
+    inputs: Any = (states, None)
+    code = ""
+    for phase in map(placement.shard, make_phases(train)):
+        active = jax.ShapeDtypeStruct((4,), bool)
+        code += machine_code(sharding, phase, *inputs, active) or ""
+        inputs, _ = jax.eval_shape(phase, *inputs, active)
     assert "all-reduce" in code  # the gradients' mean
     assert "all-gather" in code  # the episodes

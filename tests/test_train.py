@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +22,14 @@ from rich.console import Console
 
 from agents import evaluate, train
 from agents.config import PRESETS, Config
+from agents.parallel.sharding import Placement
 from agents.ppo.learner import Learner, make_train
 from agents.runs import compilation
 from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved, MetricsLog, is_last, read_metrics
+from agents.runs.programs import Programs
 from agents.runs.progress import Progress
-from agents.runs.session import make_advance
 from agents.runs.stopping import StopSignals
 from agents.train import main, parse, select
 from trap_tube_jax.scoring.tasks import ALL_SETS
@@ -373,12 +375,14 @@ def test_solved_seeds_stay_as_they_are():
     config = Config(max_steps=6, filters=(2, 2), hidden=4, embedding=2, eval_episodes=2)
 
     class Adding(Learner):
-        def iterate(self, state):
+        def collect(self, state) -> Any:
+            return state._replace(transitions=state.transitions + 48), jnp.arange(3.0), {}
+
+        def learn(self, state, batch: Any):
             state = state._replace(
-                params=jax.tree.map(lambda x: x + 1, state.params),
+                params=jax.tree.map(lambda x: x + jnp.sum(batch), state.params),
                 iteration=state.iteration + 1,
                 episodes=state.episodes + 8,
-                transitions=state.transitions + 48,
             )
             return state, {"loss": jnp.float32(1)}
 
@@ -387,11 +391,13 @@ def test_solved_seeds_stay_as_they_are():
     shapes = jax.eval_shape(jax.vmap(train.init), keys)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
     state = zeros._replace(key=keys)
-    after, metrics = jax.jit(make_advance(train))(state, jnp.array([True, False]))
+    active = jnp.array([True, False])
+    after, metrics = Programs(train, Placement(), state, active)(state, active)
     assert after.iteration.tolist() == [1, 0]
+    assert after.transitions.tolist() == [48, 0]
     assert metrics["steps"].tolist() == [48, 48]
     for leaf in jax.tree.leaves(after.params):
-        assert np.all(np.asarray(leaf[0]) == 1)
+        assert np.all(np.asarray(leaf[0]) == 3)
         assert np.all(np.asarray(leaf[1]) == 0)
 
 

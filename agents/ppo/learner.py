@@ -146,24 +146,37 @@ class Learner:
         return {**self.agent.init(agent_key), "curiosity": own}
 
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """Plays, prepares, learns: the next state, and metrics f32[] each."""
-        reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
+        """Collects and learns: the next state, and metrics f32[] each."""
+        state, batch, play_metrics = self.collect(state)
+        state, loss_metrics = self.learn(state, batch)
+        return state, {**play_metrics, **loss_metrics}
+
+    def collect(self, state: TrainState) -> tuple[TrainState, Batch, Metrics]:
+        """Plays an iteration's episodes: the state, brought up to date; a batch; metrics of play.
+
+        The parameters are those before. `learn` is to follow.
+        """
+        reset_key, action_key, _, _ = _keys(state)
         reset_keys = self.draw_tasks(state.failures, reset_key)
         trajectory = self.play(state.params, reset_keys, action_key)
-        batch, state, play_metrics = self.prepare(state, trajectory)
-        params, opt_state, loss_metrics = self.optimize(state, batch, update_key)
-        failures = state.failures
+        batch, state, metrics = self.prepare(state, trajectory)
         if again := self.config.num_replayed:
-            failures = failures.remember(reset_keys, ~batch.episodes.solved, again)
+            failures = state.failures.remember(reset_keys, ~batch.episodes.solved, again)
+            state = state._replace(failures=failures)
+        return state, batch, metrics
+
+    def learn(self, state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        """Learns from the batch that `collect` returned with this state."""
+        _, _, update_key, key = _keys(state)
+        params, opt_state, metrics = self.optimize(state, batch, update_key)
         state = state._replace(
             params=params,
             opt_state=opt_state,
-            failures=failures,
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + self.config.episodes,
         )
-        return state, {**play_metrics, **loss_metrics}
+        return state, metrics
 
     def draw_tasks(self, failures: Failures, key: jax.Array) -> jax.Array:
         """The reset keys [B] of an iteration's tasks: first new ones, then those failed before."""
@@ -367,6 +380,11 @@ class Learner:
     def _whole(self, record: Any) -> Any:
         """A record of all devices' episodes from those of each."""
         return along_episodes(lambda axis, x: self.shards.whole(x, axis), record)
+
+
+def _keys(state: TrainState) -> jax.Array:
+    """Those of an iteration's resets, actions and gradient steps, and that of what follows."""
+    return jax.random.split(state.key, 4)
 
 
 def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Learner:

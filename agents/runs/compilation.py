@@ -1,11 +1,17 @@
 """How programs are compiled: kept from one process to the next, or quickly."""
 
 import os
+from collections.abc import Callable
+from concurrent import futures
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 import jax
 
 from agents.config import Config
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 # Leaves out XLA's newer code generator for fused loops, and what LLVM takes longest for.
 QUICKLY: dict[str, bool | str] = {
@@ -46,3 +52,16 @@ def compiled(lowered: jax.stages.Lowered, config: Config) -> jax.stages.Compiled
             if "No such compile option" not in str(error):
                 raise
     return lowered.compile()
+
+
+def in_background(
+    function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
+) -> futures.Future[Result]:
+    """The result to come of a function that runs in a thread of its own.
+
+    XLA compiles without holding Python up.
+    """
+    worker = futures.ThreadPoolExecutor(1)
+    result = worker.submit(function, *args, **kwargs)
+    worker.shutdown(wait=False)
+    return result

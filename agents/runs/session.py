@@ -3,37 +3,34 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent import futures
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets
+from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.acting.policy import Policy
 from agents.networks.agent import PARTS, num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import Placement
-from agents.ppo.learner import Learner, TrainState, make_train
+from agents.ppo.learner import TrainState, make_train
 from agents.runs import report, report_page
 from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
-from agents.runs.compilation import compiled
+from agents.runs.compilation import compiled, in_background
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.loading import policies
 from agents.runs.metrics import MetricsLog, Row, read_metrics
+from agents.runs.programs import Programs
 from agents.runs.progress import Progress
 from agents.runs.stopping import Stopped, StopSignals
 from agents.runs.story import resume_command, story
 from agents.runs.tracking import Tracker
-from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 POLL_SECONDS = 0.005
-
-Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
 
 
 class Session:
@@ -75,12 +72,23 @@ class Session:
         # Files are the first process's alone.
         is_first = processes.is_first()
         self._checkpoints = Checkpoints(folder.checkpoints, keep=keep) if is_first else None
+        keys = jax.vmap(jax.random.key)(np.array(run.seed_range, np.uint32))
+        init = jax.jit(jax.vmap(self._train.init))
+        self._shapes = jax.eval_shape(init, keys)
         try:
-            state, self._progress = self._start()
+            stored = processes.from_first(self._stored)
         except ValueError:
             self.close()
             raise
-        self._state = placement.put(state)
+        arrays, self._progress = stored or (None, Progress.start(run))
+
+        def first() -> TrainState:
+            if arrays is not None:
+                return placement.put(from_arrays(arrays, self._shapes))
+            return placement.put(compiled(init.lower(keys), run.config)(keys))
+
+        # Meanwhile the programs of an iteration are traced.
+        self._first = in_background(first)
         self.saved = self._progress.iteration
         self._log = MetricsLog(folder.metrics, last_iteration=self.saved) if is_first else None
         if tracker is not None and self._log is not None:
@@ -166,48 +174,39 @@ class Session:
         if self._log is not None:
             self._summarize(state, self._log)
 
-    def _start(self) -> tuple[TrainState, Progress]:
-        keys = jax.vmap(jax.random.key)(np.array(self.run.seed_range, np.uint32))
-        init = jax.jit(jax.vmap(self._train.init))
-        template = jax.eval_shape(init, keys)
+    def _stored(self) -> tuple[Any, Progress] | None:
+        """The arrays of the newest checkpoint, and how far it had come."""
+        if self._checkpoints is None or not self._checkpoints.iterations:
+            return None
+        state, record = self._checkpoints.restore(self._shapes)
+        rows = read_metrics(self.folder.metrics)
+        progress = Progress.resumed(record, self.run, rows)
+        progress.check(self.run, np.asarray(state.iteration))
+        return to_arrays(state), progress
 
-        def stored() -> Any:
-            if self._checkpoints is None or not self._checkpoints.iterations:
-                return None
-            state, record = self._checkpoints.restore(template)
-            rows = read_metrics(self.folder.metrics)
-            progress = Progress.resumed(record, self.run, rows)
-            progress.check(self.run, np.asarray(state.iteration))
-            return to_arrays(state), progress
+    @functools.cached_property
+    def _state(self) -> TrainState:
+        """The first state, which later ones replace."""
+        return self._first.result()
 
-        found = processes.from_first(stored)
-        if found is not None:
-            return from_arrays(found[0], template), found[1]
-        begin = compiled(init.lower(keys), self.run.config)
-        return begin(keys), Progress.start(self.run)
-
-    def _compile(self) -> Any:
+    def _compile(self) -> Programs:
         started = time.perf_counter()
-        count = num_parameters(self._state.params) // self.run.seeds
+        count = num_parameters(self._shapes.params) // self.run.seeds
         iteration = self._progress.iteration
         begin = f"from iteration {iteration}" if iteration else "from the start"
         self._say([f"{count:,} parameters, {begin}. Compiling one iteration of training ..."])
         active = np.ones(self.run.seeds, bool)
-        per_device = make_advance(self._train)
-        advance = jax.jit(self._placement.shard(per_device), donate_argnums=0)
-        program = compiled(advance.lower(self._state, active), self.run.config)
+        programs = Programs(self._train, self._placement, self._shapes, active)
         seconds = time.perf_counter() - started
         self._progress = self._progress._replace(
             compile_seconds=self._progress.compile_seconds + seconds
         )
         self.console.print(f"Compiled in {seconds:.1f} s.")
-        return program
+        return programs
 
     def _prepare_results(self) -> None:
         """Compiles in the background what `finish` needs."""
-        worker = futures.ThreadPoolExecutor(1)
-        self._results = worker.submit(self._ready)
-        worker.shutdown(wait=False)
+        self._results = in_background(self._ready)
 
     def _ready(self) -> tuple[Evaluator, report_page.Pay]:
         """What plays the tasks of all sets, and what the curiosity pays for it, compiled."""
@@ -218,7 +217,7 @@ class Session:
         evaluator.compile({part: state.params[part] for part in PARTS})
         return evaluator, report_page.compile_pay(config, state, evaluator)
 
-    def _iterate(self, advance: Advance) -> list[Row]:
+    def _iterate(self, advance: Programs) -> list[Row]:
         progress, active = self._progress, self._progress.active
         started = time.perf_counter()
         self._state, metrics = advance(self._state, active)
@@ -305,8 +304,7 @@ class Session:
         self._say(
             [
                 f"{self.folder.path}: preset {run.preset}, {tt.task_set(run.config.env_id).id}, "
-                f"curiosity {run.config.curiosity}, seed {seeds}, on {self._placement}",
-                "Setting up the network ...",
+                f"curiosity {run.config.curiosity}, seed {seeds}, on {self._placement}"
             ]
         )
 
@@ -326,40 +324,6 @@ class Session:
             "report": folder.page,
         }
         self._say([f"{name:>15}: {path}" for name, path in files.items()])
-
-
-def make_advance(train: Learner) -> Advance:
-    """One iteration of every seed and the greedy evaluation after it, as a pure function.
-
-    The function takes the states [S, ...] and bool[S], the seeds to advance; the others stay
-    as they are. It returns the states and metrics [S].
-    """
-    config = train.config
-    tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")
-
-    def advance(state: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
-        after, metrics = train.iterate(state)
-        outcome = evaluate(train.agent, after.params, train.env, tasks, train.shards)
-        metrics = {
-            **metrics,
-            "episodes": after.episodes,
-            "transitions": after.transitions,
-            "steps": after.transitions - state.transitions,
-            "evaluation": jnp.mean(outcome.solved.astype(jnp.float32)),
-        }
-        after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
-        return after, metrics
-
-    def advance_all(
-        states: TrainState, active: jax.Array
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
-        if len(active) > 1:
-            return jax.vmap(advance)(states, active)
-        # A vmapped loop has to carry on until the slowest of its elements is done.
-        first = jax.tree.map(lambda x: x[0], (states, active))
-        return jax.tree.map(lambda x: x[None], advance(*first))
-
-    return advance_all
 
 
 def _wait(arrays: Any) -> None:
