@@ -5,7 +5,10 @@ from typing import NamedTuple
 # Of the exhaustive comparison the base task and its swaps are enough here.
 STEP = ("tests/test_golden.py", "tests/test_dynamics.py", "-k", "not p-3 and not psy-3")
 OBSERVE = ("tests/test_observation.py", "tests/test_golden.py")
-TIME = ("tests/test_environment.py", "-k", "last_step or limit_trunc or larger or auto or statist")
+TIME = (
+    *("tests/test_environment.py", "tests/test_wrappers.py"),
+    *("-k", "last_step or limit_trunc or larger or auto or statist"),
+)
 PERCEPTUAL = ("tests/test_transfers.py", "-k", "perceptual")
 STRUCTURAL = ("tests/test_transfers.py", "-k", "structural")
 SYMBOLIC = ("tests/test_transfers.py", "-k", "symbolic")

@@ -11,10 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusal import refused
@@ -22,13 +20,10 @@ from rich.console import Console
 
 from agents import evaluate, train
 from agents.config import PRESETS, Config
-from agents.parallel.sharding import Placement
-from agents.ppo.learner import Learner, make_train
 from agents.runs import compilation
 from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved, MetricsLog, is_last, read_metrics
-from agents.runs.programs import Programs
 from agents.runs.progress import Progress
 from agents.runs.stopping import StopSignals
 from agents.train import main, parse, select
@@ -368,37 +363,6 @@ def test_metrics_lose_nothing_but_what_comes_after_the_checkpoint(tmp_path):
     assert read_metrics(path) == log.rows
     assert np.float32(read_metrics(path)[0]["loss"]) == np.float32(1 / 3)
     assert MetricsLog(path).rows == []
-
-
-def test_solved_seeds_stay_as_they_are():
-    """Two seeds side by side, the second one solved."""
-    config = Config(max_steps=6, filters=(2, 2), hidden=4, embedding=2, eval_episodes=2)
-
-    class Adding(Learner):
-        def collect(self, state) -> Any:
-            return state._replace(transitions=state.transitions + 48), jnp.arange(3.0), {}
-
-        def learn(self, state, batch: Any):
-            state = state._replace(
-                params=jax.tree.map(lambda x: x + jnp.sum(batch), state.params),
-                iteration=state.iteration + 1,
-                episodes=state.episodes + 8,
-            )
-            return state, {"loss": jnp.float32(1)}
-
-    train = Adding(**vars(make_train(config)))
-    keys = jax.random.split(jax.random.key(0), 2)
-    shapes = jax.eval_shape(jax.vmap(train.init), keys)
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
-    state = zeros._replace(key=keys)
-    active = jnp.array([True, False])
-    after, metrics = Programs(train, Placement(), state, active)(state, active)
-    assert after.iteration.tolist() == [1, 0]
-    assert after.transitions.tolist() == [48, 0]
-    assert metrics["steps"].tolist() == [48, 48]
-    for leaf in jax.tree.leaves(after.params):
-        assert np.all(np.asarray(leaf[0]) == 3)
-        assert np.all(np.asarray(leaf[1]) == 0)
 
 
 def test_training_goes_on_until_every_seed_is_solved():

@@ -15,7 +15,6 @@ from agents.acting.identity import layout_ids
 from agents.networks.actions import ActionDistribution
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State
 
 ChooseAction = Callable[[jax.Array, ActionDistribution], jax.Array]
@@ -116,11 +115,10 @@ def rollout(
 def _first(agent: Agent, params: Params, env: Environment, initial: State) -> _Carry:
     """Before the first step: no action, no reward, nothing encoded."""
     batch = len(initial.time)
-    features = jax.eval_shape(agent.encode, params, jax.vmap(observe)(initial))
     return _Carry(
         state=initial,
         embedding=agent.initial_state(params, batch),
         action_tm1=jnp.zeros((batch, 2), jnp.int32),
         reward_tm1=jnp.zeros(batch),
-        cache=Cache.empty(layout_ids(initial), env.max_steps, features.shape[-1]),
+        cache=Cache.empty(layout_ids(initial), env.max_steps, agent.width),
     )

@@ -1,5 +1,6 @@
 """The policy network as pure functions of its parameters: encoder, recurrent core, heads."""
 
+import functools
 from typing import Any
 
 import flax.linen as nn
@@ -33,11 +34,19 @@ class Agent:
         self.heads = Heads(config.streams)
         self.config = config
 
+    @functools.cached_property
+    def width(self) -> int:
+        """F, how many features an observation is encoded to."""
+
+        def encode() -> Any:
+            return self.encoder.init_with_output(jax.random.key(0), self._board())[0]
+
+        return jax.eval_shape(encode).shape[-1]
+
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters."""
         encoder_key = jax.random.fold_in(key, 0)
-        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
-        features, encoder = self.encoder.init_with_output(encoder_key, board)
+        features, encoder = self.encoder.init_with_output(encoder_key, self._board())
         state = jnp.zeros((1, self.config.hidden))
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
         params = {
@@ -119,6 +128,10 @@ class Agent:
         embeddings = _apply(self.core, params["core"], both, method=Core.unroll)
         now, after = jnp.split(embeddings, 2, axis=1)
         return now, after
+
+    def _board(self) -> jax.Array:
+        """An observation, which stands for any other."""
+        return jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
 
     def _unroll_inputs(
         self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array

@@ -1,0 +1,152 @@
+"""Surveys of task sets, and the command line of the solver."""
+
+import json
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+import trap_tube_jax as tt
+from trap_tube_jax.solver.__main__ import _caption, _distances_line, main
+from trap_tube_jax.solver.survey import Survey, survey
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tasks": 0, "graphs": 0}, "tasks must be an integer >= 1, got 0"),
+        ({"tasks": 2, "graphs": 3}, "graphs must be an integer >= 0 and <= 2, got 3"),
+        ({"tasks": 2, "graphs": -1}, "graphs must be an integer >= 0 and <= 2, got -1"),
+        ({"tasks": 2, "graphs": 0, "seed": 2**32}, "seed must be .* <= 4294967295, got 4294967296"),
+    ],
+)
+def test_survey_refuses(options, message):
+    with pytest.raises(ValueError, match=message):
+        survey(tt.task_set("p"), **options)
+
+
+def test_survey_takes_every_task_of_the_seed_once(monkeypatch):
+    """Numbers stand for the tasks, and for what is found in them."""
+    for name, replacement in {
+        "TASKS_PER_CALL": 2,
+        "draw_tasks": lambda entry, tasks, seed: 10 * seed + np.arange(tasks),
+        "solve_batch": lambda tasks: SimpleNamespace(length=tasks),
+        "count_reachable": lambda task: task,
+    }.items():
+        monkeypatch.setattr(f"trap_tube_jax.solver.survey.{name}", replacement)
+    done = []
+    found = survey(tt.task_set("p"), tasks=5, graphs=3, seed=4, advance=done.append)
+    assert found.length.tolist() == [40, 41, 42, 43, 44]
+    assert found.reachable.tolist() == [40, 41, 42]
+    assert found.seed == 4
+    assert done == [2, 2, 1, 1, 1, 1]
+
+
+def test_the_figures_of_a_survey():
+    lengths, reachable = np.array([4, -1, 8, 6, -1]), np.array([10, 40])
+    found = Survey(tt.task_set("p"), 3, lengths, reachable).summary()
+    quantiles = found.pop("quantiles")
+    assert found == {
+        "id": "PerceptualTrapTube-v0",
+        "tasks": 5,
+        "seed": 3,
+        "solvable": 0.6,
+        "mean": 6,
+        "longest": 8,
+        "reachable": {"tasks": 2, "mean": 25, "fewest": 10, "most": 40},
+    }
+    assert quantiles == pytest.approx({"5": 4.2, "25": 5, "50": 6, "75": 7, "95": 7.8})
+
+
+def test_command_line_surveys_task_sets(tmp_path, capsys):
+    picture = tmp_path / "histogram.png"
+    arguments = ["--tasks", "12", "--graphs", "0", "--output", str(picture), "--sets"]
+    main([*arguments, "sy", "--json"])
+    (found,) = json.loads(capsys.readouterr().out)
+    assert (found["id"], found["tasks"], found["solvable"]) == ("SymbolicTrapTube-v0", 12, 1)
+    assert 8 <= found["mean"] <= found["longest"] <= 16
+    main([*arguments, "base"])
+    assert "100.00 %  11.0   11" in capsys.readouterr().out
+    with Image.open(picture) as image:
+        assert image.format == "PNG"
+
+
+def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypatch):
+    for module in ("matplotlib", "trap_tube_jax.solver.pictures"):
+        monkeypatch.setitem(sys.modules, module, None)
+    animation = tmp_path / "plan.gif"
+    arguments = ["--show", "SymbolicTrapTube-v0", "--seed", "3", "--output", str(animation)]
+    main([*arguments, "--json"])
+    plan = json.loads(capsys.readouterr().out)
+    state, _ = tt.make("sy").reset(jax.random.key(3))
+    assert plan["actions"] == tt.solve(state).actions.tolist()
+    main(arguments)
+    text = capsys.readouterr().out
+    assert f"step {plan['length']}: grasp" in text
+    assert tt.render_ascii(state) in text
+    with Image.open(animation) as image:
+        assert image.format == "GIF"
+
+
+@pytest.mark.slow
+def test_command_line_draws_distances(tmp_path, capsys):
+    picture = tmp_path / "distances.png"
+    main(["--distances", "base", "--output", str(picture)])
+    assert "1,547,184 reachable states" in capsys.readouterr().out
+    with Image.open(picture) as image:
+        assert image.format == "PNG"
+
+
+def test_captions_of_a_plan():
+    actions = np.array([[0, 3], [1, 2]], np.int32)
+    plan = tt.Plan(actions, np.array(2), np.array(True))
+    assert [_caption(plan, time) for time in range(3)] == [
+        "start (2 steps)",
+        "step 1: grasp up, move right",
+        "step 2: grasp down, move left",
+    ]
+    unsolvable = tt.Plan(actions[:0], np.array(-1), np.array(False))
+    assert _caption(unsolvable, 0) == "start (unsolvable)"
+
+
+def test_the_command_line_says_how_far_the_goal_is():
+    plan = tt.Plan(np.zeros((2, 2), np.int32), np.array(2), np.array(True))
+    found = tt.Distances(from_start=np.arange(-1, 1234), to_goal=np.arange(1235) % 9 - 1)
+    line = "1,234 reachable states, 1,097 of them with a way to the goal, at most 7 steps; 2 steps"
+    assert _distances_line(plan, found) == f"{line} from the start"
+
+
+def test_the_command_line_says_that_no_state_leads_to_the_goal():
+    plan = tt.Plan(np.zeros((0, 2), np.int32), np.array(-1), np.array(False))
+    found = tt.Distances(from_start=np.arange(1234), to_goal=np.full(1234, -1))
+    line = "1,234 reachable states, none of them with a way to the goal; unsolvable from the start"
+    assert _distances_line(plan, found) == line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--show", "p", "--distances", "p"], "exclude each other"),
+        (["--show", "nowhere"], "unknown task set 'nowhere'"),
+        (["--tasks", "0"], "tasks must be an integer >= 1"),
+        (["--seed", str(2**32)], "seed must be an integer >= 0 and <= 4294967295"),
+        (["--show", "base", "--seed", "-1"], "seed must be an integer >= 0"),
+        (["--sets"], "--sets must name at least one task set"),
+    ],
+)
+def test_command_line_refuses(arguments, message, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        main(arguments)
+    assert exit_info.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_runs_as_a_module_without_warnings():
+    command = [sys.executable, "-W", "error", "-m", "trap_tube_jax.solver", "--help"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "--distances" in result.stdout
