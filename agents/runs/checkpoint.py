@@ -5,6 +5,7 @@ JSON record with a digest of them. Reading one needs neither the classes that wr
 the device.
 """
 
+import functools
 import hashlib
 import logging
 from pathlib import Path
@@ -48,22 +49,30 @@ class Checkpoints:
             raise ValueError(f"keep must be >= 1, got {keep}")
         if keep is None and not folder.is_dir():
             raise CheckpointError(f"{folder} holds no checkpoint")
-        import orbax.checkpoint as ocp  # noqa: PLC0415  slow to import
-
-        # Orbax reports every refused file with a stack trace of its own.
-        logging.getLogger("absl").setLevel(logging.CRITICAL)
-        self.folder = folder
-        self._ocp = ocp
+        self.folder, self._keep = folder, keep
         folder.mkdir(parents=True, exist_ok=True)
+
+    @functools.cached_property
+    def _ocp(self) -> Any:
+        """Orbax, imported where there is something to read or write: importing it is slow."""
+        import orbax.checkpoint as ocp  # noqa: PLC0415
+
+        # It reports every refused file with a stack trace of its own.
+        logging.getLogger("absl").setLevel(logging.CRITICAL)
+        return ocp
+
+    @functools.cached_property
+    def _manager(self) -> Any:
+        ocp = self._ocp
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep,
-            read_only=keep is None,
+            max_to_keep=self._keep,
+            read_only=self._keep is None,
             create=False,
-            cleanup_tmp_directories=keep is not None,
+            cleanup_tmp_directories=self._keep is not None,
             enable_async_checkpointing=False,
             multiprocessing_options=_this_process_alone(ocp),
         )
-        self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
+        return ocp.CheckpointManager(self.folder.absolute(), options=options)
 
     def __enter__(self) -> Self:
         return self
@@ -73,11 +82,14 @@ class Checkpoints:
 
     def close(self) -> None:
         """Ends whatever works in the background."""
-        self._manager.close()
+        if "_manager" in vars(self):
+            self._manager.close()
 
     @property
     def iterations(self) -> list[int]:
         """The iterations that have a checkpoint, in order."""
+        if not any(self.folder.iterdir()):
+            return []
         return sorted(self._manager.all_steps(read=True))
 
     def save(self, iteration: int, state: Any, record: dict[str, Any]) -> None:
