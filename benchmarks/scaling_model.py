@@ -129,7 +129,7 @@ def compiled_exchanges(config: Config, devices: int) -> list[Exchange]:
     train = make_train(config, shards=placement.episodes)
     state = placement.put(jax.jit(jax.vmap(train.init))(jax.random.split(jax.random.key(0), 1)))
     programs = Programs(train, placement, state, np.ones(1, bool))
-    return exchanges(*(program.as_text() or "" for program in programs.compiled))
+    return exchanges(*(program.result().as_text() or "" for program in programs.pending))
 
 
 def share_seconds(config: Config, devices: int) -> float:

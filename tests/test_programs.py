@@ -2,16 +2,18 @@
 
 import functools
 import gc
+import threading
 from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from agents.config import Config
 from agents.parallel.sharding import Placement
-from agents.ppo.learner import Learner, make_train
+from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import programs
 from agents.runs.programs import Programs
 
@@ -52,9 +54,44 @@ def test_garbage_is_collected_afterwards_as_before():
         assert gc.isenabled() == was_enabled
 
 
+def make_state(train: Learner, seeds: int) -> TrainState:
+    """Zeros, with different keys."""
+    keys = jax.random.split(jax.random.key(0), seeds)
+    shapes = jax.eval_shape(jax.vmap(train.init), keys)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
+    return zeros._replace(key=keys)
+
+
+def test_an_iteration_begins_while_its_end_is_still_traced():
+    has_played = threading.Event()
+
+    class Waiting(Learner):
+        def collect(self, state) -> Any:
+            jax.debug.callback(has_played.set)
+            return state, jnp.zeros(3), {}
+
+        def learn(self, state, batch: Any):
+            assert has_played.wait(60)
+            return state, {}
+
+    train = Waiting(**vars(make_train(Config(**TINY))))
+    state, active = make_state(train, 1), np.ones(1, bool)
+    Programs(train, Placement(), state, active)(state, active)
+
+
+def test_what_fails_while_tracing_ends_the_iteration():
+    class Failing(Learner):
+        def learn(self, state, batch: Any) -> Any:
+            raise ValueError("no loss")
+
+    train = Failing(**vars(make_train(Config(**TINY, episodes=2, minibatch=2))))
+    state, active = make_state(train, 1), np.ones(1, bool)
+    with pytest.raises(ValueError, match="no loss"):
+        Programs(train, Placement(), state, active)(state, active)
+
+
 def test_solved_seeds_stay_as_they_are():
     """Two seeds side by side, the second one solved."""
-    config = Config(**TINY)
 
     class Adding(Learner):
         def collect(self, state) -> Any:
@@ -68,11 +105,8 @@ def test_solved_seeds_stay_as_they_are():
             )
             return state, {"loss": jnp.float32(1)}
 
-    train = Adding(**vars(make_train(config)))
-    keys = jax.random.split(jax.random.key(0), 2)
-    shapes = jax.eval_shape(jax.vmap(train.init), keys)
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(key=None))
-    state = zeros._replace(key=keys)
+    train = Adding(**vars(make_train(Config(**TINY))))
+    state = make_state(train, 2)
     active = jnp.array([True, False])
     after, metrics = Programs(train, Placement(), state, active)(state, active)
     assert after.iteration.tolist() == [1, 0]

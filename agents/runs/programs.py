@@ -1,13 +1,16 @@
 """One iteration of all seeds, as three programs that compile at the same time.
 
 Much of a compilation runs on one core: as a single program an iteration takes a quarter longer to
-compile on two. Each program is compiled while the next one is traced.
+compile on two. Each program compiles while the next one is traced, and the first iteration begins
+as soon as the first program is there.
 """
 
 import contextlib
 import functools
 import gc
+import time
 from collections.abc import Callable, Iterator
+from concurrent import futures
 from typing import Any
 
 import jax
@@ -65,14 +68,15 @@ def _for_all_seeds(
 
 
 class Programs:
-    """The compiled phases; call them for one iteration.
+    """The phases, compiled in the background; call them for one iteration.
 
     Attributes:
-      compiled: one program for each phase, in order.
+      pending: one program for each phase, in order, some of them still to come.
+      ready_at: when the newest of them came, by `time.perf_counter`.
     """
 
     def __init__(self, train: Learner, placement: Placement, states: TrainState, active: Any):
-        """Compiles.
+        """Begins to compile.
 
         Args:
           train: the learner.
@@ -80,21 +84,34 @@ class Programs:
           states: the states that the first iteration will take, or their shapes.
           active: bool[S].
         """
-        carry: Any = (states, None)
-        pending = []
-        with _uncollected():
-            for phase in make_phases(train):
-                traced = jax.jit(placement.shard(phase), donate_argnums=0).trace(*carry, active)
-                pending.append(in_background(compiled, traced.lower(), train.config))
-                carry, _ = traced.out_info
-        self.compiled = [program.result() for program in pending]
+        self.pending: list[futures.Future[jax.stages.Compiled]] = []
+        self.ready_at = time.perf_counter()
+
+        def lower(phase: Phase, before: futures.Future | None) -> tuple[jax.stages.Lowered, Any]:
+            carry = (states, None) if before is None else before.result()[1]
+            with _uncollected():
+                jitted = jax.jit(placement.shard(phase), donate_argnums=0)
+                traced = jitted.trace(*carry, active)
+                return traced.lower(), traced.out_info[0]
+
+        def finish(lowered: futures.Future) -> jax.stages.Compiled:
+            program = compiled(lowered.result()[0], train.config)
+            self.ready_at = time.perf_counter()
+            return program
+
+        lowered = None
+        tracer = futures.ThreadPoolExecutor(1)  # one trace after the other
+        for phase in make_phases(train):
+            lowered = tracer.submit(lower, phase, lowered)
+            self.pending.append(in_background(finish, lowered))
+        tracer.shutdown(wait=False)
 
     def __call__(self, states: TrainState, active: Any) -> tuple[TrainState, Metrics]:
         """The states after an iteration of the active seeds, and metrics [S]. Takes the states."""
         carry: Carry = (states, None)
         metrics: Metrics = {}
-        for program in self.compiled:
-            carry, more = program(*carry, active)
+        for program in self.pending:
+            carry, more = program.result()(*carry, active)
             metrics |= more
         return carry[0], dict(sorted(metrics.items()))
 

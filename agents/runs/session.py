@@ -190,19 +190,12 @@ class Session:
         return self._first.result()
 
     def _compile(self) -> Programs:
-        started = time.perf_counter()
         count = num_parameters(self._shapes.params) // self.run.seeds
         iteration = self._progress.iteration
         begin = f"from iteration {iteration}" if iteration else "from the start"
         self._say([f"{count:,} parameters, {begin}. Compiling one iteration of training ..."])
         active = np.ones(self.run.seeds, bool)
-        programs = Programs(self._train, self._placement, self._shapes, active)
-        seconds = time.perf_counter() - started
-        self._progress = self._progress._replace(
-            compile_seconds=self._progress.compile_seconds + seconds
-        )
-        self.console.print(f"Compiled in {seconds:.1f} s.")
-        return programs
+        return Programs(self._train, self._placement, self._shapes, active)
 
     def _prepare_results(self) -> None:
         """Compiles in the background what `finish` needs."""
@@ -223,7 +216,8 @@ class Session:
         self._state, metrics = advance(self._state, active)
         _wait(metrics)
         host = {name: np.asarray(values) for name, values in metrics.items()}
-        taken = time.perf_counter() - started
+        compiling = max(0.0, advance.ready_at - started)  # of the first iteration alone
+        taken = time.perf_counter() - started - compiling
         steps = host.pop("steps")
         iteration, seconds = progress.iteration + 1, progress.seconds + taken
         rows: list[Row] = [
@@ -237,7 +231,11 @@ class Session:
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        progress = progress._replace(iteration=iteration, seconds=seconds).after(self.run, rows)
+        progress = progress._replace(
+            iteration=iteration,
+            seconds=seconds,
+            compile_seconds=progress.compile_seconds + compiling,
+        ).after(self.run, rows)
         changes = zip(self.run.seed_range, self._progress.solved, progress.solved, strict=True)
         rows = self._track(rows, just_solved={seed for seed, old, new in changes if old != new})
         if self._log is not None:
