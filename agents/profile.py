@@ -32,7 +32,8 @@ class Options(Settings):
     the length of the shortest plan, by the way that the food has to take, and by kind of symbolic
     swap; the controls of comparative psychology; the paired test of the first push; and at which
     step and subgoal plans go wrong. All agents in one figure, and one more figure for each.
-    Greedy play on tasks that training never draws, compared with exact shortest plans.
+    Greedy play on tasks drawn with keys that training never uses, compared with exact shortest
+    plans.
 
     Attributes:
       runs: folders of runs, or files of parameters; of a run its first seed.

@@ -106,7 +106,7 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         return train.play(state.params, reset_keys, action_key)
 
     trajectory = _jitted(play, train, state)()
-    batch, _, _ = jax.jit(train.prepare)(state, trajectory)
+    _, batch, _ = jax.jit(train.prepare)(state, trajectory)
     flop = useful_flop(train, state, batch)
     parts: list[tuple[str, Callable[[], Any], float]] = [
         ("iteration", _jitted(Learner.iterate, train, state), sum(flop)),

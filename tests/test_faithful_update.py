@@ -36,7 +36,7 @@ def ours(recording: Recording) -> dict[str, Any]:
         assert isinstance(train.curiosity, ICM)
         prediction = train.curiosity.predict(params["curiosity"], experience)
         raw, _ = train.intrinsic_reward(state, trajectory)
-        batch, state, _ = train.prepare(state, trajectory)
+        state, batch, _ = train.prepare(state, trajectory)
         moments = (state.extrinsic, state.intrinsic)
         return trajectory, experience.next_embedding, prediction, raw, batch, moments
 

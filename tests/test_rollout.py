@@ -189,7 +189,7 @@ def prepared(curiosity):
         # The same episodes with the features of these parameters.
         boards = trajectory.episodes.observations()
         features = jax.vmap(lambda rows: train.agent.encode(state.params, rows))(boards)
-        batch, _, _ = train.prepare(state, trajectory._replace(features=features))
+        _, batch, _ = train.prepare(state, trajectory._replace(features=features))
         return state, batch
 
     return train, prepare

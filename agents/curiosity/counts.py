@@ -23,7 +23,7 @@ class Counts(Curiosity):
     the same hash share a count. While n observations are known, a new one shares with
     probability n / 2^20: 5 % at 50,000.
 
-    Counts tell something only where tasks return: base (1 layout) and {Sy} (5 layouts).
+    Counts tell something only where tasks recur: base (1 layout) and {Sy} (5 layouts).
     `perceptual` and `structural` draw so many tasks that hardly any observation is met again, and
     the table would fill with what never returns. So they are refused.
 

@@ -159,7 +159,7 @@ class Learner:
         reset_key, action_key, _, _ = _keys(state)
         reset_keys = self.draw_tasks(state.failures, reset_key)
         trajectory = self.play(state.params, reset_keys, action_key)
-        batch, state, metrics = self.prepare(state, trajectory)
+        state, batch, metrics = self.prepare(state, trajectory)
         if again := self.config.num_replayed:
             failures = state.failures.remember(reset_keys, ~batch.episodes.solved, again)
             state = state._replace(failures=failures)
@@ -198,7 +198,7 @@ class Learner:
 
     def prepare(
         self, state: TrainState, trajectory: Trajectory
-    ) -> tuple[Batch, TrainState, Metrics]:
+    ) -> tuple[TrainState, Batch, Metrics]:
         """Turns episodes into what the gradient steps learn from, under the acting parameters.
 
         Args:
@@ -206,8 +206,8 @@ class Learner:
           trajectory: this device's episodes.
 
         Returns:
-          The batch of all devices' episodes; the state with rewards' moments, curiosity's
-          memory and transitions brought up to date; and metrics of play.
+          The state with rewards' moments, curiosity's memory and transitions brought up to date;
+          the batch of all devices' episodes; and metrics of play.
         """
         config = self.config
         novelty, memory = self.intrinsic_reward(state, trajectory)
@@ -239,7 +239,7 @@ class Learner:
             memory=memory,
             transitions=state.transitions + jnp.sum(episodes.length),
         )
-        return batch, state, metrics
+        return state, batch, metrics
 
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
         """The intrinsic reward f32[T, B] of all devices' episodes, and the curiosity's new memory.
