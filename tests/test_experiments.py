@@ -3,16 +3,19 @@
 import dataclasses
 import json
 import shlex
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from refusal import refused
 
 from agents.config import PRESETS, Config
 from agents.experiments import __main__ as experiments
-from agents.experiments import records, training
+from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROTOCOLS, QUICK, Protocol, algorithms, parse_setting
 from agents.experiments.tables import algorithm_label
-from agents.runs.folder import Run, RunFolder, write_json
+from agents.parallel.sharding import Placement
+from agents.runs.folder import Run, RunFolder, read_json, write_json
 from agents.runs.metrics import MetricsLog
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
@@ -143,3 +146,18 @@ def test_a_command_can_be_pasted_into_a_shell():
     words = shlex.split(Protocol(settings=settings).command("exp1", ["ppo"]))
     given = words[words.index("--settings") + 1 :]
     assert dict(map(parse_setting, given)) == settings
+
+
+def test_a_command_says_on_how_many_devices_its_runs_were_trained(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "machine", lambda commit: {"devices": 8, "commit": commit})
+    folder = RunFolder.create(tmp_path / "x", Run(Config()))
+    for devices, used in ((1, [1]), (2, [1, 2])):
+        mesh: Any = SimpleNamespace(size=devices)
+        training.note_machine(folder, Placement(mesh if devices > 1 else None), "abc")
+        assert [each["devices"] for each in read_json(folder.machines)] == used
+    for machines, devices in (([1, 1], 1), ([1, 2], None), ([None], None), ([], None)):
+        assert reporting._devices([{"devices": each} for each in machines]) == devices
+    assert reporting._devices([{}]) is None
+    protocol = PROTOCOLS["exp1"]
+    assert protocol.command("exp1", ["ppo"], 2).endswith(" --algorithms ppo --devices 2")
+    assert "--devices" not in protocol.command("exp1", ["ppo"])

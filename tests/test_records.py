@@ -217,6 +217,20 @@ def test_training_is_averaged_over_the_last_points_of_its_seed():
     assert [row.get("success") for row in figures.smoothed(mixed)[20:]] == [0.5, None]
 
 
+def test_recorded_commands_are_those_of_the_protocols_and_machines():
+    folder = readme_tables.Arguments().results
+    found = readme_tables.read_records(folder).values()
+    experiments = [record for record in found if record["schema"] == records.SCHEMA]
+    assert len(experiments) >= 5
+    for record in experiments:
+        names = [entry["name"] for entry in record["algorithms"]]
+        (devices,) = {each["devices"] for each in record["machines"]}
+        command = Protocol.from_dict(record["protocol"]).command(
+            record["experiment"], names, devices
+        )
+        assert record["command"] == command
+
+
 def test_pages_and_figures_are_those_of_the_records():
     found = readme_tables.read_records(readme_tables.Arguments().results)
     assert not readme_tables.stale(readme_tables.ROOT, found)

@@ -200,8 +200,17 @@ class Protocol:
         changes = changes_of(algorithm)
         return Config.preset(self.preset, **{**self.settings, **fixed, **changes})
 
-    def command(self, experiment: str, algorithms: Sequence[str]) -> str:
-        """What to type for the same runs in a new folder."""
+    def command(
+        self, experiment: str, algorithms: Sequence[str], devices: int | None = None
+    ) -> str:
+        """What to type for the same runs in a new folder.
+
+        Args:
+          experiment: which of `PROTOCOLS`.
+          algorithms: the algorithms of the runs.
+          devices: how many each run was trained on, as sums of other numbers round otherwise;
+            None if unknown.
+        """
         usual = PROTOCOLS[experiment]
         parts = [experiment]
         parts += [part for name in self.imports for part in ("--import", name)]
@@ -219,6 +228,8 @@ class Protocol:
             parts.append("--settings")
         for name, value in self.settings.items():
             parts.append(f"{name}={json.dumps(value, separators=(',', ':'))}")
+        if devices is not None:
+            parts += ["--devices", str(devices)]
         return f"{PROGRAM} {shlex.join(parts)}"
 
 

@@ -53,7 +53,7 @@ def make_record(root: Path, experiment: str, protocol: Protocol, console: Consol
     return {
         "schema": records.SCHEMA,
         "experiment": experiment,
-        "command": whole.command(experiment, names),
+        "command": whole.command(experiment, names, _devices(machines)),
         "protocol": dataclasses.asdict(whole),
         "ranked": list(protocol.ranked),
         "machines": machines,
@@ -163,6 +163,12 @@ def _about(name: str, tasks: State) -> dict[str, Any]:
         "layout": None if layout is None else layout.tolist(),
         "shortest": solve_batch(take(tasks, slice(NUM_COMPARED))).length.tolist(),
     }
+
+
+def _devices(machines: Sequence[Record]) -> int | None:
+    """How many devices every run was trained on; None where they differ or are unknown."""
+    numbers = {machine.get("devices") for machine in machines}
+    return numbers.pop() if len(numbers) == 1 else None
 
 
 def _whole_protocol(protocol: Protocol, runs: Sequence[AlgorithmRun]) -> Protocol:

@@ -107,7 +107,8 @@ def train_all(
     tasks = draw_tasks(todo[0][1].config, protocol.sets, protocol.tasks, protocol.selects_on)
     for number, (folder, run) in enumerate(todo, 1):
         console.rule(f"run {number} of {len(todo)}: {folder.path.name}")
-        note_machine(folder, commit)
+        placement = Placement.of(devices, run.config, run.seeds)
+        note_machine(folder, placement, commit)
         tracker = Tracker(folder, run, tasks, ranked=protocol.ranked, every=protocol.evaluate_every)
         session = Session(
             folder,
@@ -116,7 +117,7 @@ def train_all(
             checkpoint_every=checkpoint_every,
             keep=2,
             tracker=tracker,
-            placement=Placement.of(devices, run.config, run.seeds),
+            placement=placement,
         )
         folder.note(run)  # more iterations, once it has been taken up
         try:
@@ -172,10 +173,10 @@ def draw_tasks(
     return {name: evaluation_tasks(name, num_tasks, config.num_features, purpose) for name in sets}
 
 
-def note_machine(folder: RunFolder, commit: str | None) -> None:
-    """Adds this machine to those that a run ran on."""
+def note_machine(folder: RunFolder, placement: Placement, commit: str | None) -> None:
+    """Adds this machine, with the devices that train, to those that a run ran on."""
     known = read_json(folder.machines) or []
-    here = machine(commit)
+    here = {**machine(commit), "devices": placement.devices}
     if here not in known:
         write_json(folder.machines, [*known, here])
 

@@ -136,6 +136,11 @@ class Placement:
         return cls(Mesh(grid.reshape(math.gcd(wanted, seeds), -1), (SEEDS, EPISODES)))
 
     @property
+    def devices(self) -> int:
+        """How many there are."""
+        return 1 if self.mesh is None else self.mesh.size
+
+    @property
     def episodes(self) -> Shards:
         """How the episodes of a seed are divided."""
         return ALONE if self.mesh is None else Shards(self.mesh.shape[EPISODES])
