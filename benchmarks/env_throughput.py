@@ -32,7 +32,7 @@ class Arguments:
       repeats: timed calls; the median counts.
       devices: devices to divide the environments over; a CPU is made to appear as so many.
       plain: measure `jax.vmap` of an `AutoReset`, the fast path's reference, instead.
-      json: file to write the results to.
+      json: file to write the record to; refused unless all is of committed code.
     """
 
     sets: tuple[str, ...] = tuple(task_set.short for task_set in tt.PAPER_TASK_SETS)
@@ -70,6 +70,7 @@ def main(arguments: Arguments) -> list[harness.Throughput]:
         devices=arguments.devices,
     )
     harness.use_devices(arguments.devices)
+    harness.check_recordable(arguments.json)
     subjects = [subject(name, plain=arguments.plain) for name in arguments.sets]
     console = Console()
     console.print(harness.machine())
@@ -97,9 +98,8 @@ def main(arguments: Arguments) -> list[harness.Throughput]:
             )
     console.print(table)
     if arguments.json is not None:
-        harness.write_json(
-            arguments.json, results, plain=arguments.plain, copy_bytes_per_s=bandwidth
-        )
+        extra = {"plain": arguments.plain, "copy_bytes_per_s": bandwidth}
+        harness.write_record(arguments.json, "env_throughput", arguments, results, **extra)
     return results
 
 

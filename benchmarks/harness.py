@@ -1,7 +1,17 @@
-"""What all benchmarks share: the machine's description, timing, and results as JSON."""
+"""What all benchmarks share: the machine's description, timing, and their records.
+
+A record is a JSON file:
+
+    schema      the name of this layout
+    benchmark   which module of `benchmarks` measured
+    command     what to type for the same measurement
+    machines    the one that it ran on: hardware, versions and commit
+    results     what was measured; settings beside it, where the benchmark has more to say
+"""
 
 import dataclasses
 import pathlib
+import shlex
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -10,9 +20,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from agents.runs.folder import write_json as write_record
+from agents.experiments.records import check_clean
+from agents.runs.folder import write_json
 from agents.runs.machine import machine
 from trap_tube_jax.checks import check_integer
+
+SCHEMA = "trap-tube-jax benchmark 1"
+PLACES = ("json", "figure", "output")  # options that say nothing of the results
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,14 +233,54 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
     return passes * num_bytes / measure(lambda: rewrite(source)).median_s
 
 
-def write_json(path: pathlib.Path, results: Sequence[Any], **extra: Any) -> None:
-    """Writes the machine, `extra` and a list of dataclass results to `path`."""
+def check_recordable(path: pathlib.Path | None) -> None:
+    """Refuses to record what uncommitted code measures; call it before measuring.
+
+    Raises:
+      ValueError: there is a path to record to, and git tells of changes or of no commit.
+    """
+    if path is not None:
+        check_clean({"machines": []})
+
+
+def write_record(
+    path: pathlib.Path, benchmark: str, options: Any, results: Sequence[Any], **extra: Any
+) -> None:
+    """Writes the record of a benchmark.
+
+    Args:
+      path: the file.
+      benchmark: its module in `benchmarks`.
+      options: those that it was run with, a dataclass.
+      results: dataclasses.
+      extra: what else the record says.
+
+    Raises:
+      ValueError: see `check_recordable`.
+    """
+    check_recordable(path)
     record = {
-        "machine": machine(),
+        "schema": SCHEMA,
+        "benchmark": benchmark,
+        "command": command(benchmark, options),
+        "machines": [machine()],
         **extra,
         "results": [dataclasses.asdict(result) for result in results],
     }
-    write_record(path, record)
+    write_json(path, record)
+
+
+def command(benchmark: str, options: Any) -> str:
+    """What to type for the same measurement: the options that are not the usual ones."""
+    parts = ["python", "-m", f"benchmarks.{benchmark}"]
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if field.name in PLACES or value == field.default:
+            continue
+        parts.append(f"--{field.name.replace('_', '-')}")
+        if value is not True:
+            parts += map(str, value if isinstance(value, tuple) else (value,))
+    return shlex.join(parts)
 
 
 def _bits(observation: jax.Array) -> jax.Array:

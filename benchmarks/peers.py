@@ -30,7 +30,7 @@ class Arguments:
       repeats: timed calls; the median counts.
       devices: devices to divide the environments over; a CPU is made to appear as so many.
       sets: our own task sets in the table; the first is the ratios' numerator.
-      json: file to write the results to.
+      json: file to write the record to; refused unless all is of committed code.
     """
 
     num_envs: int = 4096
@@ -186,6 +186,7 @@ def main(arguments: Arguments) -> None:
         devices=arguments.devices,
     )
     harness.use_devices(arguments.devices)
+    harness.check_recordable(arguments.json)
     console = Console()
     console.print(harness.machine())
     results, skipped = run(arguments)
@@ -203,7 +204,7 @@ def main(arguments: Arguments) -> None:
     for name, reason in skipped.items():
         console.print(f"skipped {name}: {reason}", markup=False)
     if arguments.json is not None:
-        harness.write_json(arguments.json, results, skipped=skipped)
+        harness.write_record(arguments.json, "peers", arguments, results, skipped=skipped)
 
 
 def _actions(num_actions: int) -> Callable[[jax.Array, tuple[int, ...]], jax.Array]:

@@ -20,7 +20,7 @@ import agents.profiles.tables
 from agents.experiments import figures, tables
 from agents.experiments.records import SCHEMA, Record, read_record
 from agents.profiles import measure
-from agents.runs.folder import read_json
+from benchmarks import harness
 from trap_tube_jax.command_line import Flag, plain_errors
 
 ROOT = Path(__file__).parent.parent
@@ -54,13 +54,14 @@ class Arguments:
 
 
 def read_records(results: Path) -> dict[str, Record]:
-    """All records of a folder by name; other JSON files are none.
+    """The records of a folder that have tables, by name.
 
     Raises:
-      ValueError: a record is of another schema than this version's.
+      ValueError: a JSON file is no record, or of another schema than this version's.
     """
-    paths = [path for path in sorted(results.glob("*.json")) if "schema" in read_json(path)]
-    return {path.stem: read_record(path, *KINDS) for path in paths}
+    paths = sorted(results.glob("*.json"))
+    records = {path.stem: read_record(path, *KINDS, harness.SCHEMA) for path in paths}
+    return {name: record for name, record in records.items() if record["schema"] in KINDS}
 
 
 def generate(text: str, records: dict[str, Record]) -> str:

@@ -43,7 +43,7 @@ class Arguments:
       num_envs: batch sizes of the environment.
       episodes: episodes per iteration of training, on base; whole minibatches of the fast preset.
       seeds: seeds trained side by side, 256 episodes each, on base.
-      json: file to write the results to.
+      json: file to write the record to; refused unless all is of committed code.
       figure: picture to write them to.
     """
 
@@ -158,6 +158,7 @@ def main(arguments: Arguments) -> list[Point]:
         check_integer("seeds", seeds)
     minibatch = Config.preset("fast").minibatch
     harness.check_multiples("episodes", arguments.episodes, "minibatch", minibatch)
+    harness.check_recordable(arguments.json)
     console = Console()
     console.print(harness.machine())
     wanted: list[tuple[Kind, str, int]] = [
@@ -179,7 +180,7 @@ def main(arguments: Arguments) -> list[Point]:
                 )
         console.print(table)
     if arguments.json is not None:
-        harness.write_json(arguments.json, points)
+        harness.write_record(arguments.json, "scaling", arguments, points)
     if arguments.figure is not None:
         save_figure(points, arguments.figure)
     return points

@@ -53,7 +53,7 @@ class Options:
       measure: time the shares of work; needs a quiet machine.
       latency: seconds of one step of a ring between devices.
       bandwidth: bytes per second of each device's link.
-      output: write the results to this file.
+      output: write the record to this file; refused unless all is of committed code.
     """
 
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "paper"
@@ -233,6 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise ValueError(f"bandwidth must be > 0, got {options.bandwidth}")
     config = Config.preset(options.preset, env_id=task_set(options.env).id)
     harness.use_devices(COUNTED_DEVICES)
+    harness.check_recordable(options.output)
     found = compiled_exchanges(config, COUNTED_DEVICES)
     print(exchange_table(found))
     rows = speed_up_rows(options, config, found) if options.measure else []
@@ -240,7 +241,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(speed_up_table(rows))
     if options.output is not None:
         settings = {**dataclasses.asdict(options), "output": None, "config": config.to_dict()}
-        harness.write_json(options.output, found, settings=settings, model=rows)
+        extra = {"settings": settings, "model": rows}
+        harness.write_record(options.output, "scaling_model", options, found, **extra)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ class Arguments:
       env: task sets to train on, by id or short name.
       warm: iterations of training before the clock starts.
       repeats: timed calls; the median counts.
-      json: file to write the results to.
+      json: file to write the record to; refused unless all is of committed code.
     """
 
     preset: str = "paper"
@@ -276,6 +276,7 @@ def main(arguments: Arguments) -> list[Part]:
     check_integer("warm", arguments.warm, minimum=0)
     check_integer("repeats", arguments.repeats)
     configs = [Config.preset(arguments.preset, env_id=task_set(env).id) for env in arguments.env]
+    harness.check_recordable(arguments.json)
     console = Console()
     console.print(harness.machine())
     peak = matrix_product_flops()
@@ -298,8 +299,10 @@ def main(arguments: Arguments) -> list[Part]:
             )
     console.print(table)
     if arguments.json is not None:
-        harness.write_json(
+        harness.write_record(
             arguments.json,
+            "train_throughput",
+            arguments,
             results,
             preset=arguments.preset,
             warm=arguments.warm,

@@ -1,29 +1,41 @@
 """The environment's benchmarks run, and their figures belong together."""
 
+import dataclasses
 import json
+import re
 import runpy
+import shlex
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
+import tyro
 from timings import TIMING
 
+from agents.experiments import records
 from benchmarks import env_throughput, harness, peers, scaling, scaling_model, train_throughput
 from trap_tube_jax.vector import VectorState
 from trap_tube_jax.wrappers import AutoResetState
 
+ROOT = Path(__file__).parent.parent
 
-def test_measures_the_fast_path_and_writes_json(tmp_path, monkeypatch, timed):
+
+def test_measures_the_fast_path_and_writes_a_record(tmp_path, monkeypatch, timed):
     monkeypatch.setattr(harness, "copy_bandwidth", lambda: 1e9)
+    monkeypatch.setattr(records, "machine", lambda: {"commit": "abc"})
     path = tmp_path / "results" / "env.json"
     arguments = env_throughput.Arguments(
         sets=("base",), num_envs=(2,), num_steps=2, repeats=1, json=path
     )
     (result,) = env_throughput.main(arguments)
-    record = json.loads(path.read_text())
-    assert record["machine"]["jax"] == jax.__version__
+    record = records.read_record(path, harness.SCHEMA)
+    assert (record["schema"], record["benchmark"]) == (harness.SCHEMA, "env_throughput")
+    command = "python -m benchmarks.env_throughput --sets base --num-envs 2 --num-steps 2"
+    assert record["command"] == f"{command} --repeats 1"
+    assert record["machines"][0]["jax"] == jax.__version__
     assert record["results"][0]["name"] == "base"
     assert result.observation_bytes == 12 * 12 * 3
     assert (result.steps_per_s, result.timing) == (2 * 2 / 2.0, TIMING)
@@ -80,6 +92,53 @@ def test_a_measurement_is_a_first_call_and_the_repeats(monkeypatch):
 def test_copied_bytes_are_those_of_all_passes(timed):
     assert harness.copy_bandwidth(num_bytes=16, passes=3) == 3 * 16 / 2.0
     assert timed[0].tolist() == [0 ^ 1 ^ 2] * 4
+
+
+@pytest.mark.parametrize(
+    ("module", "option"),
+    [
+        *((module, "--json") for module in (env_throughput, peers, scaling, train_throughput)),
+        (scaling_model, "--output"),
+    ],
+)
+def test_what_uncommitted_code_would_measure_is_not_recorded(
+    capsys, tmp_path, monkeypatch, module, option
+):
+    def fail(*args, **kwargs):
+        raise AssertionError("began before the check")
+
+    monkeypatch.setattr(harness, "measure", fail)
+    monkeypatch.setattr(scaling.subprocess, "run", fail)
+    monkeypatch.setattr(harness, "use_devices", lambda number: None)
+    monkeypatch.setattr(records, "machine", lambda: {"commit": "abc-dirty"})
+    monkeypatch.setattr(sys, "argv", ["x", option, str(tmp_path / "x.json")])
+    with pytest.raises(SystemExit):
+        runpy.run_path(module.__file__, run_name="__main__")
+    assert "committed code, this one of abc-dirty" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="this one of abc-dirty"):  # changed while measuring
+        harness.write_record(tmp_path / "x.json", "x", env_throughput.Arguments(), [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_command_names_what_is_not_usual():
+    options = env_throughput.Arguments(num_envs=(4, 8), plain=True, json=Path("x.json"))
+    command = harness.command("env_throughput", options)
+    assert command == "python -m benchmarks.env_throughput --num-envs 4 8 --plain"
+    given = tyro.cli(env_throughput.Arguments, args=shlex.split(command)[3:])
+    assert given == dataclasses.replace(options, json=None)
+
+
+def test_recorded_commands_can_be_given():
+    modules = {"scaling_model": scaling_model.Options}
+    for path in (ROOT / "benchmarks" / "results").glob("*.json"):
+        record = json.loads(path.read_text())
+        if record["schema"] == harness.SCHEMA:
+            name = record["benchmark"]
+            options = modules.get(name) or sys.modules[f"benchmarks.{name}"].Arguments
+            words = shlex.split(record["command"])
+            assert words[:3] == ["python", "-m", f"benchmarks.{name}"]
+            tyro.cli(options, args=words[3:])
+            assert re.fullmatch("[0-9a-f]{12}", record["machines"][0]["commit"])
 
 
 def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):

@@ -11,6 +11,7 @@ import pytest
 from timings import TIMING
 
 from agents import Config
+from agents.experiments import records
 from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
 from benchmarks import harness, scaling, scaling_model, train_throughput
@@ -157,6 +158,7 @@ def test_exchanges_are_counted_on_as_many_devices_as_the_page_says(tmp_path, mon
 
     monkeypatch.setattr(harness, "use_devices", counted.append)
     monkeypatch.setattr(scaling_model, "compiled_exchanges", compiled_exchanges)
+    monkeypatch.setattr(records, "machine", lambda: {"commit": "abc"})
     path = tmp_path / "scale.json"
     scaling_model.main(["--output", str(path)])
     assert counted == [8, 8]

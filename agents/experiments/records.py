@@ -145,7 +145,9 @@ def check_clean(record: Record, commit: str | None = None) -> None:
     """
     commits = {entry["commit"] for entry in record["machines"]} | {machine()["commit"] or commit}
     if None in commits:
-        raise ValueError("a record names its commit, which git does not tell; give --commit")
+        raise ValueError(
+            "a record names its commit, which git does not tell; run in a clone, or give --commit"
+        )
     dirty = sorted(str(commit) for commit in commits if str(commit).endswith(DIRTY))
     if dirty:
         raise ValueError(
@@ -166,7 +168,7 @@ def read_record(path: Path, *schemas: str) -> Record:
     """
     record = read_json(path)
     if not isinstance(record, dict) or "schema" not in record:
-        raise ValueError(f"{path} is no record of an experiment")
+        raise ValueError(f"{path} is no record: it has no schema")
     schemas = schemas or (SCHEMA,)
     if record["schema"] not in schemas:
         allowed = ", ".join(map(repr, schemas))
