@@ -16,7 +16,15 @@ import tyro
 from timings import TIMING
 
 from agents.experiments import records
-from benchmarks import env_throughput, harness, peers, scaling, scaling_model, train_throughput
+from benchmarks import (
+    env_throughput,
+    harness,
+    peers,
+    scaling,
+    scaling_model,
+    tables,
+    train_throughput,
+)
 from trap_tube_jax.vector import VectorState
 from trap_tube_jax.wrappers import AutoResetState
 
@@ -139,6 +147,33 @@ def test_recorded_commands_can_be_given():
             assert words[:3] == ["python", "-m", f"benchmarks.{name}"]
             tyro.cli(options, args=words[3:])
             assert re.fullmatch("[0-9a-f]{12}", record["machines"][0]["commit"])
+
+
+def test_speeds_are_a_table_of_several_records():
+    def record(commit, *speeds):
+        results = [
+            {"name": name, "num_envs": num_envs, "devices": devices, "steps_per_s": 1e6 * millions}
+            for name, num_envs, devices, millions in speeds
+        ]
+        return {"machines": [{"commit": commit}], "results": results}
+
+    one = record("a" * 12, ("base", 4096, 1, 1.25), ("base", 16, 1, 9), ("p", 8192, 1, 2))
+    two = record("b" * 12, ("p", 4096, 2, 3))
+    assert tables.speeds(one, two).splitlines() == [
+        "| M steps/s | base | p |",
+        "| --- | ---: | ---: |",
+        "| 1 device, 4,096 environments, commit `aaaaaaa` | 1.2 | – |",
+        "| 1 device, 8,192 environments, commit `aaaaaaa` | – | 2.0 |",
+        "| 2 devices, 4,096 environments, commit `bbbbbbb` | – | 3.0 |",
+    ]
+
+
+def test_the_pages_of_benchmarks_are_of_their_records():
+    pages = [ROOT / "README.md", *(ROOT / "benchmarks" / "results").glob("*.md")]
+    asked = " ".join(page.read_text() for page in pages)
+    for name in ("peers_2_devices/speeds", "peers,peers_2_devices/speeds", "scale/speed_up"):
+        assert f"<!-- table: {name} -->" in asked
+    assert "<!-- table: env_throughput,env_throughput_2_devices/speeds -->" in asked
 
 
 def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):

@@ -9,6 +9,8 @@ import pytest
 import trap_tube_jax as tt
 from agents.experiments import statistics
 from agents.experiments.records import read_record
+from agents.experiments.tables import LABELS, PAPER_PERCENT
+from trap_tube_jax.scoring.tasks import ALL_SETS
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -65,6 +67,14 @@ def test_the_leaderboard_is_of_the_records(agent, name):
     steps = np.mean([run["transitions"] for run in entry["runs"]])
     assert row.split(" | ") == [*means, "1,000", f"{steps:,.0f}"]
     assert record["command"] in " ".join(PROTOCOL.read_text().split())
+
+
+def test_the_leaderboard_has_the_papers_numbers():
+    for name, spreads in PAPER_PERCENT.items():
+        means = " | ".join(f"{spreads[each].mean:.1f}" for each in ALL_SETS if each != "base")
+        assert f"| {LABELS[name]} of the paper, mean of 5 seeds [4] | – | {means} | 128 |" in (
+            PROTOCOL.read_text()
+        )
 
 
 @pytest.mark.interop

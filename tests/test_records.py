@@ -94,7 +94,7 @@ def test_tables_hold_means_deviations_and_intervals(example):
     text = tables.markdown(example)
     assert "| {P} | 55.6 ± 19.2 [7.7, 100.0] | 0.0 | 2.0 ± 3.0 |" in text
     assert "| mean of the sets apart from base | 55.6 ± 19.2 [7.7, 100.0] | – | – |" in text
-    assert "| base | 1.0 of 1 |" in text
+    assert "| base | 1 of 1 |" in text
     seed = tables.seeds_table(example).rows[1]
     assert (*seed[:2], seed[3], *seed[-3:-1]) == ("PPO + ICM", "1", "66.7", "66.7", "1 of 3")
     assert "| {P} | 3 | 83.3 ± 28.9 [11.6, 100.0] | 0.458 ± 0.072 [0.279, 0.638] | 0.250 |" in text
@@ -244,7 +244,6 @@ def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
     block = "a\n<!-- table: {} -->\nold\n<!-- end -->\nb\n"
     (tmp_path / "README.md").write_text(block.format("mine"))
     (folder / "page.md").write_text(block.format("mine"))
-    (folder / "absent.md").write_text(block.format("absent"))
     check, write = (readme_tables.Arguments(root=tmp_path, write=write) for write in (False, True))
     with pytest.raises(SystemExit):
         readme_tables.main(check)
@@ -252,7 +251,6 @@ def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
     for page in (tmp_path / "README.md", folder / "page.md"):
         assert "PPO + ICM, paper" in page.read_text()
         assert "old" not in page.read_text()
-    assert (folder / "absent.md").read_text() == block.format("absent")
     readme_tables.main(check)
     example["algorithms"][0]["runs"][0]["curves"]["training"]["success"][0] = 0.5
     write_json(folder / "mine.json", example)
@@ -260,6 +258,54 @@ def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
     with pytest.raises(SystemExit):
         readme_tables.main(check)
     assert "out of date: " + str(folder / "figures" / "mine.png") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ("<!-- table: absent -->\n<!-- end -->", "there is no record 'absent'; allowed: mine"),
+        ("<!-- table: mine,absent/x -->\n<!-- end -->", "there is no record 'absent'"),
+        ("<!-- table: mine/x -->\n<!-- end -->", "has no view 'x'; allowed: '', 'summary'"),
+        ("| a <!-- row: absent --> | 1 |", "there is no record 'absent'; allowed: mine"),
+        ("| a <!-- row: mine/7 --> | 1 |", "the record has no seed 7"),
+    ],
+)
+def test_what_no_record_makes_is_an_error(example, tmp_path, asked, message):
+    write_json(tmp_path / "benchmarks" / "results" / "mine.json", example)
+    page = tmp_path / "README.md"
+    page.write_text(f"{asked}\n")
+    with pytest.raises(SystemExit, match=rf"error: .*README.md: .*{re.escape(message)}") as stopped:
+        readme_tables.main(readme_tables.Arguments(root=tmp_path, write=True))
+    assert isinstance(stopped.value.code, str), "which ends the process with 1"
+    assert page.read_text() == f"{asked}\n"
+
+
+def test_a_block_may_be_another_view_of_a_record(example):
+    made = readme_tables.generate("<!-- table: a/summary -->\n<!-- end -->", {"a": example})
+    assert made.splitlines()[2:6] == [
+        "| agent | {P} |",
+        "| --- | ---: |",
+        "| PPO + ICM, paper | 2.0 |",
+        "| PPO + ICM | 55.6 [7.7, 100.0] |",
+    ]
+    example["sets"]["p"]["layout"] = [0, 1, 1]  # seed 0 solves the second of three tasks alone
+    assert tables.summary(example).endswith("| PPO + ICM | 55.6 (0.7 of 2) |")
+
+
+def test_rows_of_the_leaderboard_are_made_and_others_stay(example):
+    head, other = "| agent | base | {P} |\n|---|---|---|", "| by hand | 1 | 2 |"
+    own = ["| mine [1] <!-- row: a --> | old |", "| one <!-- row: a/0 --> |"]
+    made = readme_tables.generate("\n".join([head, *own, other]), {"a": example})
+    absent = " | ".join(["–"] * 6)
+    assert made.splitlines() == [
+        *head.splitlines(),
+        f"| mine [1] <!-- row: a --> | 100.0 | 55.6 | {absent} | 3 | 3,333 |",
+        f"| one <!-- row: a/0 --> | 100.0 | 33.3 | {absent} | 3 | 3,000 |",
+        other,
+    ]
+    example["algorithms"] *= 2
+    with pytest.raises(ValueError, match="a row of the leaderboard is of one algorithm"):
+        tables.leaderboard_cells(example)
 
 
 @pytest.mark.parametrize("experiment", PROTOCOLS)

@@ -10,11 +10,11 @@ from statistics import fmean
 from agents.experiments import statistics
 from agents.experiments.protocol import PRESET, PROTOCOLS
 from agents.experiments.records import Record
-from agents.experiments.statistics import Spread
+from agents.experiments.statistics import SetSummary, Spread
 from agents.runs.report import FEW_LAYOUTS, duration
 from agents.runs.table import NOTHING, Table, number
 from trap_tube_jax.scoring.scores import Layouts
-from trap_tube_jax.scoring.tasks import label
+from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
 # Table 1: trials that solved the task, and episodes to solve it.
 PAPER_SOLVED = {"ppo": ("0 / 5", None), "ppo+icm": ("5 / 5", Spread(102_000, 60_000))}
@@ -228,6 +228,45 @@ def provenance(record: Record) -> list[str]:
     return list(dict.fromkeys(map(_machine, record["machines"])))
 
 
+def summary(record: Record) -> str:
+    """The paper's best agent above ours, in Markdown: percent solved of the sets apart from base.
+
+    With the 95 % interval of the mean, or, of sets that have few layouts, the layouts solved.
+    """
+    names = [name for name in record["sets"] if name != "base"]
+    paper = PAPER_PERCENT["ppo+icm"]
+    rows = [(f"{LABELS['ppo+icm']}, paper", *(f"{paper[name].mean:.1f}" for name in names))]
+    for entry in _tested(record):
+        found = statistics.by_set(record, entry)
+        cells = (_percent_or_layouts(found[name]) for name in names)
+        rows.append((algorithm_label(record, entry), *cells))
+    return Table("", ("agent", *map(label, names)), tuple(rows)).to_markdown()
+
+
+def leaderboard_cells(record: Record, seed: int | None = None) -> tuple[str, ...]:
+    """A row of the leaderboard: percent solved of the paper's sets, tasks of a set, steps.
+
+    Args:
+      record: of one algorithm.
+      seed: whose row it is; the means over all if absent.
+
+    Raises:
+      ValueError: the record has no such seed, or several algorithms.
+    """
+    if len(record["algorithms"]) != 1:
+        raise ValueError("a row of the leaderboard is of one algorithm")
+    entry = record["algorithms"][0]
+    runs = [run for run in statistics.tested(entry) if seed in (None, run["seed"])]
+    if not runs:
+        raise ValueError(f"the record has no seed {seed}")
+    found = statistics.by_set(record, {**entry, "runs": runs})
+    means = [found[name].percent if name in found else None for name in ALL_SETS]
+    tasks = max(map(len, runs[0]["best"]["steps"].values()))
+    steps = fmean(run["transitions"] for run in runs)
+    percents = (number(each and each.mean, ".1f") for each in means)
+    return (*percents, f"{tasks:,}", f"{steps:,.0f}")
+
+
 def markdown(record: Record) -> str:
     """All tables and notes in Markdown."""
     parts = [f"**{table.title}**\n\n{table.to_markdown()}" for table in tables(record)]
@@ -286,7 +325,16 @@ def spread_text(spread: Spread | None, form: str, high: float = math.inf) -> str
     return text
 
 
+def _percent_or_layouts(found: SetSummary) -> str:
+    if found.percent is None:
+        return NOTHING
+    if found.layouts:
+        return f"{found.percent.mean:.1f} ({_solved_layouts(found.layouts)})"
+    return _percent(found.percent._replace(sd=None))
+
+
 def _solved_layouts(layouts: Sequence[Layouts]) -> str:
-    mean = sum(each.solved for each in layouts) / len(layouts)
-    form = ".0f" if len(layouts) == 1 else ".1f"
-    return f"{mean:{form}} of {layouts[0].total}"
+    """How many are solved: a whole number where all seeds agree, else the mean."""
+    counts = {each.solved for each in layouts}
+    form = ".0f" if len(counts) == 1 else ".1f"
+    return f"{fmean(each.solved for each in layouts):{form}} of {layouts[0].total}"
