@@ -26,7 +26,7 @@ from agents.runs.machine import machine
 from trap_tube_jax.checks import check_integer
 
 SCHEMA = "trap-tube-jax benchmark 1"
-PLACES = ("json", "figure", "output")  # options that say nothing of the results
+PLACES = ("json", "output")  # options that say nothing of the results
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ the project they make
     <!-- row: NAME/SEED -->        the same of one seed
 
 A record's figures are `benchmarks/results/figures/NAME.png`, and of a profile `NAME_AGENT.png`
-beside it.
+beside it. They are out of date where the record or the code that draws them has changed.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ import benchmarks.tables
 from agents.experiments import figures, tables
 from agents.experiments.records import SCHEMA, Record, read_record
 from agents.profiles import measure
-from benchmarks import harness
+from benchmarks import harness, scaling
 from trap_tube_jax.command_line import Flag
 
 ROOT = Path(__file__).parent.parent
@@ -43,8 +43,8 @@ VIEWS: dict[str, dict[str, Callable[..., str]]] = {
     "peers": {"speeds": benchmarks.tables.speeds},
     "scaling_model": {"speed_up": benchmarks.tables.speed_up},
 }
-# By schema, what draws the figures.
-FIGURES = {SCHEMA: figures, measure.SCHEMA: agents.profiles.figures}
+# By schema or benchmark, what draws the figures.
+FIGURES = {SCHEMA: figures, measure.SCHEMA: agents.profiles.figures, "scaling": scaling}
 BLOCK = re.compile(
     r"(?P<start><!-- table: (?P<names>[^\s/]+)/?(?P<view>\S*) -->\n).*?(?P<end><!-- end -->)",
     re.DOTALL,
@@ -109,8 +109,12 @@ def _named(records: Mapping[str, Record], name: str) -> Record:
     return records[name]
 
 
+def _kind(record: Record) -> str:
+    return record.get("benchmark", record["schema"])
+
+
 def _view(record: Record, view: str) -> Callable[..., str]:
-    views = VIEWS.get(record.get("benchmark", record["schema"]), {})
+    views = VIEWS.get(_kind(record), {})
     if view not in views:
         allowed = ", ".join(map(repr, views)) or "none"
         raise ValueError(f"this record has no view {view!r}; allowed: {allowed}")
@@ -132,11 +136,12 @@ def stale(root: Path, records: dict[str, Record]) -> dict[Path, Callable[[], obj
             raise ValueError(f"{path}: {error}") from error
         if made != text:
             found[path] = partial(path.write_text, made, encoding="utf-8")
-    drawn = {name: record for name, record in records.items() if record["schema"] in FIGURES}
+    drawn = {name: record for name, record in records.items() if _kind(record) in FIGURES}
     for name, record in drawn.items():
-        for file, draw in FIGURES[record["schema"]].drawings(record, name).items():
+        own_figures = FIGURES[_kind(record)]
+        for file, draw in own_figures.drawings(record, name).items():
             path = root / "benchmarks" / "results" / "figures" / file
-            if figures.drawn_from(path) != figures.digest(record):
+            if figures.drawn_from(path) != own_figures.digest(record):
                 found[path] = partial(draw, path)
     return found
 

@@ -9,7 +9,8 @@ import pathlib
 import resource
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -20,6 +21,8 @@ from rich.progress import track
 from rich.table import Table
 
 from agents import Config, make_train
+from agents.experiments import figures
+from agents.experiments.records import Record
 from benchmarks import harness
 from benchmarks.env_throughput import subject
 from trap_tube_jax.checks import check_integer
@@ -44,7 +47,6 @@ class Arguments:
       episodes: episodes per iteration of training, on base; whole minibatches of the fast preset.
       seeds: seeds trained side by side, 256 episodes each, on base.
       json: file to write the record to; refused unless all is of committed code.
-      figure: picture to write them to.
     """
 
     sets: tuple[str, ...] = ("base", "pstsy")
@@ -52,7 +54,6 @@ class Arguments:
     episodes: tuple[int, ...] = (64, 256, 1024, 4096)
     seeds: tuple[int, ...] = (1, 2, 4, 8)
     json: pathlib.Path | None = None
-    figure: pathlib.Path | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,8 +122,19 @@ def _measure_apart(kind: Kind, env: str, size: int) -> Point:
     return Point(**json.loads(done.stdout.splitlines()[-1]))
 
 
-def save_figure(points: Sequence[Point], path: pathlib.Path) -> None:
+def drawings(record: Record, name: str) -> dict[str, Callable[[pathlib.Path], None]]:
+    """What draws the figure of a record, by the name of its file."""
+    return {f"{name}.png": partial(save_figure, record)}
+
+
+def digest(record: Record) -> str:
+    """That of a record's figure: what it is drawn from."""
+    return figures.digest_of(record, save_figure)
+
+
+def save_figure(record: Record, path: pathlib.Path) -> None:
     """Throughput and memory, one column per kind."""
+    points = [Point(**result) for result in record["results"]]
     kinds: list[Kind] = [kind for kind in TITLES if any(point.kind == kind for point in points)]
     figure = Figure(figsize=(4.5 * len(kinds), 6), layout="constrained")
     axes: Any = figure.subplots(2, len(kinds), squeeze=False, sharex="col")
@@ -145,8 +157,7 @@ def save_figure(points: Sequence[Point], path: pathlib.Path) -> None:
             axis.legend()
     axes[0, 0].set_ylabel("per second")
     axes[1, 0].set_ylabel("peak memory of the process, GiB")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+    figures.write(figure, path, digest(record))
 
 
 def main(arguments: Arguments) -> list[Point]:
@@ -181,8 +192,6 @@ def main(arguments: Arguments) -> list[Point]:
         console.print(table)
     if arguments.json is not None:
         harness.write_record(arguments.json, "scaling", arguments, points)
-    if arguments.figure is not None:
-        save_figure(points, arguments.figure)
     return points
 
 

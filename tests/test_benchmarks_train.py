@@ -11,7 +11,7 @@ import pytest
 from timings import TIMING
 
 from agents import Config
-from agents.experiments import records
+from agents.experiments import figures, records
 from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
 from benchmarks import harness, scaling, scaling_model, train_throughput
@@ -173,6 +173,8 @@ def test_points_are_drawn(tmp_path):
         for kind in scaling.TITLES
         for size in (1, 8)
     ]
-    path = tmp_path / "folder" / "scaling.png"
-    scaling.save_figure(points, path)
-    assert path.read_bytes().startswith(b"\x89PNG")
+    record = {"results": [dataclasses.asdict(point) for point in points]}
+    ((name, draw),) = scaling.drawings(record, "mine").items()
+    path = tmp_path / "folder" / name
+    draw(path)
+    assert figures.drawn_from(path) == scaling.digest(record)

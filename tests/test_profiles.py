@@ -15,7 +15,7 @@ from agents.acting.policy import Policy
 from agents.config import Config
 from agents.experiments import figures as experiment_figures
 from agents.networks.agent import Agent
-from agents.profiles import measure, mistakes, summary, tables
+from agents.profiles import figures, measure, mistakes, summary, tables
 from agents.profiles.mistakes import (
     NEVER,
     NO_PUSH,
@@ -306,7 +306,7 @@ def test_a_profile_from_end_to_end(tiny, tmp_path, capsys):
     assert files == {"profile.json", "tables.md", "profile.png", "profile_mine.png"}
     for file in ("profile.png", "profile_mine.png"):
         drawn_from = experiment_figures.drawn_from(tmp_path / "out" / file)
-        assert drawn_from == experiment_figures.digest(tiny)
+        assert drawn_from == figures.digest(tiny)
     text = (tmp_path / "out" / "tables.md").read_text()
     assert "| trap-turned | 11 |" in text
     assert "| {P, St} | mine | 2 |" in text

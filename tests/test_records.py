@@ -1,6 +1,7 @@
 """Records of experiments: how they are kept, summed up, drawn."""
 
 import dataclasses
+import inspect
 import re
 import subprocess
 
@@ -9,9 +10,10 @@ import pytest
 
 from agents.experiments import figures, records, statistics, tables, training
 from agents.experiments.protocol import PROTOCOLS, Protocol
+from agents.profiles import figures as profile_figures
 from agents.runs import machine
 from agents.runs.folder import Run, RunFolder, write_json
-from benchmarks import readme_tables
+from benchmarks import readme_tables, scaling
 
 
 def rows(seed, greedy, iterations=None):
@@ -208,6 +210,14 @@ def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
         figures.save(example, tmp_path / "x.png")
         assert figures.drawn_from(tmp_path / "x.png") == figures.digest(example)
     assert figures.drawn_from(tmp_path / "none.png") is None
+
+
+@pytest.mark.parametrize("drawn_by", [figures, profile_figures, scaling])
+def test_figures_are_out_of_date_where_the_code_that_draws_them_changed(monkeypatch, drawn_by):
+    before = drawn_by.digest({})
+    assert before == drawn_by.digest({}) != drawn_by.digest({"seed": 1})
+    monkeypatch.setattr(inspect, "getsource", lambda code: f"{code.__name__}, changed")
+    assert drawn_by.digest({}) != before
 
 
 def test_training_is_averaged_over_the_last_points_of_its_seed():

@@ -4,7 +4,9 @@ Source: the paper's figures of experiments 1 and 2.
 """
 
 import hashlib
+import inspect
 import json
+import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -27,11 +29,11 @@ HEIGHT = 2.5
 DPI = 110
 MOST_SHADED = 3  # algorithms whose spread is shown too
 SMOOTHED = 10  # points of a curve of training, over which `_save_success` takes means
-DIGEST = "Record"  # the key of a figure's metadata
+DIGEST = "Drawn from"  # the key of a figure's metadata
 
 
 def save(record: Record, path: Path) -> None:
-    """Draws the learning curves of a record as PNG, which carries the digest of its data."""
+    """Draws the learning curves of a record as PNG, which carries its `digest`."""
     curves = {
         tables.algorithm_label(record, entry): [
             row for run in entry["runs"] for row in rows_of(run)
@@ -47,20 +49,26 @@ def drawings(record: Record, name: str) -> dict[str, Callable[[Path], None]]:
     return {f"{name}.png": partial(save, record)}
 
 
-def write(figure: Any, path: Path, record: Record | None) -> None:
-    """Writes a figure as PNG, which carries the digest of the record that it shows."""
+def write(figure: Any, path: Path, drawn_from: str | None) -> None:
+    """Writes a figure as PNG, which carries the digest of what it is drawn from."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    metadata = {} if record is None else {DIGEST: digest(record)}
+    metadata = {} if drawn_from is None else {DIGEST: drawn_from}
     figure.savefig(path, format="png", dpi=DPI, metadata=metadata)
 
 
 def digest(record: Record) -> str:
-    """A SHA-256 of a record."""
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+    """That of a record's figures: what they are drawn from."""
+    return digest_of(record, sys.modules[__name__], over_episodes)
+
+
+def digest_of(record: Record, *code: Any) -> str:
+    """A SHA-256 of a record and of the source of the modules and functions that draw it."""
+    parts = (json.dumps(record, sort_keys=True), *map(inspect.getsource, code))
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
 def drawn_from(path: Path) -> str | None:
-    """The digest of the data that a figure was drawn from; None if it names none."""
+    """The digest of what a figure was drawn from; None if it names none."""
     from PIL import Image  # noqa: PLC0415  slow to import
 
     if not path.is_file():
@@ -138,7 +146,7 @@ def _save(
         axis.set_ylim(-0.03, 1.03)
     lines, names = axes[0].get_legend_handles_labels()
     figure.legend(lines, names, loc="outside lower center", ncols=len(names), fontsize="small")
-    write(figure, path, record)
+    write(figure, path, None if record is None else digest(record))
 
 
 def _draw_seeds(axis: Any, episodes: np.ndarray, values: np.ndarray, **style: Any) -> None:

@@ -1,6 +1,7 @@
 """The figures of a profile, from its record."""
 
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.experiments.figures import write
+from agents.experiments.figures import digest_of, write
 from agents.experiments.records import Record
 from agents.profiles import summary
 from agents.profiles.mistakes import NEVER
@@ -49,6 +50,11 @@ def drawings(record: Record, name: str) -> dict[str, Callable[[Path], None]]:
     return made
 
 
+def digest(record: Record) -> str:
+    """That of a record's figures: what they are drawn from."""
+    return digest_of(record, sys.modules[__name__], summary)
+
+
 def save_profile(record: Record, path: Path) -> None:
     """Draws percent solved and optimality over the axes, all policies in one figure, as PNG.
 
@@ -72,7 +78,7 @@ def save_profile(record: Record, path: Path) -> None:
             part.legend(
                 handles, labels, loc="outside upper center", ncols=len(labels), frameon=False
             )
-    write(figure, path, record)
+    write(figure, path, digest(record))
 
 
 def save_mistakes(record: Record, policy: Record, path: Path) -> None:
@@ -93,7 +99,7 @@ def save_mistakes(record: Record, policy: Record, path: Path) -> None:
             for name, pair in record["pairs"].items()
         }
         _draw_bars(axes[2], counts, PUSH_COLOURS, "first push in pairs that differ in the trap")
-    write(figure, path, record)
+    write(figure, path, digest(record))
 
 
 def _by_angle(record: Record, policy: Record) -> dict[float, Outcome]:
