@@ -17,7 +17,7 @@ from agents.config import PRESETS, Config
 from agents.experiments import figures, workers
 from agents.experiments.protocol import parse_value
 from agents.experiments.statistics import Spread
-from agents.experiments.tables import spread_text
+from agents.experiments.tables import SPREAD, spread_text
 from agents.experiments.training import FOLDER_NAME, find_runs, plan_runs
 from agents.ppo.learner import make_train
 from agents.runs.folder import check_name, is_done, write_json
@@ -163,7 +163,7 @@ def report(root: Path, console: Console) -> None:
 
 
 def table(records: Sequence[dict[str, Any]], title: str) -> Table:
-    """A row for each point of the grid: means over seeds, ± the sample standard deviation.
+    """A row for each point of the grid: means over seeds, deviations and 95 % intervals.
 
     Args:
       records: as `results` gives them.
@@ -185,13 +185,13 @@ def table(records: Sequence[dict[str, Any]], title: str) -> Table:
             str(len(seeds)),
             str(sum(seed["finished"] for seed in seeds)),
             str(sum(seed["solved_episodes"] is not None for seed in seeds)),
-            _mean([seed["solved_episodes"] for seed in seeds], ",.0f"),
-            _mean(percents, ".1f"),
-            *(_mean([seed[column] for seed in seeds], ".1f") for column in sets),
+            spread_text(Spread.of([seed["solved_episodes"] for seed in seeds]), ",.0f"),
+            _percent(percents),
+            *(_percent([seed[column] for seed in seeds]) for column in sets),
         ]
         rows.append(tuple(cells))
     labels = (f"{name.removeprefix(PERCENT)} %" for name in sets)
-    return Table(f"{title}: mean ± sd over seeds", (*heads, *labels), tuple(rows))
+    return Table(f"{title}: {SPREAD}", (*heads, *labels), tuple(rows))
 
 
 def point_name(settings: dict[str, Any]) -> str:
@@ -199,9 +199,8 @@ def point_name(settings: dict[str, Any]) -> str:
     return ",".join(f"{name}={_text(value)}" for name, value in settings.items())
 
 
-def _mean(values: Sequence[float | None], form: str) -> str:
-    spread = Spread.of(values)
-    return spread_text(spread and spread._replace(margin=None), form)
+def _percent(values: Sequence[float | None]) -> str:
+    return spread_text(Spread.of(values), ".1f", high=100.0)
 
 
 def _values(text: str) -> tuple[str, list[Any]]:

@@ -37,7 +37,7 @@ PAGES = ("*.md", "agents/**/*.md", "benchmarks/**/*.md", "trap_tube_jax/**/*.md"
 SCHEMAS = (SCHEMA, measure.SCHEMA, harness.SCHEMA)
 # By schema or benchmark, then by view, what makes the text; "" is the view of all tables.
 VIEWS: dict[str, dict[str, Callable[..., str]]] = {
-    SCHEMA: {"": tables.markdown, "summary": tables.summary},
+    SCHEMA: {"": tables.markdown, "summary": tables.summary_markdown},
     measure.SCHEMA: {"": agents.profiles.tables.markdown},
     "env_throughput": {"speeds": benchmarks.tables.speeds},
     "peers": {"speeds": benchmarks.tables.speeds},

@@ -100,6 +100,7 @@ def test_tables_hold_means_deviations_and_intervals(example):
     seed = tables.seeds_table(example).rows[1]
     assert (*seed[:2], seed[3], *seed[-3:-1]) == ("PPO + ICM", "1", "66.7", "66.7", "1 of 3")
     assert "| {P} | 3 | 83.3 ± 28.9 [11.6, 100.0] | 0.458 ± 0.072 [0.279, 0.638] | 0.250 |" in text
+    assert not tables.intervals_table(example), "which the columns hold"
     assert "Unfinished: ppo+icm, seed 0, 3 of 4 iterations." in text
     assert "Unfinished: ppo+icm, seed 1, 3 of 4 iterations." in text
     assert "seed 2" not in text
@@ -192,8 +193,17 @@ def test_many_algorithms_are_rows(example, tmp_path):
     assert [row[0] for row in table.rows] == [
         *("PPO + ICM", "ppo+rnd", "ppo+ride", "PPO, paper", "PPO + ICM, paper")
     ]
-    assert table.rows[1][2:] == ("55.6 ± 19.2", "55.6 ± 19.2 [7.7, 100.0]")
+    assert table.rows[1][2:] == ("55.6 ± 19.2", "55.6 ± 19.2")
     assert table.rows[4][2:] == ("2.0 ± 3.0", "–")
+    (intervals,) = tables.intervals_table(example)
+    assert (intervals.heads, [row[0] for row in intervals.rows]) == (
+        table.heads,
+        ["PPO + ICM", "ppo+rnd", "ppo+ride"],
+    )
+    assert intervals.rows[1] == ("ppo+rnd", "[100.0, 100.0]", "[7.7, 100.0]", "[7.7, 100.0]")
+    assert "| ppo+rnd | [100.0, 100.0] | [7.7, 100.0] | [7.7, 100.0] |" in (
+        tables.markdown(example)
+    )
     assert len(tables.seeds_table(example).rows) == 9
     example["algorithms"].append({**entry, "name": "ppo"})
     figures.save(example, tmp_path / "x.png")
@@ -299,7 +309,7 @@ def test_a_block_may_be_another_view_of_a_record(example):
         "| PPO + ICM | 55.6 [7.7, 100.0] |",
     ]
     example["sets"]["p"]["layout"] = [0, 1, 1]  # seed 0 solves the second of three tasks alone
-    assert tables.summary(example).endswith("| PPO + ICM | 55.6 (0.7 of 2) |")
+    assert tables.summary_markdown(example).endswith("| PPO + ICM | 55.6 (0.7 of 2) |")
 
 
 def test_rows_of_the_leaderboard_are_made_and_others_stay(example):

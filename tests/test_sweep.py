@@ -231,7 +231,9 @@ def test_a_sweep_ends_in_a_table_and_a_figure(finished):
     heads, _, one, two = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:]]
     assert heads[:2] == ["settings", "seeds"]
     assert heads[-2:] == ["base %", "p %"]
-    assert one == ["clip=1", "2", "2", "2", "21 ± 1", "100.0 ± 0.0", "100.0 ± 0.0", "4.5 ± 0.7"]
+    assert "mean ± sd [95 % confidence interval" in lines[0]
+    assert one[:5] == ["clip=1", "2", "2", "2", "21 ± 1 [8, 34]"]
+    assert one[5:] == [*["100.0 ± 0.0 [100.0, 100.0]"] * 2, "4.5 ± 0.7 [0.0, 10.9]"]
     assert two == ["clip=2", "2", "1", "0", "–", "0.0", "0.0", "4.0"]
     assert (finished / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert len(json.loads((finished / "results.json").read_text())) == 4

@@ -4,7 +4,7 @@ Source: paper Tables 1 and 2.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import fmean
 
 from agents.experiments import statistics
@@ -58,6 +58,7 @@ def tables(record: Record) -> list[Table]:
     evaluated = [entry for entry in record["algorithms"] if statistics.tested(entry)]
     if evaluated:
         made.append(percent_table(record))
+        made += intervals_table(record)
     if any(about["layout"] for about in record["sets"].values()) and evaluated:
         made.append(layouts_table(record))
     if any(about["shortest"] for about in record["sets"].values()):
@@ -100,41 +101,58 @@ def percent_table(record: Record) -> Table:
     """Percent of tasks solved of each set; for experiment 2 with the columns of Table 2.
 
     Of experiment 1 the paper says that agents solve what happens to equal the base task: the
-    share of such tasks stands beside theirs. Many algorithms are rows instead of columns.
+    share of such tasks stands beside theirs. Many algorithms are rows instead of columns, and
+    their intervals are in `intervals_table`.
     """
+    columns, selection = _percents(record), _selection(record)
+    if len(columns) > MOST_COLUMNS:
+        return _algorithm_rows(
+            record, f"Tasks solved, %, mean ± sd. {selection}", _without_interval
+        )
+    rows = [
+        (text, *(_percent(cells.get(name)) for cells in columns.values()))
+        for name, text in _compared(record).items()
+    ]
+    return Table(f"Tasks solved, %, {SPREAD}. {selection}", ("set", *columns), tuple(rows))
+
+
+def intervals_table(record: Record) -> list[Table]:
+    """The intervals of the means of many algorithms, whose table is too wide for them; or none."""
+    table = _algorithm_rows(record, f"Tasks solved, %: {INTERVAL.strip('[]')}", _interval)
+    rows = tuple(row for row in table.rows if set(row[1:]) != {NOTHING})
+    is_needed = len(table.rows) > MOST_COLUMNS and rows
+    return [table._replace(rows=rows)] if is_needed else []
+
+
+def _compared(record: Record) -> dict[str, str]:
+    """The names of the sets, and of their mean, with what tables call them."""
+    return {**{name: label(name) for name in record["sets"]}, MEAN_OF_SETS: MEAN_OF_SETS}
+
+
+def _percents(record: Record) -> dict[str, Mapping[str, Spread | None]]:
+    """Percent solved by algorithm, ours and the paper's, and then by set."""
     columns: dict[str, Mapping[str, Spread | None]] = {}
     for entry in _tested(record):
         summaries = statistics.by_set(record, entry)
         percents = {name: summary.percent for name, summary in summaries.items()}
         mean = statistics.mean_of_sets(record, entry)
         columns[algorithm_label(record, entry)] = {**percents, MEAN_OF_SETS: mean}
-    labels = {**{name: label(name) for name in record["sets"]}, MEAN_OF_SETS: MEAN_OF_SETS}
     with_paper = record["experiment"] == "exp2" and is_of_paper(record)
     for name, paper in PAPER_PERCENT.items() if with_paper else ():
         columns[f"{LABELS[name]}, paper"] = paper
     if record["experiment"] == "exp1":
         about = record["sets"].items()
         columns["equal to base"] = {name: Spread(each["equal_to_base"]) for name, each in about}
-    selection = _selection(record)
-    if len(columns) > MOST_COLUMNS:
-        return _algorithm_rows(columns, labels, selection)
+    return columns
+
+
+def _algorithm_rows(record: Record, heading: str, text: Callable[[Spread | None], str]) -> Table:
+    """Percent solved with a row for each algorithm."""
+    labels = _compared(record)
     rows = [
-        (text, *(_percent(cells.get(name)) for cells in columns.values()))
-        for name, text in labels.items()
+        (algorithm, *(text(cells.get(name)) for name in labels))
+        for algorithm, cells in _percents(record).items()
     ]
-    return Table(f"Tasks solved, %, {SPREAD}. {selection}", ("set", *columns), tuple(rows))
-
-
-def _algorithm_rows(
-    percents: Mapping[str, Mapping[str, Spread | None]], labels: Mapping[str, str], selection: str
-) -> Table:
-    """Percent solved with a row for each algorithm; an interval of the last column alone."""
-    rows = []
-    for algorithm, cells in percents.items():
-        *sets, mean = (cells.get(name) for name in labels)
-        short = [spread and spread._replace(margin=None) for spread in sets]
-        rows.append((algorithm, *map(_percent, (*short, mean))))
-    heading = f"Tasks solved, %, mean ± sd, of the last column {INTERVAL}. {selection}"
     return Table(heading, ("algorithm", *labels.values()), tuple(rows))
 
 
@@ -228,7 +246,7 @@ def provenance(record: Record) -> list[str]:
     return list(dict.fromkeys(map(_machine, record["machines"])))
 
 
-def summary(record: Record) -> str:
+def summary_markdown(record: Record) -> str:
     """The paper's best agent above ours, in Markdown: percent solved of the sets apart from base.
 
     With the 95 % interval of the mean, or, of sets that have few layouts, the layouts solved.
@@ -320,9 +338,16 @@ def spread_text(spread: Spread | None, form: str, high: float = math.inf) -> str
     if spread.sd is not None:
         text += f" ± {spread.sd:{form}}"
     if spread.margin is not None:
-        ends = max(0.0, spread.mean - spread.margin), min(high, spread.mean + spread.margin)
-        text += f" [{ends[0]:{form}}, {ends[1]:{form}}]"
+        text += f" {interval_text(spread, form, high)}"
     return text
+
+
+def interval_text(spread: Spread | None, form: str, high: float = math.inf) -> str:
+    """The interval alone, cut off as in `spread_text`."""
+    if spread is None or spread.margin is None:
+        return NOTHING
+    ends = max(0.0, spread.mean - spread.margin), min(high, spread.mean + spread.margin)
+    return f"[{ends[0]:{form}}, {ends[1]:{form}}]"
 
 
 def _percent_or_layouts(found: SetSummary) -> str:
@@ -331,6 +356,14 @@ def _percent_or_layouts(found: SetSummary) -> str:
     if found.layouts:
         return f"{found.percent.mean:.1f} ({_solved_layouts(found.layouts)})"
     return _percent(found.percent._replace(sd=None))
+
+
+def _without_interval(spread: Spread | None) -> str:
+    return _percent(spread and spread._replace(margin=None))
+
+
+def _interval(spread: Spread | None) -> str:
+    return interval_text(spread, ".1f", high=100.0)
 
 
 def _solved_layouts(layouts: Sequence[Layouts]) -> str:
