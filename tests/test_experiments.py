@@ -90,8 +90,8 @@ def test_stored_protocols_are_whole():
     """An old one did not say on which tasks its evaluations were chosen."""
     values = json.loads(json.dumps(dataclasses.asdict(PROTOCOLS["exp1"])))
     assert Protocol.from_dict(values) == PROTOCOLS["exp1"]
-    settings = {"hidden": 4, "eval_episodes": 9}  # the second had no effect, and was allowed
-    assert Protocol.from_dict({**values, "settings": settings}).settings == {"hidden": 4}
+    with pytest.raises(ValueError, match="eval_episodes is none of --settings; give --tasks"):
+        Protocol.from_dict({**values, "settings": {"hidden": 4, "eval_episodes": 9}})
     del values["selection"]
     with pytest.raises(ValueError, match="a protocol lacks selection"):
         Protocol.from_dict(values)

@@ -62,9 +62,13 @@ def parse_setting(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         raise ValueError(f"settings are given as NAME=VALUE, got {text!r}")
+    _check_setting(name)
+    return name, parse_value(value)
+
+
+def _check_setting(name: str) -> None:
     if name in OWN_OPTIONS:
         raise ValueError(f"{name} is none of --settings; give {OWN_OPTIONS[name]}")
-    return name, parse_value(value)
 
 
 def parse_value(text: str) -> Any:
@@ -131,6 +135,8 @@ class Protocol:
             raise ValueError(f"name at least one task set; allowed: {', '.join(ALL_SETS)}, ...")
         for name in self.algorithms:
             changes_of(name)
+        for name in self.settings:
+            _check_setting(name)
         for name in ("seeds", "tasks", "reported", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
@@ -145,9 +151,6 @@ class Protocol:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The inverse of `dataclasses.asdict`, also from JSON.
 
-        Settings that have an option of their own are left out: earlier versions took them, to no
-        effect.
-
         Raises:
           ValueError: a value is unknown, missing or not allowed.
         """
@@ -161,8 +164,6 @@ class Protocol:
         read: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
         }
-        settings = values["settings"].items()
-        read["settings"] = {name: value for name, value in settings if name not in OWN_OPTIONS}
         return cls(**read)
 
     @property
