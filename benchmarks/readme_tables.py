@@ -41,6 +41,7 @@ VIEWS: dict[str, dict[str, Callable[..., str]]] = {
     measure.SCHEMA: {"": agents.profiles.tables.markdown},
     "env_throughput": {"speeds": benchmarks.tables.speeds},
     "peers": {"speeds": benchmarks.tables.speeds},
+    "scaling": {"points": benchmarks.tables.points},
     "scaling_model": {"speed_up": benchmarks.tables.speed_up},
 }
 # By schema or benchmark, what draws the figures.

@@ -2,7 +2,7 @@
 
 from agents.experiments.records import Record
 from agents.runs.table import Table, number
-from benchmarks import scaling_model
+from benchmarks import scaling, scaling_model
 
 FULL = 4096  # environments that fill a core; tables leave smaller batches out
 
@@ -29,6 +29,23 @@ def speeds(*records: Record) -> str:
 def speed_up(record: Record) -> str:
     """The model of several devices, from a record of `benchmarks.scaling_model`."""
     return scaling_model.speed_up_table(record["model"])
+
+
+def points(record: Record) -> str:
+    """Speed and peak memory, from a record of `benchmarks.scaling`: a table for each kind."""
+    parts = []
+    for kind, title in scaling.TITLES.items():
+        found = [scaling.Point(**each) for each in record["results"] if each["kind"] == kind]
+        sizes = dict.fromkeys(f"{point.size:,}" for point in found)
+        rows = []
+        for env in dict.fromkeys(point.env for point in found):
+            own = [point for point in found if point.env == env]
+            memory = (f"{point.peak_bytes / 2**30:.2f}" for point in own)
+            rows.append((f"{env}, per second", *(f"{point.steps_per_s:,.0f}" for point in own)))
+            rows.append((f"{env}, peak memory, GiB", *memory))
+        table = Table(title, (kind, *sizes), tuple(rows))
+        parts.append(f"**{table.title}**\n\n{table.to_markdown()}")
+    return "\n\n".join(parts)
 
 
 def _measured(record: Record, result: Record) -> str:

@@ -171,9 +171,11 @@ def test_speeds_are_a_table_of_several_records():
 def test_the_pages_of_benchmarks_are_of_their_records():
     pages = [ROOT / "README.md", *(ROOT / "benchmarks" / "results").glob("*.md")]
     asked = " ".join(page.read_text() for page in pages)
-    for name in ("peers_2_devices/speeds", "peers,peers_2_devices/speeds", "scale/speed_up"):
+    for name in (
+        *("peers_2_devices/speeds", "peers,peers_2_devices/speeds", "scale/speed_up"),
+        *("env_throughput,env_throughput_2_devices/speeds", "scaling/points"),
+    ):
         assert f"<!-- table: {name} -->" in asked
-    assert "<!-- table: env_throughput,env_throughput_2_devices/speeds -->" in asked
 
 
 def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):

@@ -14,7 +14,7 @@ from agents import Config
 from agents.experiments import figures, records
 from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
-from benchmarks import harness, scaling, scaling_model, train_throughput
+from benchmarks import harness, scaling, scaling_model, tables, train_throughput
 from benchmarks.scaling_model import Exchange
 
 CONFIG = Config(
@@ -178,3 +178,8 @@ def test_points_are_drawn(tmp_path):
     path = tmp_path / "folder" / name
     draw(path)
     assert figures.drawn_from(path) == scaling.digest(record)
+    assert tables.points(record).split("\n\n")[:2] == [
+        "**environment: steps/s over environments**",
+        "| environment | 1 | 8 |\n| --- | ---: | ---: |\n"
+        "| base, per second | 1,000 | 8,000 |\n| base, peak memory, GiB | 1.00 | 1.00 |",
+    ]

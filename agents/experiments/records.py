@@ -9,7 +9,8 @@ policy took in each reported task. Tables and figures are functions of a record 
     command     what to type for the same runs
     protocol    the settings of the experiment
     ranked      the sets whose mean chose the best evaluation
-    machines    hardware, versions and commit of every process that trained
+    machines    hardware, versions and commit of every process that trained, and how many devices
+                shared its run
     sets        by set: `max_steps`, its step limit; `equal_to_base`, percent of the reported
                 tasks that equal the base task; `layout`, the layout of each task, where the
                 set has few; `shortest`, the lengths of the first tasks' shortest plans, -1
