@@ -247,12 +247,12 @@ def provenance(record: Record) -> list[str]:
 
 
 def summary_markdown(record: Record) -> str:
-    """The paper's best agent above ours, in Markdown: percent solved of the sets apart from base.
+    """The paper's best agent above ours, in Markdown: percent solved of the sets of its Table 2.
 
     With the 95 % interval of the mean, or, of sets that have few layouts, the layouts solved.
     """
-    names = [name for name in record["sets"] if name != "base"]
     paper = PAPER_PERCENT["ppo+icm"]
+    names = [name for name in paper if name in record["sets"]]
     rows = [(f"{LABELS['ppo+icm']}, paper", *(f"{paper[name].mean:.1f}" for name in names))]
     for entry in _tested(record):
         found = statistics.by_set(record, entry)
