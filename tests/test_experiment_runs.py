@@ -51,6 +51,8 @@ STEPS = {
 }
 NOTHING_SOLVED = {"base": [0], "p": [0, 0, 0, 0]}
 
+asked: list[tuple[str, int, str]] = []  # the evaluation tasks: of which set, how many, what for
+
 
 class Killed(BaseException):
     """Nothing in the way of a process that is killed catches it."""
@@ -112,14 +114,20 @@ def lab():
         "base": jax.tree.map(lambda x: x[None], base),
         "p": jax.tree.map(lambda *x: jnp.stack(x), *(base.replace(agent=x) for x in columns)),
     }
+
+    def fake_tasks(name, num_tasks, num_features, purpose="test"):
+        short = tt.task_set(name).short
+        asked.append((short, num_tasks, purpose))
+        return tasks[short]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(session, "make_train", fake_train)
         patch.setattr(programs, "evaluate", fake_evaluate)
         patch.setattr(report, "save_curves", lambda *args: None)
         for module in (tracking, reporting):
             patch.setattr(module, "Evaluator", FakeEvaluator)
-        for module in (training, reporting):
-            patch.setattr(module, "draw_tasks", lambda *args: tasks)
+        for module in (training, programs):
+            patch.setattr(module, "evaluation_tasks", fake_tasks)
         one_step = lambda states: SimpleNamespace(length=np.ones(len(states.time), int))  # noqa: E731
         patch.setattr(reporting, "solve_batch", one_step)
         yield
@@ -230,6 +238,21 @@ def test_the_papers_selection_reports_what_it_chose_by(whole, record, tmp_path):
     )
     tested = json.loads((root / "ppo-seed0" / "tested-seed0.json").read_text())
     assert tested["iteration_and_tasks"] == [4, 4]
+
+
+@pytest.mark.parametrize(
+    ("selection", "chosen_by", "reported"),
+    [("validation", (4, "validation"), (7, "test")), ("paper", (4, "test"), (4, "test"))],
+)
+def test_reported_are_the_test_tasks(selection, chosen_by, reported, tmp_path):
+    """Training is stopped by validation tasks, whichever the best evaluation is chosen by."""
+    asked.clear()
+    run(tmp_path, "--selection", selection, "--reported", 7, seeds=1, iterations=2)
+    assert asked == [
+        *[(name, *chosen_by) for name in ("base", "p")],
+        ("base", 4, "validation"),
+        *[(name, *reported) for name in ("base", "p")],
+    ]
 
 
 def test_an_experiment_leaves_tables_and_figures(whole, record, capsys):
