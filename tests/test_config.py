@@ -110,6 +110,12 @@ def test_the_sets_own_limit_holds_unless_the_settings_give_one(own_task_sets):
         Run(config).check_continues(Run(longer))
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_trains_in_an_environment_of_ones_own(name):
+    own = tt.make("sy", max_steps=9)
+    assert make_train(Config.preset(name), own).env is own
+
+
 def test_environment_that_contradicts_the_config_is_refused():
     with pytest.raises(ValueError, match="max_steps is 9, the config's 50"):
         make_train(Config(max_steps=50), tt.make("p", max_steps=9))

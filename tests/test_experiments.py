@@ -97,9 +97,11 @@ def test_stored_protocols_are_whole():
         Protocol.from_dict(values)
 
 
-def test_any_sets_are_trained_and_evaluated_on():
-    options = experiments.Options("exp1", train_set="SymbolicTrapTube-v0", sets=("base", "psy"))
-    assert options.root.name == "exp1-paper-sy"
+@pytest.mark.parametrize("preset", PRESETS)
+def test_any_sets_are_trained_and_evaluated_on(preset):
+    sets = {"train_set": "SymbolicTrapTube-v0", "sets": ("base", "psy")}
+    options = experiments.Options("exp1", preset=preset, **sets)
+    assert options.root.name == f"exp1-{preset}-sy"
     protocol = dataclasses.replace(options.defaults, **options.given())
     assert (protocol.train_set, protocol.sets) == ("sy", ("base", "psy"))
     assert protocol.config("ppo").env_id == "SymbolicTrapTube-v0"

@@ -26,7 +26,7 @@ from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import FirstSolved, MetricsLog, is_last, read_metrics
 from agents.runs.progress import Progress
 from agents.runs.stopping import StopSignals
-from agents.train import main, parse, select
+from agents.train import main, open_run, parse, select
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
 ROOT = Path(__file__).parent.parent
@@ -213,13 +213,15 @@ def test_defaults_and_overrides(tmp_path):
     stored, options = parsed("--out", str(tmp_path))
     assert (options.name, options.seed, options.seeds, stored) == ("fast-base-0", 0, 1, None)
     assert options.config == Config.preset("fast")
-    arguments = "--preset paper --env psy --seed 3 --seeds 2 --hidden 32 --curiosity none"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_is_asked_for_goes_before_every_preset(preset, tmp_path):
+    arguments = f"--preset {preset} --env psy --seed 3 --seeds 2 --hidden 32 --curiosity none"
     _, options = parsed(*arguments.split(), "--out", str(tmp_path))
-    expected = Config.preset(
-        "paper", env_id="PerceptualSymbolicTrapTube-v0", hidden=32, curiosity="none"
-    )
-    assert options.config == expected
-    assert options.name == "paper-psy-3to4"
+    own = {"env_id": "PerceptualSymbolicTrapTube-v0", "hidden": 32, "curiosity": "none"}
+    assert options.config == Config.preset(preset, **own)
+    assert options.name == f"{preset}-psy-3to4"
 
 
 def test_resumed_runs_keep_their_settings(tmp_path):
@@ -275,12 +277,14 @@ def test_after_stopping_a_further_ctrl_c_ends_the_process():
             signal.signal(number, handler)
 
 
-def test_a_run_with_a_cooldown_is_not_extended(capsys, tmp_path):
-    """Its step size has been falling towards the last iteration that was known then."""
-    RunFolder.create(tmp_path / "x", Run(Config(iterations=20, cooldown=0.5)))
-    arguments = ["--resume", "--name", "x", "--out", tmp_path]
-    message = refused(capsys, main, *arguments, "--iterations", 30)
-    assert "the run has cooldown=0.5 and iterations=20, not 30" in message
+@pytest.mark.parametrize("schedule", [{"cooldown": 0.5}, {"intrinsic_start": 3.0}])
+def test_a_run_with_a_schedule_is_not_extended(tmp_path, schedule):
+    """What is scheduled has been falling towards the last iteration that was known then."""
+    RunFolder.create(tmp_path / "x", Run(Config(iterations=20, **schedule)))
+    arguments = ["--resume", "--name", "x", "--out", str(tmp_path), "--iterations", "30"]
+    ((name, value),) = schedule.items()
+    with pytest.raises(ValueError, match=f"the run has {name}={value} and iterations=20, not 30"):
+        open_run(select(arguments), arguments)
     assert json.loads((tmp_path / "x/config.json").read_text())["config"]["iterations"] == 20
     Run(Config(iterations=30)).check_continues(Run(Config(iterations=20)))
 
