@@ -1,5 +1,7 @@
 """Intrinsic rewards: the registry of names, a curiosity from outside, visit counts."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,8 @@ import pytest
 
 from agents import Config, make_train, registry
 from agents.acting.episodes import Episodes
-from agents.curiosity import Curiosity, register
+from agents.acting.identity import observation_ids
+from agents.curiosity import Curiosity, counts, register
 from agents.curiosity.counts import observation_slots, visit_bonus
 
 TINY = Config(
@@ -119,10 +122,23 @@ def test_visits_are_counted_and_pay_by_their_root():
 
 
 def test_few_observations_share_a_slot(trajectory):
-    """No more of the positions on layouts of {Sy} than chance would have it, here 1 %."""
-    cells = jax.random.randint(jax.random.key(2), (500, 40, 3, 2), 0, 12).astype(jnp.uint8)
+    """No more of 4000 positions on each layout of {Sy} than chance would have it, here 1 %."""
+    cells = jax.random.randint(jax.random.key(2), (4000, 1, 3, 2), 0, 12).astype(jnp.uint8)
+    cells = jnp.broadcast_to(cells, (4000, 40, 3, 2))
+    episodes = trajectory.episodes._replace(cells=cells)
+    slot, identity = (jax.jit(of)(episodes) for of in (observation_slots, observation_ids))
+    distinct = int(identity.max()) + 1
+    assert distinct > 19_900
+    assert 0.98 * distinct < len(np.unique(slot)) <= distinct
+
+
+def test_layouts_of_near_hashes_share_few_slots(trajectory, monkeypatch):
+    """Of 40 layouts with 144 positions in a row, again no more than chance would have it."""
+    near: Any = lambda layout: jnp.arange(40, dtype=jnp.uint32)  # noqa: E731
+    monkeypatch.setattr(counts, "layout_hashes", near)
+    food = jnp.stack(jnp.divmod(jnp.arange(144), 12), axis=-1)
+    cells = jnp.zeros((144, 40, 3, 2), jnp.uint8).at[:, :, 2].set(food[:, None].astype(jnp.uint8))
     slot = jax.jit(observation_slots)(trajectory.episodes._replace(cells=cells))
-    slot = np.asarray(slot)
     assert len(np.unique(slot)) > 0.98 * slot.size
 
 
