@@ -131,6 +131,41 @@ def test_episodes_are_played_facing_the_food(monkeypatch):
     assert not np.all(drawn.food >= drawn.agent)
 
 
+def test_no_key_is_used_twice(monkeypatch):
+    """Those of two iterations, of their resets, steps and gradient steps."""
+    used: list[tuple[int, ...]] = []
+
+    def note(key):
+        jax.debug.callback(lambda key: used.extend(data(key)), key)
+
+    class Environment(tt.Environment):
+        def reset(self, key):
+            note(key)
+            return super().reset(key)
+
+    def choose(key, actions):
+        note(key)
+        return actions.mode()
+
+    class Playing(Learner):
+        def prepare(self, state, trajectory):
+            note(state.key)
+            return state, trajectory, {}
+
+        def optimize(self, state, batch, key):
+            note(key)
+            return state.params, state.opt_state, {}
+
+    monkeypatch.setattr(learner, "sample_action", choose)
+    small = {"max_steps": STEPS, "filters": (2, 2), "hidden": 4, "embedding": 2, "chunk": 4}
+    config = Config(**small, episodes=EPISODES, minibatch=4, curiosity="none")
+    train = Playing(**vars(make_train(config, Environment(max_steps=STEPS))))
+    state, iterate = train.init(jax.random.key(0)), jax.jit(train.iterate)
+    iterate(iterate(state)[0])
+    jax.effects_barrier()
+    assert len(set(used)) == len(used) == 2 * (1 + EPISODES + STEPS + 1 + 1)
+
+
 def recorder(updates: int) -> optax.GradientTransformation:
     """Plain gradient descent, whose state holds all gradients [updates, EPISODES]."""
 

@@ -26,9 +26,11 @@ CONFIG = Config(
 
 
 counts: list[int] = []  # distinct observations that `play` encoded, step by step
+drawn_with: list[bytes] = []  # the keys that actions were drawn with, step by step
 
 
 def choose(key, actions):
+    jax.debug.callback(lambda data: drawn_with.append(data.tobytes()), jax.random.key_data(key))
     return sample_action(key, actions).at[0].set(jnp.array([0, 3]))
 
 
@@ -108,6 +110,15 @@ def test_every_observation_has_its_own_features(played):
     _, _, params, _, _, trajectory = played
     plain = encoding()(params, trajectory.episodes)
     np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
+
+
+def test_every_step_draws_its_actions_with_a_key_of_its_own(played):
+    env, _, params, initial, play, _ = played
+    jax.effects_barrier()
+    drawn_with.clear()
+    play(params, initial)
+    jax.effects_barrier()
+    assert len(set(drawn_with)) == len(drawn_with) == env.max_steps + 1
 
 
 @pytest.mark.parametrize("bits", [0, 20])
