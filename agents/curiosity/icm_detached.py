@@ -35,6 +35,7 @@ class DetachedICM(ICM):
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """The parameters of the encoder and of both models."""
+        # As in `Agent.init`: only layers of Flax draw with this key.
         encoder_key = jax.random.fold_in(key, 0)
         features, encoder = self._encoder.init_with_output(encoder_key, board)
         return draw(key, {"encoder": encoder, **self.init_models(key, features)})

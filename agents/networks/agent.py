@@ -45,6 +45,8 @@ class Agent:
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters."""
+        # Layers of Flax in an encoder of your own draw with this key; those here leave that to
+        # `draw` and use no key.
         encoder_key = jax.random.fold_in(key, 0)
         features, encoder = self.encoder.init_with_output(encoder_key, self._board())
         state = jnp.zeros((1, self.config.hidden))

@@ -81,6 +81,7 @@ def draw(key: jax.Array, params: Any) -> Any:
 
 def init_module(module: nn.Module, key: jax.Array, *inputs: Any) -> Any:
     """Parameters of a module of any layers, given what it is called with."""
+    # Layers of Flax draw with the key that they are given; those here leave that to `draw`.
     return draw(key, module.init(jax.random.fold_in(key, 0), *inputs))
 
 
