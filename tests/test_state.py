@@ -273,3 +273,26 @@ def test_validate_refuses_what_is_no_state(value):
 @pytest.mark.parametrize("number", [0, -1, 2.0, "3", True, None])
 def test_base_palette_refuses(number):
     assert_refused(["num_features", ">= 1", repr(number)], tt.base_palette, number)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        *(tt.observe, tt.visible_objects, tt.render_ascii, tt.render),
+        lambda states: tt.make("base").step(states, np.array((0, 3))),
+        *(
+            lambda states, transfer=transfer: transfer(jax.random.key(0), states)
+            for transfer in (
+                *(tt.perceptual, tt.structural, tt.symbolic),
+                *(tt.graded_perceptual(0.5), tt.graded_structural(0.5)),
+                *tt.task_set("trap-turned").transfers,
+            )
+        ),
+    ],
+)
+def test_functions_of_one_state_refuse_a_batch_and_a_pair(function):
+    states = jax.tree.map(lambda x: np.stack([x] * 4), tt.base_state())
+    words = ["state.board must be uint8[12, 12], got uint8[4, 12, 12]", "use jax.vmap"]
+    assert_refused(words, function, states)
+    words = ["expected a trap_tube_jax.State, got tuple", "return (state, timestep)"]
+    assert_refused(words, function, (tt.base_state(), None))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusal import assert_refused
 
 import trap_tube_jax as tt
 from trap_tube_jax.vector import VectorEnvironment, draw_movable, draw_static
@@ -117,3 +118,14 @@ def test_refuses_bad_chunk_sizes(arguments, message):
 def test_refuses_a_wrapped_environment():
     with pytest.raises(ValueError, match=r"must be a trap_tube_jax\.Environment, got AutoReset"):
         VectorEnvironment(tt.AutoReset(tt.make("base")))  # pyright: ignore[reportArgumentType]
+
+
+def test_refuses_one_key_and_what_is_not_its_state():
+    vector, keys = VectorEnvironment(tt.make("base")), jax.random.split(jax.random.key(0), 3)
+    for key in (keys[0], jax.random.PRNGKey(0), 0):
+        assert_refused(["reset takes PRNG keys [B]", "jax.random.split"], vector.reset, key)
+    state, timestep = jax.eval_shape(vector.reset, keys)
+    actions = np.zeros((3, 2), np.int32)
+    words = ["VectorState, got AutoResetTimeStep", "return (state, timestep)"]
+    assert_refused(words, vector.step, timestep, actions)
+    assert_refused(["actions must be integer[3, 2], got"], vector.step, state, actions[:2])

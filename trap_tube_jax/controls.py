@@ -14,7 +14,7 @@ import numpy as np
 
 from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND, NUM_OBJECTS, OBJECT_CHARS, TRAP
 from trap_tube_jax.prng import loop_free
-from trap_tube_jax.state import State
+from trap_tube_jax.state import State, check_state
 from trap_tube_jax.transfers import Transfer
 
 Cell = tuple[int, int]
@@ -123,6 +123,7 @@ def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
     """
 
     def transfer(key: jax.Array, state: State) -> State:
+        check_state(state)
         choices = layouts()
         index = jax.random.randint(loop_free(key), (), 0, len(choices), jnp.int32)
         fields = ("board", "agent", "tool", "tool_extent", "food")

@@ -23,7 +23,7 @@ from trap_tube_jax.objects import (
     NUM_DIRECTIONS,
 )
 from trap_tube_jax.observation import observe
-from trap_tube_jax.state import State, TimeStep, base_state, check_structure, validate
+from trap_tube_jax.state import State, TimeStep, base_state, check_state, check_structure, validate
 from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
 
 LARGEST_TIME = 2**31 - 1  # `State.time` is an i32
@@ -114,8 +114,10 @@ class Environment:
           The next state, and a timestep with reward 1 if this step solved the task.
 
         Raises:
-          ValueError: the action's shape or dtype is wrong, or its concrete numbers.
+          ValueError: `state` is not one unbatched state; the action's shape or dtype is wrong, or
+            its concrete numbers.
         """
+        check_state(state)
         action = _check_action(action)
         was_done = state.terminated | state.truncated
         state = dynamics.step(state, action)

@@ -18,7 +18,7 @@ from trap_tube_jax.geometry import cell_of
 from trap_tube_jax.layouts import NUM_FRAMES, layout_tables, padded, padded_by_frame
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.prng import loop_free
-from trap_tube_jax.state import State, base_state
+from trap_tube_jax.state import State, base_state, check_state
 from trap_tube_jax.transfers import Transfer, perceptual, recolor, sphere_points, structural
 
 CENTER = 1e-4  # a radius below is 0 up to rounding; that of other features is 1 / 255 or more
@@ -49,6 +49,7 @@ def graded_perceptual(strength: float) -> Transfer:
     near, full = near_layouts(strength), layout_tables()
 
     def transfer(key: jax.Array, state: State) -> State:
+        check_state(state)
         tables = jax.tree.map(jnp.asarray, near)
         layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
         frame, assignment = tables.layout[layout % len(tables.layout)]
@@ -93,6 +94,7 @@ def graded_structural(strength: float) -> Transfer:
         return structural
 
     def transfer(key: jax.Array, state: State) -> State:
+        check_state(state)
         # The middle of the interval that floor maps to the feature, so that 0 changes nothing.
         own = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
         drawn = sphere_points(key, state.palette.shape[-1])

@@ -9,11 +9,16 @@ import numpy as np
 
 from trap_tube_jax.geometry import COLUMNS, ROWS, bar_cells
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS, OBJECT_CHARS, TOOL
-from trap_tube_jax.state import State
+from trap_tube_jax.state import State, check_state
 
 
 def visible_objects(state: State) -> jax.Array:
-    """The topmost object of every cell: u8[12, 12] of object codes 0 to 7."""
+    """The topmost object of every cell: u8[12, 12] of object codes 0 to 7.
+
+    Raises:
+      ValueError: `state` is not one unbatched state; likewise below.
+    """
+    check_state(state)
     tool = bar_cells(state.tool, state.tool_extent)
     objects = jnp.where(_at(state.food), jnp.uint8(FOOD), state.board)
     objects = jnp.where(tool, jnp.uint8(TOOL), objects)

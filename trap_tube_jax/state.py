@@ -3,6 +3,7 @@
 Source: environment.md, "Board and objects" and "Base task".
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -240,21 +241,48 @@ def check_structure(state: Any) -> None:
     Raises:
       ValueError: naming the field, what it is and what it must be.
     """
-    if not isinstance(state, State):
-        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}")
-    shape = np.shape(state.palette)
-    num_features = shape[-1] if len(shape) == 2 else 3
-    for name, (shape, dtype) in _field_specs(max(num_features, 1)).items():
+    check_state(state)
+    for name, (shape, dtype) in _field_specs(np.shape(state.palette)[-1]).items():
         field = getattr(state, name)
         if not hasattr(field, "shape") or not hasattr(field, "dtype"):
             raise ValueError(f"state.{name} must be an array, got {type(field).__name__}")
-        if field.shape != shape or field.dtype != dtype:
+        if field.dtype != dtype:
             raise ValueError(
                 f"state.{name} must be {np.dtype(dtype).name}{list(shape)}, "
                 f"got {field.dtype}{list(field.shape)}"
             )
 
 
+def check_state(state: Any) -> None:
+    """Checks that `state` is one unbatched `State`, by type and shapes alone.
+
+    Functions of one state call it, so it must be quick: it runs whenever they are traced.
+
+    Raises:
+      ValueError: naming the field, what it is and what it must be.
+    """
+    if not isinstance(state, State):
+        hint = "; reset and step return (state, timestep)" if isinstance(state, tuple) else ""
+        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}{hint}")
+    shape = np.shape(state.palette)
+    num_features = shape[-1] if len(shape) > 1 else 3
+    for name, (shape, dtype) in _field_specs(max(num_features, 1)).items():
+        field = getattr(state, name)
+        found = np.shape(field)
+        if found != shape:
+            kind = getattr(field, "dtype", type(field).__name__)
+            hint = "; for a batch of states use jax.vmap" if _is_batch_of(shape, found) else ""
+            raise ValueError(
+                f"state.{name} must be {np.dtype(dtype).name}{list(shape)}, "
+                f"got {kind}{list(found)}{hint}"
+            )
+
+
+def _is_batch_of(shape: tuple[int, ...], found: tuple[int, ...]) -> bool:
+    return len(found) > len(shape) and found[len(found) - len(shape) :] == shape
+
+
+@functools.cache
 def _field_specs(num_features: int) -> dict[str, tuple[tuple[int, ...], type]]:
     cell = ((2,), np.int32)
     flag = ((), np.bool_)

@@ -30,7 +30,7 @@ from trap_tube_jax.objects import (
     TUBE2,
 )
 from trap_tube_jax.prng import fold_in, loop_free
-from trap_tube_jax.state import State
+from trap_tube_jax.state import State, check_state
 
 Transfer = Callable[[jax.Array, State], State]
 
@@ -83,7 +83,11 @@ def perceptual(key: jax.Array, state: State) -> State:
 
     Returns:
       A state with a new layout.
+
+    Raises:
+      ValueError: `state` is not one unbatched state.
     """
+    check_state(state)
     tables = jax.tree.map(jnp.asarray, layout_tables())
     layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
     frame, assignment = layout % NUM_FRAMES, layout // NUM_FRAMES % NUM_ASSIGNMENTS
@@ -111,7 +115,11 @@ def structural(key: jax.Array, state: State) -> State:
 
     Returns:
       The state with a new palette.
+
+    Raises:
+      ValueError: `state` is not one unbatched state.
     """
+    check_state(state)
     return recolor(state, sphere_points(key, state.palette.shape[-1]))
 
 
@@ -153,7 +161,11 @@ def symbolic(key: jax.Array, state: State) -> State:
 
     Returns:
       The state after the swap.
+
+    Raises:
+      ValueError: `state` is not one unbatched state.
     """
+    check_state(state)
     choice = jax.random.randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS), jnp.int32)
     return swap_with_tool(state, jnp.asarray(SYMBOLIC_OBJECTS)[choice])
 

@@ -14,6 +14,8 @@ plain reference to read and to test against. Three differences make it fast:
    from fusing the later reshape to [12, 12, N] into that loop over bytes.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,7 +77,12 @@ class VectorEnvironment:
         self._auto_reset = AutoReset(env)
 
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
-        """Starts the first episodes, one for each of the keys [B]."""
+        """Starts the first episodes, one for each of the keys [B].
+
+        Raises:
+          ValueError: `keys` is not a batch of keys.
+        """
+        _check_keys(keys)
         episodes, timestep = jax.vmap(self._auto_reset.reset)(keys)
         return VectorState(episodes, jax.vmap(draw_static)(episodes.inner)), timestep
 
@@ -83,6 +90,10 @@ class VectorEnvironment:
         """Takes one action i32[B, 2] in each and starts over those whose episode ended.
 
         Numbers of actions are not checked; see `Environment.step`.
+
+        Raises:
+          ValueError: `state` is not what `reset` and `step` return first, or the actions' shape is
+            wrong.
         """
         stepped, timestep, final_picture = self._advance(state, actions)
         state, picture = self._start_over(timestep.done, stepped, final_picture)
@@ -92,6 +103,7 @@ class VectorEnvironment:
         self, state: VectorState, actions: jax.Array
     ) -> tuple[VectorState, TimeStep, jax.Array]:
         """One step without any reset: states, timesteps, and pictures u8[B, 12 * 12 * N]."""
+        _check_step(state, actions)
         inner, timestep = jax.vmap(self.env.step)(state.episodes.inner, actions)
         stepped = VectorState(AutoResetState(inner, state.episodes.key), state.background)
         return stepped, timestep, jax.vmap(draw_movable)(inner, state.background)
@@ -128,6 +140,26 @@ class VectorEnvironment:
             (jnp.int32(0), (state, picture)),
         )
         return state, picture
+
+
+def _check_keys(keys: Any) -> None:
+    is_typed = jnp.issubdtype(getattr(keys, "dtype", np.int32), jax.dtypes.prng_key)
+    if np.ndim(keys) != (1 if is_typed else 2):
+        raise ValueError(
+            f"reset takes PRNG keys [B], got {type(keys).__name__} of shape {np.shape(keys)}; make "
+            "them with jax.random.split(jax.random.key(seed), B)"
+        )
+
+
+def _check_step(state: Any, actions: Any) -> None:
+    if not isinstance(state, VectorState):
+        raise ValueError(
+            f"step takes a trap_tube_jax.VectorState, got {type(state).__name__}; reset and step "
+            "return (state, timestep)"
+        )
+    wanted = (len(state.background), 2)
+    if np.shape(actions) != wanted:
+        raise ValueError(f"actions must be integer{list(wanted)}, got shape {np.shape(actions)}")
 
 
 def draw_static(state: State) -> jax.Array:
