@@ -279,7 +279,7 @@ def test_base_palette_refuses(number):
     "function",
     [
         *(tt.observe, tt.visible_objects, tt.render_ascii, tt.render),
-        lambda states: tt.make("base").step(states, np.array((0, 3))),
+        lambda states: tt.make("base").step(states, jnp.array((0, 3))),
         *(
             lambda states, transfer=transfer: transfer(jax.random.key(0), states)
             for transfer in (

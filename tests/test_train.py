@@ -193,6 +193,14 @@ def test_a_run_is_not_overwritten(capsys, whole):
     assert "the run has seed=0, not 1" in refused(capsys, main, *out, "--resume", "--seed", 1)
 
 
+def test_a_folder_without_a_run_is_not_to_be_resumed(capsys, tmp_path):
+    (tmp_path / "plain").mkdir()
+    (tmp_path / "plain" / "x").touch()
+    message = refused(capsys, main, "--name", "plain", "--out", tmp_path)
+    assert "is taken, and holds no run; give another --name" in message
+    assert "--resume" not in message
+
+
 def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
     RunFolder.create(tmp_path / "foreign", Run(Config()))
     shutil.copytree(whole[0] / "checkpoints", tmp_path / "foreign" / "checkpoints")

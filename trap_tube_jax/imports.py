@@ -26,5 +26,5 @@ def import_modules(names: Sequence[str]) -> None:
         except ModuleNotFoundError as error:
             raise ValueError(
                 f"cannot import {name!r}: there is no module {error.name!r} in {here} or on "
-                "Python's path"
+                "Python's path; run from the folder that holds it, or put that on PYTHONPATH"
             ) from error

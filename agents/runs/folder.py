@@ -166,9 +166,10 @@ class RunFolder:
           ValueError: there is something already.
         """
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise ValueError(
-                f"{path} is not empty; give --resume to continue the run in it, or another --name"
-            )
+            advice = "is taken, and holds no run; give another --name"
+            if (path / CONFIG_FILE).is_file():
+                advice = "is not empty; give --resume to continue the run in it, or another --name"
+            raise ValueError(f"{path} {advice}")
         # The folder appears together with its settings, so that a kill leaves either no run
         # or one that can be resumed.
         draft = path.parent / f".{path.name}.{os.getpid()}"
@@ -182,7 +183,8 @@ class RunFolder:
         """The folder of an existing run, and the run.
 
         Raises:
-          ValueError: there is none, or its settings cannot be read.
+          ValueError: there is none, its settings cannot be read, or a module that it imports is
+            missing.
         """
         folder = cls(path)
         if not folder.config.is_file():
@@ -197,6 +199,8 @@ class RunFolder:
                 version = values.pop("version", FIRST_VERSION)
             return folder, Run.from_dict(values)
         except ValueError as error:
+            if isinstance(error.__cause__, ModuleNotFoundError):
+                raise ValueError(f"the run in {path} needs a module of yours: {error}") from error
             raise ValueError(
                 f"{folder.config} is not the settings of a run: {error}; version {version} wrote "
                 f"it, this is {__version__}"
