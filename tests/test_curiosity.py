@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusal import assert_refused
 
 from agents import Config, make_train, registry
 from agents.acting.episodes import Episodes
@@ -100,6 +101,26 @@ def test_names_are_checked_against_the_registry():
         Config(curiosity="rdn")
     with pytest.raises(ValueError, match="curiosity 'icm' is registered already"):
         register("icm", lambda config, env: Curiosity())
+
+
+def test_the_same_file_may_register_a_name_again():
+    register("mine", lambda config, env: Corners())
+    register("mine", lambda config, env: Plain())
+    assert isinstance(registry.curiosities.factory("mine")(None, None), Plain)
+    with pytest.raises(ValueError, match="curiosity 'mine' is registered already"):
+        exec('register("mine", print)', {"register": register, "__name__": "elsewhere"})
+
+
+@pytest.mark.parametrize(
+    ("name", "factory", "words"),
+    [
+        ("mine", Corners(), ["curiosity 'mine' needs a function", "Corners object"]),
+        ("a+b, c", Corners, ["curiosity names consist of letters, digits", "'a+b, c'"]),
+        (7, Corners, ["curiosity names consist of letters, digits", "got 7"]),
+    ],
+)
+def test_instances_and_names_that_cannot_be_typed_are_refused(name, factory, words):
+    assert_refused(words, register, name, factory)
 
 
 @pytest.mark.parametrize("env_id", ["base", "sy"])

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import runpy
 import shlex
 import sys
 from pathlib import Path
@@ -111,6 +112,13 @@ def test_the_pages_curiosity_pays_for_a_moved_tool(here, own_tables):
     trajectory = trajectory._replace(episodes=trajectory.episodes._replace(cells=cells))
     reward, _ = learner.intrinsic_reward(start, trajectory)
     np.testing.assert_array_equal(np.argwhere(reward), [[4, 2]])
+
+
+def test_a_script_may_load_a_run_that_imports_its_own_file(here, own_tables):
+    runpy.run_path("my_module.py", run_name="__main__")
+    assert registry.curiosities.factory("tool-moved").__module__ == "__main__"
+    Config(imports=("my_module",), env_id="cold", curiosity="tool-moved", encoder="flat")
+    assert registry.curiosities.factory("tool-moved").__module__ == "my_module"
 
 
 def test_missing_modules_are_named(tmp_path, monkeypatch, capsys, own_tables):

@@ -87,6 +87,19 @@ def test_register_takes_the_id_for_a_missing_short_name(own_task_sets):
     assert tt.register("Plain-v0", ()).short == "Plain-v0"
 
 
+def test_the_same_file_may_register_a_set_again(own_task_sets):
+    tt.register("Own-v0", (), short="own", max_steps=20)
+    tt.register("Own-v0", (tt.structural,), short="own", max_steps=30)
+    assert tt.make("own").max_steps == 30
+    assert tt.make("Own-v0").transfers == (tt.structural,)
+    assert tt.registered_ids().count("Own-v0") == 1
+    assert_refused(["'own' is taken"], tt.register, "Other-v0", (), short="own")
+    elsewhere = {"tt": tt, "__name__": "elsewhere"}
+    with pytest.raises(ValueError, match="'Own-v0' is taken"):
+        exec('tt.register("Own-v0", ())', elsewhere)
+    assert tt.make("own").max_steps == 30
+
+
 UNKNOWN = ["TrapTube-v1", "traptube-v0", "", "P", 3, None]
 
 

@@ -1,5 +1,6 @@
 """Checks of arguments that several modules share."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,16 @@ def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None =
         upper = "" if maximum is None else f" and <= {maximum}"
         raise ValueError(f"{name} must be an integer >= {minimum}{upper}, got {value!r}")
     return int(value)
+
+
+def check_registered_name(what: str, name: Any) -> None:
+    """Checks a name that command lines and file names are to hold; `what` is what it names.
+
+    Raises:
+      ValueError: it has other characters than letters, digits, "_", "." and "-".
+    """
+    if not isinstance(name, str) or not re.fullmatch(r"[\w.-]+", name, re.ASCII):
+        raise ValueError(f"{what} names consist of letters, digits, '_', '.' and '-', got {name!r}")
 
 
 def check_seed(seed: Any) -> int:

@@ -1,6 +1,7 @@
 """Modules of your own, imported for the names that they register."""
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,3 +29,14 @@ def import_modules(names: Sequence[str]) -> None:
                 f"cannot import {name!r}: there is no module {error.name!r} in {here} or on "
                 "Python's path; run from the folder that holds it, or put that on PYTHONPATH"
             ) from error
+
+
+def registering_file() -> str:
+    """The file of the code that calls the function that calls this one.
+
+    So a script and the module that is imported from its file are the same. Where there is no file,
+    as in a notebook, it is the module's name.
+    """
+    module = sys._getframe(2).f_globals
+    file = module.get("__file__")
+    return os.path.realpath(file) if file else str(module.get("__name__"))

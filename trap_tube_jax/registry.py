@@ -4,11 +4,12 @@ Source: paper, section "Experimental Setup"; environment.md, "Task sets"; contro
 """
 
 import dataclasses
-import re
 from collections.abc import Iterable
 
+from trap_tube_jax.checks import check_registered_name
 from trap_tube_jax.controls import CONTROLS, drawn_from
 from trap_tube_jax.environment import Environment
+from trap_tube_jax.imports import registering_file
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.state import State, base_state, check_structure
 from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
@@ -69,6 +70,7 @@ CONTROL_TASK_SETS = tuple(
 )
 
 _task_sets = {entry.id: entry for entry in (*PAPER_TASK_SETS, *CONTROL_TASK_SETS)}
+_files: dict[str, str] = {}  # by id, of your own sets: what has registered them
 
 
 def registered_ids() -> tuple[str, ...]:
@@ -132,8 +134,11 @@ def register(
 ) -> TaskSet:
     """Adds a task set to those that `make` knows, for this process.
 
+    The file or notebook that has registered an id may register it again; the new set then takes
+    the old one's place. Environments that are made already stay as they are.
+
     Args:
-      id: its name, not yet taken.
+      id: its name, not taken by the project or by another file.
       transfers: functions (key, state) -> state, in the order in which they apply.
       short: its name in tables and file names; the id if absent.
       base: the state that the transfers start from, at time 0; the base task if absent.
@@ -144,15 +149,17 @@ def register(
         "-", a transfer is not a function or not hashable, or the base state or the step limit is
         invalid; the message says what is allowed.
     """
-    short = id if short is None else short
-    taken = {name for entry in _task_sets.values() for name in (entry.id, entry.short)}
+    short, file = id if short is None else short, registering_file()
     for name in (id, short):
-        if not isinstance(name, str) or not re.fullmatch(r"[\w.-]+", name, re.ASCII):
-            raise ValueError(
-                f"a task set's name consists of letters, digits, '_', '.' and '-', got {name!r}"
-            )
+        check_registered_name("task set", name)
+    others = [
+        entry for entry in _task_sets.values() if (entry.id, _files.get(entry.id)) != (id, file)
+    ]
+    taken = {name for entry in others for name in (entry.id, entry.short)}
+    for name in (id, short):
         if name in taken:
             raise ValueError(f"the name {name!r} is taken; taken are: {', '.join(sorted(taken))}")
     env = Environment(transfers, base=base, max_steps=max_steps)
+    _files[id] = file
     _task_sets[id] = TaskSet(id, short, env.transfers, base, env.max_steps)
     return _task_sets[id]
