@@ -12,6 +12,7 @@ from agents import Config, make_train, registry
 from agents.acting.episodes import Episodes
 from agents.acting.identity import observation_ids
 from agents.curiosity import Curiosity, counts, register
+from agents.curiosity.checks import check_curiosity, shapes_of
 from agents.curiosity.counts import observation_slots, visit_bonus
 
 TINY = Config(
@@ -121,6 +122,70 @@ def test_the_same_file_may_register_a_name_again():
 )
 def test_instances_and_names_that_cannot_be_typed_are_refused(name, factory, words):
     assert_refused(words, register, name, factory)
+
+
+class Scalar(Corners):
+    def reward(self, params, memory, experience):
+        return jnp.sum(experience.episodes.reward), memory
+
+
+class Alone(Corners):
+    def reward(self, params, memory, experience):
+        return experience.episodes.reward
+
+
+class Drifting(Corners):
+    def reward(self, params, memory, experience):
+        return experience.episodes.reward, memory + 0.5
+
+
+class Forgetful(Corners):
+    def reward(self, params, memory, experience):
+        return experience.embedding.sum(-1), memory
+
+
+class ForgetfulLoss(Corners):
+    def losses(self, params, experience):
+        return {"own": experience.next_embedding.sum(-1)}
+
+
+class Embedded(Corners):
+    needs_embeddings = True
+
+    def reward(self, params, memory, experience):
+        both = (experience.embedding + experience.next_embedding).sum(-1)
+        return both + experience.action_embedding.sum(-1), memory
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (Scalar, ["Scalar.reward must return (reward f32[T, B], memory)", "got (float32[], int32"]),
+        (Alone, ["(float32[4, 4], int32[]), got float32[4, 4]"]),
+        (Drifting, ["(float32[4, 4], int32[]), got (float32[4, 4], float32[])"]),
+        (Forgetful, ["Forgetful.reward failed", "unless needs_embeddings = True"]),
+        (ForgetfulLoss, ["ForgetfulLoss.losses failed", "unless needs_embeddings = True"]),
+        (lambda: Corners, ["'mine' must be an agents.curiosity.Curiosity, got <class"]),
+    ],
+)
+def test_curiosities_that_break_their_contract_are_refused(kind, words):
+    register("mine", lambda config, env: kind())
+    assert_refused(words, make_train, Config.from_dict({**TINY, "curiosity": "mine"}))
+
+
+def test_the_contract_is_checked_with_the_shapes_of_training(trajectory):
+    """Those of what an iteration gives, and with every curiosity of the project."""
+    register("mine", lambda config, env: Embedded())
+    for name in ("mine", "icm", "rnd", "effects", "counts", "none"):
+        config = Config.from_dict({**TINY, "episodes": 40, "curiosity": name})
+        train = make_train(config)
+        check_curiosity(train.curiosity, config, train.env)
+        params = jax.eval_shape(train.init_params, jax.random.key(0))
+        given = jax.eval_shape(train.acting_experience, params, trajectory)
+        checked = shapes_of(train.curiosity, params["curiosity"], config, train.env)
+        assert jax.tree.map(lambda x: (x.shape, x.dtype), given) == jax.tree.map(
+            lambda x: (x.shape, x.dtype), checked
+        )
 
 
 @pytest.mark.parametrize("env_id", ["base", "sy"])

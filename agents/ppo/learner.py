@@ -23,6 +23,7 @@ from agents.acting.identity import observation_ids
 from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
+from agents.curiosity.checks import check_curiosity
 from agents.networks.agent import Agent, Params
 from agents.parallel.sharding import ALONE, Shards
 from agents.ppo import advantages, losses, returns
@@ -396,8 +397,8 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
       shards: how to divide the episodes; more than one only within `Placement.shard`.
 
     Raises:
-      ValueError: `env` contradicts `config`, the curiosity is not for this environment, or the
-        environment steps are too many to count.
+      ValueError: `env` contradicts `config`, the curiosity is not for this environment or, if it is
+        your own, breaks its contract, or the environment steps are too many to count.
     """
     if env is None:
         env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
@@ -414,4 +415,6 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
             f"steps are {steps:,} steps; allowed: at most {COUNTABLE:,}"
         )
     curiosity = curiosities.factory(config.curiosity)(config, env)
+    if type(curiosity).__module__.split(".")[0] != "agents":
+        check_curiosity(curiosity, config, env)
     return Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
