@@ -124,8 +124,13 @@ def train(arguments: Sequence[str]) -> None:
             stop.end_process()  # the exit may have to wait for what compiles in the background
             raise SystemExit(128 + stopped.signal) from None
         processes.leave(128 + (stop.received or signal.SIGINT))
-    except (jax.errors.JaxRuntimeError, ValueError) as error:
-        end_without_peers(error, f"Iteration {session.saved} is saved. {resume}")
+    except Exception as error:
+        if processes.count() == 1 and not session.saved:
+            session.close()
+            session.folder.remove_if_new()  # else the same command would be refused
+        if isinstance(error, jax.errors.JaxRuntimeError | ValueError):
+            end_without_peers(error, f"Iteration {session.saved} is saved. {resume}")
+        raise
     finally:
         session.close()
 
@@ -143,6 +148,20 @@ def start(arguments: Sequence[str]) -> Session:
     selection.join()
     console = Console(quiet=not processes.is_first())
     options, folder, run = processes.from_first(lambda: open_run(selection, arguments))
+    try:
+        return take_up(options, folder, run, console)
+    except Exception:
+        if processes.is_first():
+            folder.remove_if_new()  # else the same command would be refused
+        raise
+
+
+def take_up(options: Options, folder: RunFolder, run: Run, console: Console) -> Session:
+    """The session of a run whose folder is there.
+
+    Raises:
+      ValueError: the run cannot be trained or continued.
+    """
     import_modules(run.config.imports)  # in the processes that were told of the run
     compilation.enable_cache()
     session = Session(

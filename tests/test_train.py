@@ -201,6 +201,44 @@ def test_a_folder_without_a_run_is_not_to_be_resumed(capsys, tmp_path):
     assert "--resume" not in message
 
 
+@pytest.mark.parametrize("saved", [0, 10])
+def test_a_new_run_that_fails_before_it_saves_leaves_no_folder(saved, tmp_path, monkeypatch):
+    class Failing(SimpleNamespace):
+        saved, resume_command = 0, "again"
+
+        def __init__(self, folder, run, console, **options):
+            super().__init__(folder=folder, console=console, close=lambda: None)
+
+        def train(self, stop, then_finish):
+            self.saved = saved
+            raise RuntimeError("broken")
+
+    monkeypatch.setattr(train, "Session", Failing)
+    command = ["--name", "x", "--out", str(tmp_path)]
+    with pytest.raises(RuntimeError, match="broken"):
+        train.train(command)
+    assert (tmp_path / "x").exists() == (saved > 0)
+    if saved:
+        saved = 0  # and it fails again
+        with pytest.raises(RuntimeError, match="broken"):
+            train.train([*command, "--resume"])
+        assert (tmp_path / "x" / "config.json").exists()
+
+
+def test_a_new_run_that_cannot_start_leaves_no_folder(capsys, tmp_path, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise ValueError("cannot be trained with")
+
+    monkeypatch.setattr(train, "Session", refuse)
+    command = ["--name", "x", "--out", tmp_path]
+    for _ in range(2):
+        assert "cannot be trained with" in refused(capsys, main, *command)
+        assert not list(tmp_path.iterdir())
+    RunFolder.create(tmp_path / "x", Run(Config()))
+    assert "cannot be trained with" in refused(capsys, main, *command, "--resume")
+    assert (tmp_path / "x" / "config.json").exists()
+
+
 def test_unusable_checkpoints_are_refused(capsys, whole, tmp_path):
     RunFolder.create(tmp_path / "foreign", Run(Config()))
     shutil.copytree(whole[0] / "checkpoints", tmp_path / "foreign" / "checkpoints")

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any, Self
 
@@ -128,10 +129,12 @@ class RunFolder:
       summary: when each seed was first solved, and what that took.
       machines: what it ran on, as far as an experiment noted it.
       animation: a solved episode.
+      is_new: whether `create` has made it.
     """
 
     def __init__(self, path: Path):
         self.path = path
+        self.is_new = False
         self.config = path / CONFIG_FILE
         self.metrics = path / "metrics.csv"
         self.checkpoints = path / "checkpoints"
@@ -176,7 +179,14 @@ class RunFolder:
         draft.mkdir(parents=True)
         cls(draft).note(run)
         draft.rename(path)
-        return cls(path)
+        folder = cls(path)
+        folder.is_new = True
+        return folder
+
+    def remove_if_new(self) -> None:
+        """Removes the folder if `create` has made it, for a run that failed before it saved."""
+        if self.is_new:
+            shutil.rmtree(self.path)
 
     @classmethod
     def open(cls, path: Path) -> tuple[Self, Run]:
