@@ -222,6 +222,7 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
         (np.zeros((4, 4, 3), np.uint8), {}, r"got uint8\[4, 4, 3\]"),
         (np.zeros((0, 4, 4, 3), np.uint8), {}, "at least one"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 0}, "at most 50, got 0"),
+        ("a.gif", {}, r"takes \(frames, path\), in this order; got 'a.gif'"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 51}, "at most 50, got 51"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"hold": -1}, "got -1"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"hold": np.inf}, "got inf"),

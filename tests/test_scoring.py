@@ -316,6 +316,16 @@ class Constant:
         return jnp.broadcast_to(action, (len(observation), 2)), carry + 1
 
 
+@pytest.mark.parametrize("tasks", [2, 3])
+def test_act_must_return_a_carry(near, tasks):
+    class Carryless(Random):
+        def act(self, observation, carry, key):
+            return super().act(observation, carry, key)[0]
+
+    words = ["act must return a pair (actions i32[B, 2], carry)", "got "]
+    assert_refused(words, tt.score, Carryless(), ["near"], tasks)
+
+
 def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     over = rightward_food(evaluation_tasks("near", 20))[:, None]
     first, later = [UP, RIGHT], np.where(over, 9, RIGHT)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import trap_tube_jax as tt
 from agents.config import Config
 from agents.runs import story as stories
 from agents.runs.folder import Run, RunFolder
@@ -19,7 +20,7 @@ FIRST = FirstSolved(iteration=3, episodes=3763, transitions=9, seconds=1.0)
 def scores(own, percent, others):
     """Each set has ten tasks."""
     made = []
-    for name in ALL_SETS:
+    for name in dict.fromkeys([own, *ALL_SETS]):
         solved = np.arange(10) < (percent if name == own else others) // 10
         made.append(Score.of(name, label(name), solved, np.full(10, 5)))
     return made
@@ -79,3 +80,16 @@ def test_commands_can_be_typed_as_they_are_shown():
     folder = RunFolder(Path("my runs/x y"))
     shown = "python -m agents.train --resume --name 'x y' --out 'my runs' --devices all"
     assert resume_command(folder, "--devices", "all") == shown
+
+
+@pytest.mark.parametrize("is_solved", [True, False])
+def test_a_set_of_ones_own_is_said_to_have_food_and_no_more(tmp_path, own_task_sets, is_solved):
+    tt.register("Tubeless-v0", (), short="tubeless", max_steps=20)
+    before, after = story(tmp_path, "tubeless", 90, 0, is_solved=is_solved)
+    text = "\n".join(before)
+    assert (
+        "Learnt: to reach the food, on" if is_solved else "the agent reaches the food in"
+    ) in text
+    assert "tube " not in text
+    assert "--preset best" not in after[-1]
+    assert after[-1].endswith("--optimality")

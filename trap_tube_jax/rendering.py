@@ -161,6 +161,8 @@ def save_gif(
     Raises:
       ValueError: naming the value and what is allowed.
     """
+    if isinstance(frames, str | os.PathLike):
+        raise ValueError(f"save_gif takes (frames, path), in this order; got {frames!r} as frames")
     pictures = np.asarray(frames)
     if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[-1] != 3:
         raise ValueError(

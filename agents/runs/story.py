@@ -44,17 +44,20 @@ def story(
 def _learnt(own: tt.TaskSet, percent: float, solved: Sequence[FirstSolved | None]) -> str:
     """What was learnt on the set that was trained on."""
     what = "the base task" if own.short == "base" else f"tasks of {own.label}"
+    get, gets = "reach the food", "reaches the food"
+    if own in tt.PAPER_TASK_SETS:  # others may have no tube
+        get, gets = "get the food out of the tube with the tool", "gets the food out of the tube"
     firsts = [first for first in solved if first is not None]
     if not firsts:
         return (
-            f"Learnt so far: trained on {what}, the agent gets the food out of the tube in "
+            f"Learnt so far: trained on {what}, the agent {gets} in "
             f"{percent:.1f} % of its test episodes there."
         )
     episodes = round(statistics.fmean(first.episodes for first in firsts))
     seeds = "" if len(solved) == 1 else f" ({len(firsts)} of {len(solved)} seeds)"
     return (
-        f"Learnt: to get the food out of the tube with the tool, on {what}, after {episodes:,} "
-        f"episodes{seeds}. The final agent solves {percent:.1f} % of its test episodes there."
+        f"Learnt: to {get}, on {what}, after {episodes:,} episodes{seeds}. "
+        f"The final agent solves {percent:.1f} % of its test episodes there."
     )
 
 
@@ -95,7 +98,8 @@ def _next_step(
         can_go_on &= run.seeds == 1  # several may have stopped at different iterations
     if percent < MUCH and can_go_on:
         return f"train longer with {command} {more}"
-    if tt.task_set(config.env_id).short != "pstsy":
+    own = tt.task_set(config.env_id)
+    if own in tt.PAPER_TASK_SETS and own.short != "pstsy":
         return "train on all transfers at once with python -m agents.train --preset best"
     path = shlex.quote(str(folder.path))
     return f"compare with shortest plans, python -m agents.evaluate {path} --optimality"

@@ -201,7 +201,7 @@ def _play(
     def step(now: _Now) -> _Now:
         time, states, observation, carry, is_valid = now
         over = states.terminated | states.truncated
-        action, carry = policy.act(observation, carry, jax.random.fold_in(key, time))
+        action, carry = _pair(policy.act(observation, carry, jax.random.fold_in(key, time)))
         states, timestep = jax.vmap(env.step)(states, action)
         in_range = jnp.all((action >= 0) & (action < NUM_DIRECTIONS), axis=-1)
         return time + 1, states, timestep.observation, carry, is_valid & jnp.all(in_range | over)
@@ -218,6 +218,16 @@ def _play(
     )
     _, states, _, _, is_valid = jax.lax.while_loop(is_on, step, first)
     return states.terminated, states.time, is_valid
+
+
+def _pair(returned: Any) -> tuple[jax.Array, Any]:
+    """What a policy's act returned, if it is a pair."""
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        raise ValueError(
+            "the policy's act must return a pair (actions i32[B, 2], carry), with carry = () where "
+            f"nothing is remembered, got {type(returned).__name__}"
+        )
+    return returned[0], returned[1]
 
 
 def _play_one(
