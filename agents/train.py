@@ -34,9 +34,8 @@ class Selection(processes.Job):
     Attributes:
       preset: the named settings to start from.
       imports: modules of your own, for the curiosities, encoders and task sets that they
-        register; read first, before all other options; use it rather than --imports.
-      env: the task set to train on, by id or short name; read first, before all other options;
-        use it rather than --env-id.
+        register; read first, before all other options.
+      env: the task set to train on, by id or short name; read first, before all other options.
       seed: the first seed.
       seeds: how many seeds to train side by side, from --seed on.
       name: the run's folder within --out; <preset>-<task set>-<seed> if absent.
@@ -50,14 +49,21 @@ class Selection(processes.Job):
     """
 
     preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
-    imports: Imports = ()
-    env: str | None = None
+    imports: Annotated[Imports, tyro.conf.arg(aliases=("--imports",))] = ()
+    env: Annotated[str | None, tyro.conf.arg(aliases=("--env-id",))] = None
     seed: int = 0
     seeds: int = 1
     name: str | None = None
     out: Path = Path("runs")
     resume: Flag = False
     devices: int | Literal["all"] | None = None
+
+
+class Settings(Config):
+    """`Config`, of which no option gives what `Selection` gives."""
+
+    imports: Annotated[tuple[str, ...], tyro.conf.Suppress]
+    env_id: Annotated[str, tyro.conf.Suppress]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +82,9 @@ class Options(Selection):
 
     checkpoint_every: int = 10
     keep: int = 3
-    config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
+    config: Annotated[Config, tyro.conf.arg(name="", constructor=Settings)] = dataclasses.field(
+        default_factory=Config
+    )
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -238,11 +246,7 @@ def parse(selection: Selection, arguments: Sequence[str]) -> tuple[Run | None, O
         Options, args=arguments, prog=PROGRAM, default=defaults, config=(tyro.conf.OmitArgPrefixes,)
     )
     env_id = tt.task_set(options.config.env_id).id
-    if selection.env is not None and tt.task_set(selection.env).id != env_id:
-        raise ValueError(
-            f"--env {selection.env} contradicts --env-id {options.config.env_id}; give one"
-        )
-    config = dataclasses.replace(options.config, env_id=env_id)
+    config = Config.from_dict({**options.config.to_dict(), "env_id": env_id})
     name = path.name if stored else run_path(options, env_id).name
     return stored, dataclasses.replace(options, config=config, name=name)
 

@@ -319,7 +319,7 @@ class Constant:
 @pytest.mark.parametrize("tasks", [2, 3])
 def test_act_must_return_a_carry(near, tasks):
     class Carryless(Random):
-        def act(self, observation, carry, key):
+        def act(self, observation, carry, key) -> Any:
             return super().act(observation, carry, key)[0]
 
     words = ["act must return a pair (actions i32[B, 2], carry)", "got "]

@@ -162,7 +162,6 @@ def test_evaluate_command_line(whole, tmp_path):
     [
         ("--preset slow", f"unknown preset 'slow'; allowed: {', '.join(PRESETS)}"),
         ("--env q", "unknown task set 'q'; allowed: TrapTube-v0 (base), "),
-        ("--env p --env-id st", "--env p contradicts --env-id st"),
         ("--minibatch 3 --episodes 8", "minibatch must divide episodes=8, got 3; allowed: 1, 2"),
         ("--episodess 8", "Unrecognized options: --episodess, 8"),
         ("--curiosity icmm", "unknown curiosity 'icmm'; allowed: icm, "),
@@ -268,6 +267,18 @@ def test_what_is_asked_for_goes_before_every_preset(preset, tmp_path):
     own = {"env_id": "PerceptualSymbolicTrapTube-v0", "hidden": 32, "curiosity": "none"}
     assert options.config == Config.preset(preset, **own)
     assert options.name == f"{preset}-psy-3to4"
+
+
+def test_modules_and_task_set_are_one_option_each_also_as_once_spelled(capsys):
+    for arguments in (["--env", "st", "--import", "math"], ["--env-id", "st", "--imports", "math"]):
+        _, options = parsed(*arguments)
+        same = Config.preset("fast", env_id="StructuralTrapTube-v0", imports=("math",))
+        assert (options.config, options.name) == (same, "fast-st-0")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert text.count("--env ") == text.count("--env-id ") == 1
+    assert text.count("--import ") == text.count("--imports ") == 1
 
 
 def test_resumed_runs_keep_their_settings(tmp_path):
