@@ -148,7 +148,7 @@ def test_no_key_is_used_twice(monkeypatch):
         return actions.mode()
 
     class Playing(Learner):
-        def prepare(self, state, trajectory):
+        def prepare(self, state, trajectory) -> Any:
             note(state.key)
             return state, trajectory, {}
 
