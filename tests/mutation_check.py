@@ -19,8 +19,10 @@ import tempfile
 import time
 from typing import NamedTuple
 
-from faults import FAULTS, Fault
+from faults import ENVIRONMENT_FAULTS, Fault
+from faults_of_agents import AGENT_FAULTS
 
+FAULTS = (*ENVIRONMENT_FAULTS, *AGENT_FAULTS)
 ROOT = pathlib.Path(__file__).parent.parent
 PACKAGES = ("trap_tube_jax", "agents")
 # The child must import the copy, not an installed package.

@@ -113,9 +113,7 @@ def profile(
     return {
         "schema": SCHEMA,
         "command": command,
-        "settings": {
-            each.name: getattr(settings, each.name) for each in dataclasses.fields(Settings)
-        },
+        "settings": {f.name: getattr(settings, f.name) for f in dataclasses.fields(Settings)},
         "machines": [here, *(each for each in machines if each != here)],
         "points": {
             name: {
