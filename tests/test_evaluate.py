@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -217,6 +218,16 @@ def test_progress_is_a_table_on_a_terminal_and_lines_elsewhere(is_terminal):
     assert "left at most" in text
     assert ("iteration 2 of 5" in text) == is_terminal
     assert ("entropy" in text) != is_terminal
+
+
+def test_compiling_does_not_count_in_what_is_left(monkeypatch):
+    now = iter([0.0, 0.0, 100.0])
+    monkeypatch.setattr(report, "time", SimpleNamespace(perf_counter=lambda: next(now)))
+    file = io.StringIO()
+    row = dict.fromkeys((name for _, name, _ in report.LIVE_COLUMNS), 0.5)
+    with report.LiveReport(Console(file=file), total_iterations=5, num_seeds=1) as live:
+        live.update([row | {"iteration": 1}], 0, ready_at=98.0)
+    assert "0:08 left at most" in file.getvalue()
 
 
 def test_solved_episode_becomes_a_gif(grey_play, tmp_path):

@@ -59,13 +59,13 @@ class LiveReport:
         self._num_seeds = num_seeds
         self._rows: deque[Row] = deque(maxlen=LIVE_ROWS)
         self._durations: deque[float] = deque(maxlen=LIVE_ROWS)
-        self._shown_at = time.monotonic()
+        self._shown_at = time.perf_counter()
         self._live = None
         if console.is_terminal:
             self._live = Live(console=console, auto_refresh=False, transient=False)
 
     def __enter__(self) -> Self:
-        self._shown_at = time.monotonic()
+        self._shown_at = time.perf_counter()
         if self._live is not None:
             self._live.start()
         return self
@@ -74,15 +74,17 @@ class LiveReport:
         if self._live is not None:
             self._live.stop()
 
-    def update(self, rows: Sequence[Row], num_solved: int) -> None:
+    def update(self, rows: Sequence[Row], num_solved: int, *, ready_at: float = 0.0) -> None:
         """Shows an iteration.
 
         Args:
           rows: its rows of metrics, one per seed that trained.
           num_solved: seeds solved so far.
+          ready_at: when all was compiled, by `time.perf_counter`; the time until then does not
+            count in what is left.
         """
-        now = time.monotonic()
-        self._durations.append(now - self._shown_at)
+        now = time.perf_counter()
+        self._durations.append(now - max(self._shown_at, ready_at))
         self._shown_at = now
         mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
         mean["transitions_per_second"] *= len(rows)

@@ -117,7 +117,8 @@ class Session:
         with stop, live:
             while self._progress.active.any():
                 rows = self._iterate(advance)
-                live.update(rows, sum(first is not None for first in self._progress.solved))
+                num_solved = sum(first is not None for first in self._progress.solved)
+                live.update(rows, num_solved, ready_at=advance.ready_at)
                 if then_finish and self._log is not None and self._results is None:
                     self._prepare_results()
                 # A signal may arrive at any time: what counts is what all agreed on here.
