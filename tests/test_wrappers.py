@@ -124,3 +124,12 @@ def test_auto_reset_refuses_what_starts_over_by_itself(wrapper):
     words = [wrapper.__name__, "starts over by itself", "trap_tube_jax.Environment"]
     assert_refused(words, tt.AutoReset, env)
     assert_refused(["starts over by itself"], tt.AutoReset, tt.EpisodeStatistics(env))
+
+
+@pytest.mark.parametrize("wrap", [tt.AutoReset, tt.EpisodeStatistics])
+def test_a_state_of_another_kind_is_refused(wrap):
+    env = wrap(tt.make("base"))
+    _, timestep = env.reset(jax.random.key(0))
+    for state in (timestep, tt.base_state()):
+        words = [f"{wrap.__name__}State, got {type(state).__name__}", "return (state, timestep)"]
+        assert_refused(words, env.step, state, jnp.array([DOWN, RIGHT]))

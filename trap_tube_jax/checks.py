@@ -38,3 +38,16 @@ def check_seed(seed: Any) -> int:
       ValueError: naming the seed and the bounds.
     """
     return check_integer("seed", seed, 0, LARGEST_SEED)
+
+
+def check_own_state(state: Any, kind: type) -> None:
+    """Checks that `step` is given the kind of state that its own `reset` returns.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    if not isinstance(state, kind):
+        raise ValueError(
+            f"step takes a {kind.__name__}, got {type(state).__name__}; reset and step return "
+            "(state, timestep)"
+        )

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from trap_tube_jax.checks import check_integer
+from trap_tube_jax.checks import check_integer, check_own_state
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.state import State, TimeStep
@@ -152,11 +152,7 @@ def _check_keys(keys: Any) -> None:
 
 
 def _check_step(state: Any, actions: Any) -> None:
-    if not isinstance(state, VectorState):
-        raise ValueError(
-            f"step takes a trap_tube_jax.VectorState, got {type(state).__name__}; reset and step "
-            "return (state, timestep)"
-        )
+    check_own_state(state, VectorState)
     wanted = (len(state.background), 2)
     if np.shape(actions) != wanted:
         raise ValueError(f"actions must be integer{list(wanted)}, got shape {np.shape(actions)}")

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from trap_tube_jax.checks import check_own_state
 from trap_tube_jax.environment import check_key
 from trap_tube_jax.prng import split
 from trap_tube_jax.state import TimeStep
@@ -90,7 +91,12 @@ class AutoReset:
     def step(
         self, state: AutoResetState, action: jax.Array
     ) -> tuple[AutoResetState, AutoResetTimeStep]:
-        """Takes one action and, if that ended the episode, starts the next."""
+        """Takes one action and, if that ended the episode, starts the next.
+
+        Raises:
+          ValueError: `state` is not an `AutoResetState`.
+        """
+        check_own_state(state, AutoResetState)
         inner, timestep = self.env.step(state.inner, action)
         stepped = (AutoResetState(inner, state.key), timestep.observation)
         fresh, first = self.reset(state.key)
@@ -154,7 +160,12 @@ class EpisodeStatistics:
     def step(
         self, state: EpisodeStatisticsState, action: jax.Array
     ) -> tuple[EpisodeStatisticsState, TimeStep]:
-        """Takes one action and updates the counts."""
+        """Takes one action and updates the counts.
+
+        Raises:
+          ValueError: `state` is not an `EpisodeStatisticsState`.
+        """
+        check_own_state(state, EpisodeStatisticsState)
         inner, timestep = self.env.step(state.inner, action)
         running_return = state.running_return + timestep.reward
         running_length = state.running_length + 1
