@@ -71,8 +71,9 @@ class Options(Selection):
     """Trains an agent, evaluates it on all task sets and leaves everything in a folder.
 
     Ctrl-C stops after the current iteration and saves; a second one stops at once.
-    --resume then continues to the same result as if nothing had happened. Compiled programs are
-    kept in ~/.cache/trap_tube_jax; with JAX_ENABLE_COMPILATION_CACHE=0 all compile anew.
+    --resume then continues to the same result as if nothing had happened. Traced and compiled
+    programs are kept in ~/.cache/trap_tube_jax; with JAX_ENABLE_COMPILATION_CACHE=0 all are made
+    anew.
 
     Attributes:
       checkpoint_every: iterations from one checkpoint to the next.

@@ -10,6 +10,7 @@ TASKS = ("tests/test_experiment_runs.py", "-k", "test_tasks")
 COUNTS = ("tests/test_curiosity.py", "-k", "share")
 KEYS = (*("tests/test_rollout.py", "tests/test_learner.py"), *("-k", "a_key_of or no_key"))
 EXTENDED = ("tests/test_train.py", "-k", "extended")
+TRACES = ("tests/test_traces.py", "-k", "anew or nothing")
 
 
 AGENT_FAULTS = (
@@ -181,6 +182,20 @@ AGENT_FAULTS = (
         'protocol.num_reported, "test")',
         'protocol.num_reported, "validation")',
         TASKS,
+    ),
+    Fault(
+        "agents/runs/traces",
+        "programs traced from other sources are taken up",
+        "if head != self.code + hashlib.sha256(body).digest():",
+        "if head[len(self.code) :] != hashlib.sha256(body).digest():",
+        TRACES,
+    ),
+    Fault(
+        "agents/runs/traces",
+        "traces are kept where modules of one's own are imported",
+        "            and not config.imports\n",
+        "",
+        TRACES,
     ),
     Fault(
         "agents/runs/folder",

@@ -145,6 +145,11 @@ class Placement:
         """How the episodes of a seed are divided."""
         return ALONE if self.mesh is None else Shards(self.mesh.shape[EPISODES])
 
+    @property
+    def sharding(self) -> NamedSharding | None:
+        """How the states of seeds [S, ...] lie on the devices; None for the one default device."""
+        return None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec(SEEDS))
+
     def shard(self, advance: Callable[..., Any]) -> Callable[..., Any]:
         """Divides (states [S, ...], bool[S]) -> (states [S, ...], metrics [S]) over the mesh."""
         if self.mesh is None:
@@ -173,8 +178,7 @@ class Placement:
             )
 
         # NumPy arrays, unlike those of a device, may go to devices of other processes.
-        sharding = NamedSharding(self.mesh, PartitionSpec(SEEDS))
-        return jax.jit(whole, out_shardings=sharding)(numbers)
+        return jax.jit(whole, out_shardings=self.sharding)(numbers)
 
     def local(self, tree: Tree) -> Tree:
         """The whole arrays, wherever their parts lie, on one device of this process.

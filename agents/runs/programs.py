@@ -2,7 +2,8 @@
 
 Much of a compilation runs on one core: as a single program an iteration takes a quarter longer to
 compile on two. Each program compiles while the next one is traced, and the first iteration begins
-as soon as the first program is there.
+as soon as the first program is there. Where an earlier process has traced them, they are not traced
+again.
 """
 
 import contextlib
@@ -20,12 +21,14 @@ from agents.acting.evaluation import evaluate
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import Batch, Learner, Metrics, TrainState
 from agents.runs.compilation import compiled, in_background
+from agents.runs.traces import Traces
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 # States of all seeds [S, ...], their batches between play and learning, and bool[S]; to states,
 # batches and metrics [S].
 Carry = tuple[TrainState, Batch | None]
 Phase = Callable[[TrainState, Batch | None, jax.Array], tuple[Carry, Metrics]]
+NUM_PHASES = 3
 
 
 def make_phases(train: Learner) -> tuple[Phase, ...]:
@@ -87,11 +90,20 @@ class Programs:
         self.pending: list[futures.Future[jax.stages.Compiled]] = []
         self.ready_at = time.perf_counter()
 
-        def lower(phase: Phase, before: futures.Future | None) -> tuple[jax.stages.Lowered, Any]:
-            carry = (states, None) if before is None else before.result()[1]
+        phases = functools.cache(lambda: make_phases(train))
+        traces = Traces.of(train.config)
+        depends_on = (train.config.to_dict(), placement.mesh)
+
+        def lower(index: int, before: futures.Future | None) -> tuple[jax.stages.Lowered, Any]:
+            inputs = (states, None, active) if before is None else (*before.result()[1], active)
+
+            def shard() -> Phase:
+                return placement.shard(phases()[index])
+
             with _uncollected():
-                jitted = jax.jit(placement.shard(phase), donate_argnums=0)
-                traced = jitted.trace(*carry, active)
+                phase = traces.kept(shard, inputs, index, *depends_on) if traces else shard()
+                jitted = jax.jit(phase, donate_argnums=0, in_shardings=placement.sharding)
+                traced = jitted.trace(*inputs)
                 return traced.lower(), traced.out_info[0]
 
         def finish(lowered: futures.Future) -> jax.stages.Compiled:
@@ -101,8 +113,8 @@ class Programs:
 
         lowered = None
         tracer = futures.ThreadPoolExecutor(1)  # one trace after the other
-        for phase in make_phases(train):
-            lowered = tracer.submit(lower, phase, lowered)
+        for index in range(NUM_PHASES):
+            lowered = tracer.submit(lower, index, lowered)
             self.pending.append(in_background(finish, lowered))
         tracer.shutdown(wait=False)
 
