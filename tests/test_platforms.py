@@ -19,7 +19,7 @@ import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.parallel.sharding import EPISODES, SEEDS, Placement
 from agents.registry import curiosities
-from agents.runs.programs import make_phases
+from agents.runs.programs import PHASES
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 TINY = Config(
@@ -139,7 +139,7 @@ def test_training_compiles_for_several_gpus(gpus, settings):
     sharding = NamedSharding(mesh, PartitionSpec(SEEDS))
     inputs: Any = (states, None)
     code = ""
-    for phase in map(placement.shard, make_phases(train)):
+    for phase in (placement.shard(make(train)) for make in PHASES):
         active = jax.ShapeDtypeStruct((4,), bool)
         code += machine_code(sharding, phase, *inputs, active) or ""
         inputs, _ = jax.eval_shape(phase, *inputs, active)

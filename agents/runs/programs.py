@@ -28,33 +28,45 @@ from trap_tube_jax.scoring.tasks import evaluation_tasks
 # batches and metrics [S].
 Carry = tuple[TrainState, Batch | None]
 Phase = Callable[[TrainState, Batch | None, jax.Array], tuple[Carry, Metrics]]
-NUM_PHASES = 3
 
 
-def make_phases(train: Learner) -> tuple[Phase, ...]:
-    """The parts of an iteration, in order, as pure functions.
-
-    Each takes the states of all seeds [S, ...], their batches (of the phase before; None at first)
-    and bool[S], the seeds to advance; the others stay as they are. It returns states and batches
-    for the next phase, and metrics [S].
-    """
-    config = train.config
-    tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")
+def collecting(train: Learner) -> Phase:
+    """Plays."""
 
     def collect(state: TrainState, _: None) -> tuple[Carry, Metrics]:
         after, batch, metrics = train.collect(state)
         steps = after.transitions - state.transitions
         return (after, batch), {**metrics, "transitions": after.transitions, "steps": steps}
 
+    return functools.partial(_for_all_seeds, collect)
+
+
+def learning(train: Learner) -> Phase:
+    """Learns from what was played."""
+
     def learn(state: TrainState, batch: Batch) -> tuple[Carry, Metrics]:
         state, metrics = train.learn(state, batch)
         return (state, None), {**metrics, "episodes": state.episodes}
+
+    return functools.partial(_for_all_seeds, learn)
+
+
+def judging(train: Learner) -> Phase:
+    """Plays the validation tasks greedily."""
+    config = train.config
+    tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")
 
     def judge(state: TrainState, _: None) -> tuple[Carry, Metrics]:
         outcome = evaluate(train.agent, state.params, train.env, tasks, train.shards)
         return (state, None), {"evaluation": jnp.mean(outcome.solved.astype(jnp.float32))}
 
-    return tuple(functools.partial(_for_all_seeds, phase) for phase in (collect, learn, judge))
+    return functools.partial(_for_all_seeds, judge)
+
+
+# What makes the parts of an iteration, in order. Each part takes the states of all seeds [S, ...],
+# their batches (of the phase before; None at first) and bool[S], the seeds to advance; the others
+# stay as they are. It returns states and batches for the next part, and metrics [S].
+PHASES: tuple[Callable[[Learner], Phase], ...] = (collecting, learning, judging)
 
 
 def _for_all_seeds(
@@ -90,18 +102,20 @@ class Programs:
         self.pending: list[futures.Future[jax.stages.Compiled]] = []
         self.ready_at = time.perf_counter()
 
-        phases = functools.cache(lambda: make_phases(train))
         traces = Traces.of(train.config)
         depends_on = (train.config.to_dict(), placement.mesh)
 
-        def lower(index: int, before: futures.Future | None) -> tuple[jax.stages.Lowered, Any]:
+        def lower(
+            make: Callable[[Learner], Phase], before: futures.Future | None
+        ) -> tuple[jax.stages.Lowered, Any]:
             inputs = (states, None, active) if before is None else (*before.result()[1], active)
 
             def shard() -> Phase:
-                return placement.shard(phases()[index])
+                return placement.shard(make(train))
 
             with _uncollected():
-                phase = traces.kept(shard, inputs, index, *depends_on) if traces else shard()
+                name = make.__name__
+                phase = traces.kept(shard, inputs, name, *depends_on) if traces else shard()
                 jitted = jax.jit(phase, donate_argnums=0, in_shardings=placement.sharding)
                 traced = jitted.trace(*inputs)
                 return traced.lower(), traced.out_info[0]
@@ -113,8 +127,8 @@ class Programs:
 
         lowered = None
         tracer = futures.ThreadPoolExecutor(1)  # one trace after the other
-        for index in range(NUM_PHASES):
-            lowered = tracer.submit(lower, index, lowered)
+        for make in PHASES:
+            lowered = tracer.submit(lower, make, lowered)
             self.pending.append(in_background(finish, lowered))
         tracer.shutdown(wait=False)
 
