@@ -16,14 +16,15 @@ from agents.parallel.sharding import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import programs
 from agents.runs.programs import Programs
+from agents.runs.traces import Traces
 
 TINY = {"max_steps": 6, "filters": (2, 2), "hidden": 4, "embedding": 2, "eval_episodes": 2}
+SMALL = Config(**TINY, curiosity="none", episodes=4, minibatch=2, epochs=2, chunk=4)
 
 
 def test_three_programs_do_what_one_does():
     close = functools.partial(chex.assert_trees_all_close, rtol=1e-4, atol=1e-6)
-    config = Config(**TINY, curiosity="none", episodes=4, minibatch=2, epochs=2, chunk=4)
-    train = make_train(config)
+    train = make_train(SMALL)
     state = jax.vmap(train.init)(jax.random.split(jax.random.key(0), 1))
     alone = jax.tree.map(lambda x: x[0].copy(), state)
     iterate, three = jax.jit(train.iterate), Programs(train, Placement(), state, np.ones(1, bool))
@@ -44,6 +45,31 @@ def test_three_programs_do_what_one_does():
     np.testing.assert_array_equal(own, others)
     state, alone = (x._replace(key=None, failures=None) for x in (state, alone))
     close(state, jax.tree.map(lambda x: x[None], alone))
+
+
+def test_kept_programs_train_to_the_same_bits(tmp_path, monkeypatch):
+    train, active = make_train(SMALL), np.ones(1, bool)
+
+    def trained() -> Any:
+        state = jax.vmap(train.init)(jax.random.split(jax.random.key(0), 1))
+        iterate = Programs(train, Placement(), state, active)
+        state, _ = iterate(state, active)
+        state, metrics = iterate(state, active)
+        return jax.random.key_data(state.key), state._replace(key=None), metrics
+
+    def unmade(name: str) -> Any:
+        def make(_: Learner) -> Any:
+            raise AssertionError(f"{name} is traced anew")
+
+        make.__name__ = name
+        return make
+
+    expected = trained()
+    monkeypatch.setattr(programs.Traces, "of", lambda config: Traces(tmp_path, bytes(32)))
+    chex.assert_trees_all_equal(trained(), expected)
+    never = [unmade(make.__name__) for make in programs.PHASES]
+    monkeypatch.setattr(programs, "PHASES", never)
+    chex.assert_trees_all_equal(trained(), expected)
 
 
 def test_garbage_is_collected_afterwards_as_before():

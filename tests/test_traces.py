@@ -13,10 +13,7 @@ import numpy as np
 import pytest
 
 from agents.config import Config
-from agents.parallel.sharding import Placement
-from agents.ppo.learner import make_train
-from agents.runs import programs, traces
-from agents.runs.programs import Programs
+from agents.runs import traces
 from agents.runs.traces import Traces
 
 CODE = bytes(32)
@@ -124,25 +121,3 @@ def test_code_is_every_source_and_setting(tmp_path, monkeypatch):
     found.add(traces.code_digest())
     jax.config.update("jax_default_matmul_precision", before)
     assert len(found) == 5
-
-
-def test_kept_programs_train_to_the_same_bits(tmp_path, monkeypatch):
-    config = Config(
-        curiosity="none", episodes=4, minibatch=2, epochs=1, max_steps=6, filters=(2, 2), hidden=4,
-        embedding=2, eval_episodes=2, chunk=4,
-    )  # fmt: skip
-    train, active = make_train(config), np.ones(1, bool)
-
-    def trained() -> Any:
-        state = jax.vmap(train.init)(jax.random.split(jax.random.key(0), 1))
-        run = Programs(train, Placement(), state, active)
-        state, _ = run(state, active)
-        state, metrics = run(state, active)
-        return jax.tree.map(jax.random.key_data, state.key), state._replace(key=None), metrics
-
-    expected = trained()
-    monkeypatch.setattr(programs.Traces, "of", lambda config: Traces(tmp_path, CODE))
-    chex.assert_trees_all_equal(trained(), expected)
-    never = [types.FunctionType(unmade.__code__, {}, make.__name__) for make in programs.PHASES]
-    monkeypatch.setattr(programs, "PHASES", never)
-    chex.assert_trees_all_equal(trained(), expected)

@@ -217,11 +217,23 @@ def _indexed(pictures: np.ndarray) -> list[Any]:
 
 @functools.partial(jax.jit, static_argnames="cell_size")
 def _episode_frames(state: State, actions: jax.Array, *, cell_size: int) -> jax.Array:
-    def body(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-        return step(state, action), render(state, cell_size, grasp=action[0])
+    def body(
+        carry: tuple[State, jax.Array, jax.Array], action: jax.Array
+    ) -> tuple[tuple[State, jax.Array, jax.Array], jax.Array]:
+        state, picture, was_padding = carry
+        is_padding = jnp.all(action == NO_DIRECTION)
+        # Of padding in a row, which moves nothing, only the first is drawn.
+        picture = jax.lax.cond(
+            was_padding & is_padding,
+            lambda: picture,
+            lambda: render(state, cell_size, grasp=action[0]),
+        )
+        return (step(state, action), picture, is_padding), picture
 
-    last, frames = jax.lax.scan(body, state, actions)
-    return jnp.concatenate([frames, render(last, cell_size)[None]])
+    nothing = jnp.zeros((BOARD_SIZE * cell_size, BOARD_SIZE * cell_size, 3), jnp.uint8)
+    actions = jnp.pad(actions, ((0, 1), (0, 0)), constant_values=NO_DIRECTION)
+    _, frames = jax.lax.scan(body, (state, nothing, jnp.array(False)), actions)
+    return frames
 
 
 @functools.partial(jax.jit, static_argnames=("cell_size", "grid"))
