@@ -96,6 +96,7 @@ class Traces(NamedTuple):
         head, body = content[: 2 * len(self.code)], content[2 * len(self.code) :]
         if head != self.code + hashlib.sha256(body).digest():
             return None
+        # Whoever can write here could also replace the compiled programs, which lie beside.
         program, outputs = pickle.loads(body)
         return export.deserialize(program), outputs
 
