@@ -217,22 +217,20 @@ def _indexed(pictures: np.ndarray) -> list[Any]:
 
 @functools.partial(jax.jit, static_argnames="cell_size")
 def _episode_frames(state: State, actions: jax.Array, *, cell_size: int) -> jax.Array:
-    def body(
-        carry: tuple[State, jax.Array, jax.Array], action: jax.Array
-    ) -> tuple[tuple[State, jax.Array, jax.Array], jax.Array]:
-        state, picture, was_padding = carry
-        is_padding = jnp.all(action == NO_DIRECTION)
-        # Of padding in a row, which moves nothing, only the first is drawn.
+    actions = jnp.pad(actions, ((0, 1), (0, 0)), constant_values=NO_DIRECTION)
+    is_padding = jnp.all(actions == NO_DIRECTION, axis=1)
+    # Of padding in a row, which moves nothing, only the first is drawn.
+    is_drawn = ~is_padding | jnp.pad(~is_padding[:-1], (1, 0), constant_values=True)
+
+    def body(carry: tuple[State, jax.Array], at: tuple[jax.Array, jax.Array]) -> Any:
+        (state, picture), (action, is_drawn) = carry, at
         picture = jax.lax.cond(
-            was_padding & is_padding,
-            lambda: picture,
-            lambda: render(state, cell_size, grasp=action[0]),
+            is_drawn, lambda: render(state, cell_size, grasp=action[0]), lambda: picture
         )
-        return (step(state, action), picture, is_padding), picture
+        return (step(state, action), picture), picture
 
     nothing = jnp.zeros((BOARD_SIZE * cell_size, BOARD_SIZE * cell_size, 3), jnp.uint8)
-    actions = jnp.pad(actions, ((0, 1), (0, 0)), constant_values=NO_DIRECTION)
-    _, frames = jax.lax.scan(body, (state, nothing, jnp.array(False)), actions)
+    _, frames = jax.lax.scan(body, (state, nothing), (actions, is_drawn))
     return frames
 
 

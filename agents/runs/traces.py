@@ -22,10 +22,10 @@ from jax import export
 import agents
 import trap_tube_jax
 from agents.config import Config
+from agents.runs.machine import VERSIONED
 
 # Files changed later than this may not be what was imported. Imports take some seconds at most.
 UNCHANGED_SINCE = time.time() - 30
-VERSIONED = ("jax", "jaxlib", "flax", "optax", "chex", "numpy")
 
 
 class Traces(NamedTuple):
@@ -132,6 +132,6 @@ def code_digest() -> bytes | None:
                 return None
             source = path.read_bytes()
             digest.update(f"{path.relative_to(root)} {len(source)} ".encode() + source)
-    versions = [sys.version, *map(importlib.metadata.version, VERSIONED)]
+    versions = [sys.version, *map(importlib.metadata.version, (*VERSIONED, "chex"))]
     digest.update(repr((versions, sorted(jax.config.values.items()))).encode())
     return digest.digest()
