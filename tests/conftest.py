@@ -65,9 +65,8 @@ def own_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def timed(monkeypatch):
     """What the measured functions have returned; each takes two seconds."""
-    from timings import TIMING  # noqa: PLC0415
-
     from benchmarks import harness  # noqa: PLC0415  after the settings above
+    from timings import TIMING  # noqa: PLC0415
 
     returned = []
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import jax
 import numpy as np
-import spec_reference as spec
 
+import spec_reference as spec
 import trap_tube_jax as tt
 
 SAMPLES = 2**17

@@ -1,0 +1,146 @@
+"""The paper preset is the published baseline: one recorded batch, from outputs to updates."""
+
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+import pytest
+
+from agents import Config
+from agents.curiosity.icm import ICM
+from agents.networks.agent import num_parameters
+from agents.ppo.learner import make_train
+from paths import DATA
+from reference_update import Recording, make_trajectory
+
+CONFIG = Config.preset("paper", episodes=8, minibatch=8, epochs=5)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    with np.load(DATA / "reference_update.npz") as file:
+        return Recording({name: file[name] for name in file.files})
+
+
+@pytest.fixture(scope="module")
+def ours(recording: Recording) -> dict[str, Any]:
+    train = make_train(CONFIG)
+    params = recording.params("param", jax.jit(train.init_params)(jax.random.key(0)))
+
+    @jax.jit
+    def run(params):
+        trajectory = make_trajectory(train.agent, params, recording)
+        state = train.init(jax.random.key(0))._replace(params=params)
+        experience = train.acting_experience(params, trajectory)
+        assert isinstance(train.curiosity, ICM)
+        prediction = train.curiosity.predict(params["curiosity"], experience)
+        raw, _ = train.intrinsic_reward(state, trajectory)
+        state, batch, _ = train.prepare(state, trajectory)
+        moments = (state.extrinsic, state.intrinsic)
+        return trajectory, experience.next_embedding, prediction, raw, batch, moments
+
+    names = ("trajectory", "next_embedding", "prediction", "raw", "batch", "moments")
+    return {"train": train, "params": params, **dict(zip(names, run(params), strict=True))}
+
+
+@pytest.fixture(scope="module")
+def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
+    train, batch = ours["train"], ours["batch"]
+    clip = optax.clip_by_global_norm(CONFIG.max_gradient_norm)
+
+    @jax.jit
+    def update(params, opt_state):
+        gradient, terms = jax.grad(train.loss, has_aux=True)(params, batch)
+        step, opt_state = train.optimizer.update(gradient, opt_state, params)
+        clipped, _ = clip.update(gradient, clip.init(params))
+        params = optax.apply_updates(params, step)
+        return params, opt_state, clipped, {**terms, "gradient_norm": optax.tree.norm(gradient)}
+
+    params, opt_state, done = ours["params"], jax.jit(train.optimizer.init)(ours["params"]), []
+    for _ in range(5):
+        params, opt_state, clipped, terms = update(params, opt_state)
+        done.append({"params": params, "clipped": clipped, "terms": terms})
+    return done
+
+
+def assert_close(actual: Any, expected: Any, tolerance: float = 1e-4) -> None:
+    """Equal within `tolerance` of the largest magnitude of `expected`."""
+    expected = np.asarray(expected)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(np.asarray(actual) / scale, expected / scale, rtol=0, atol=tolerance)
+
+
+def assert_trees_close(actual: Any, expected: Any, tolerance: float) -> None:
+    leaves = jax.tree_util.tree_leaves_with_path(expected)
+    for (path, want), got in zip(leaves, jax.tree.leaves(actual), strict=True):
+        try:
+            assert_close(got, want, tolerance)
+        except AssertionError as error:
+            raise AssertionError(f"{jax.tree_util.keystr(path)}: {error}") from None
+
+
+def test_parameter_count(ours):
+    assert num_parameters(ours["params"]) == 202_113
+
+
+def test_replayed_boards_are_the_recorded_ones(recording, ours):
+    boards = jax.jit(lambda episodes: episodes.observations())(ours["trajectory"].episodes)
+    np.testing.assert_array_equal(boards, recording.steps("batch/observation_rgb"))
+
+
+def test_network_outputs(recording, ours):
+    trajectory, (error, inferred) = ours["trajectory"], ours["prediction"]
+    actions, _ = ours["train"].agent.act(ours["params"], trajectory.embedding)
+    assert_close(trajectory.embedding, recording.steps("out/embedding"))
+    assert_close(trajectory.log_prob, recording.steps("out/log_probs"))
+    assert_close(actions.entropy(), recording.steps("out/entropy"))
+    assert_close(trajectory.value[:-1, :, 0], recording.steps("out/values"))
+    assert_close(ours["next_embedding"], recording.steps("out/embedding_next"))
+    expected = recording.steps("out/embedding_next_pred") - recording.steps("out/embedding_next")
+    assert_close(error, np.square(expected))
+    assert_close(jax.nn.softmax(inferred.grasp_logits), recording.steps("out/move_pred"))
+    assert_close(jax.nn.softmax(inferred.move_logits), recording.steps("out/grasp_pred"))
+
+
+def test_rewards_and_targets(recording, ours):
+    extrinsic, intrinsic = ours["moments"]
+    mask = recording.steps("batch/weight")
+    raw = ours["raw"]
+    assert_close(raw * mask, recording.steps("reward/intrinsic") * mask)
+    assert_close(extrinsic.deviation, recording["reward/extrinsic_std"])
+    assert_close(intrinsic.deviation, recording["reward/intrinsic_std"])
+    reward = ours["trajectory"].episodes.reward / extrinsic.deviation
+    reward = reward + CONFIG.intrinsic_scale * raw * mask / intrinsic.deviation
+    assert_close(reward, recording.steps("reward/total") * mask)
+    assert_close(ours["batch"].advantage, recording.steps("target/advantages") * mask)
+    assert_close(
+        ours["batch"].value_target[..., 0] * mask, recording.steps("target/returns") * mask
+    )
+
+
+@pytest.mark.parametrize("index", range(5))
+def test_loss_terms_and_gradient_norm(recording, updates, index):
+    terms, prefix = updates[index]["terms"], f"update{index + 1}"
+    expected = {
+        "value_loss": recording[f"{prefix}/loss/value"],
+        "entropy_loss": recording[f"{prefix}/loss/entropy"],
+        "forward_loss": 10 * recording[f"{prefix}/loss/forward"],
+        "inverse_loss": 10 * recording[f"{prefix}/loss/inverse"],
+        "gradient_norm": recording[f"{prefix}/gradient_norm"],
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(terms[name], value, rtol=1e-4, err_msg=name)
+    # The policy's loss is a difference of near-equal sums: compared on the advantages' scale.
+    np.testing.assert_allclose(terms["policy_loss"], recording[f"{prefix}/loss/policy"], atol=1e-5)
+
+
+def test_clipped_gradient(recording, ours, updates):
+    expected = recording.params("clipped_gradient1", ours["params"])
+    assert_trees_close(updates[0]["clipped"], expected, 1e-4)
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_parameters_after_updates(recording, ours, updates, count):
+    expected = recording.params(f"param_after{count}", ours["params"])
+    assert_trees_close(updates[count - 1]["params"], expected, 1e-4)

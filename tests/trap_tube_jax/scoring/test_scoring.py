@@ -1,0 +1,337 @@
+"""Scores by the benchmark's protocol: fixed tasks, and agents of any kind."""
+
+import json
+import re
+import zlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from refusal import assert_refused
+from trap_tube_jax import registry
+from trap_tube_jax.scoring import benchmark
+from trap_tube_jax.scoring.scores import Optimality
+from trap_tube_jax.scoring.tasks import (
+    ALL_SETS,
+    PROTOCOL,
+    evaluation_keys,
+    evaluation_tasks,
+    layout_numbers,
+)
+
+# Of the first 32 tasks of every set. Other tasks need another version of the protocol.
+DIGESTS = {
+    1: {
+        "base": 1869258240, "p": 2439134681, "st": 592414579, "sy": 3888882155,
+        "pst": 1365254835, "psy": 246488204, "stsy": 327823811, "pstsy": 3988046806,
+    },
+}  # fmt: skip
+UP, DOWN, RIGHT = 0, 1, 3
+
+
+class Rightward:
+    """Grasps up and moves right, and remembers how often it has; solves what lies to its right."""
+
+    def initial(self, batch):
+        return jnp.zeros(batch, jnp.int32)
+
+    def act(self, observation, carry, key):
+        del key
+        assert observation.dtype == jnp.uint8
+        action = jnp.broadcast_to(jnp.array([UP, RIGHT]), (len(observation), 2))
+        return action, carry + 1
+
+
+class Random:
+    def initial(self, batch):
+        return ()
+
+    def act(self, observation, carry, key):
+        return jax.random.randint(key, (len(observation), 2), 0, 4), carry
+
+
+class Detour(Rightward):
+    """As `Rightward`, after a step up and one down."""
+
+    def act(self, observation, carry, key):
+        action, following = super().act(observation, carry, key)
+        move = jnp.select([carry == 0, carry == 1], [UP, DOWN], RIGHT)
+        return action.at[:, 1].set(move), following
+
+
+class Single:
+    """`Rightward` for one observation at a time; says how it was called."""
+
+    def __init__(self, action):
+        self.action, self.resets, self.seen = action, 0, []
+
+    def reset(self):
+        self.resets += 1
+
+    def act(self, observation):
+        self.seen.append(observation)
+        return self.action
+
+
+class Recurrent:
+    """As Stable-Baselines3 has it: grasps and moves by the number of steps since the start."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert deterministic
+        assert observation.shape == (12, 12, 3)
+        count = 0 if state is None else state
+        return np.array([UP, RIGHT] if count else [UP, UP]), count + 1
+
+
+@pytest.fixture(scope="module")
+def near():
+    """Three steps to the right of the agent, some of the time one below: a limit of 5 steps."""
+
+    def food_near(key, state):
+        row = jax.random.randint(key, (), 0, 2)
+        return state.replace(food=state.agent + jnp.array([0, 3]) + jnp.stack([row, 0]))
+
+    base = tt.base_state().replace(
+        agent=jnp.array([1, 1], jnp.int32), food=jnp.array([1, 4], jnp.int32)
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "_task_sets", dict(registry._task_sets))
+        yield tt.register("Near-v0", (food_near,), short="near", base=base, max_steps=5)
+
+
+@pytest.fixture(scope="module")
+def scores(near):
+    return tt.score(Rightward(), ["Near-v0", "base"], tasks=20)
+
+
+def rightward_food(tasks):
+    return np.asarray(tasks.food[:, 0] == tasks.agent[:, 0])
+
+
+@pytest.mark.parametrize("partitionable", [True, False])
+@pytest.mark.parametrize("name", ALL_SETS)
+def test_the_tasks_of_a_version_of_the_protocol_never_change(name, partitionable):
+    with jax.threefry_partitionable(partitionable):
+        tasks = evaluation_tasks(name, 32)
+    parts = (tasks.board, tasks.palette, tasks.agent, tasks.tool, tasks.tool_extent, tasks.food)
+    data = b"".join(np.asarray(part, np.uint8).tobytes() for part in parts)
+    assert zlib.crc32(data) == DIGESTS[PROTOCOL][name]
+
+
+def test_a_policy_is_scored_on_the_fixed_tasks(scores):
+    solvable = rightward_food(evaluation_tasks("near", 20))
+    assert 0 < solvable.sum() < 20
+    assert [score.tasks for score in scores.sets] == [20, 1]
+    assert scores["near"].solved == solvable.sum()
+    assert scores["near"].percent == 5 * solvable.sum()
+    assert scores["near"].mean_steps == 3
+    assert (scores["base"].solved, scores["base"].interval) == (0, None)
+
+
+def test_few_layouts_are_counted_in_place_of_an_interval(scores):
+    assert (scores["near"].interval, str(scores["near"].layouts)) == (None, "1 of 2")
+
+
+def test_few_layouts_are_those_that_return():
+    def in_row(rows):
+        rows = jnp.array(rows, jnp.int32)
+        tasks = jax.tree.map(lambda x: np.broadcast_to(x, (len(rows), *x.shape)), tt.base_state())
+        return tasks.replace(agent=jnp.stack([rows, rows], axis=1))
+
+    def numbers(name, rows):
+        layout = layout_numbers(name, in_row(rows))
+        return None if layout is None else layout.tolist()
+
+    assert numbers("own", [3, 1, 1, 3]) == [1, 0, 0, 1]
+    assert numbers("own", [7]) == [0]
+    assert numbers("own", [1, 2, 3]) is None, "no sign that they are few"
+    assert numbers("own", [0, 1, 2, 3, 4, 4]) == [0, 1, 2, 3, 4, 4]
+    assert numbers("own", [0, 1, 2, 3, 4, 5, 5]) is None
+    assert numbers("p", [1, 1]) is None
+    assert numbers("sy", [0, 1, 2]) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("part", ["board", "agent", "tool", "tool_extent", "food"])
+def test_layouts_differ_by_every_part(part):
+    base = jax.tree.map(np.asarray, tt.base_state())
+    other = base.replace(**{part: getattr(base, part) + 1}, palette=base.palette[::-1])
+    tasks = jax.tree.map(lambda *fields: np.stack(fields), base, other)
+    layout = layout_numbers("sy", tasks)
+    assert layout is not None
+    assert sorted(layout.tolist()) == [0, 1]
+
+
+def test_blocks_change_nothing(scores, monkeypatch):
+    monkeypatch.setattr(benchmark, "BLOCK", 8)
+    assert tt.score(Rightward(), ["near"], tasks=20)["near"] == scores["near"]
+
+
+def test_every_step_of_every_block_has_its_own_key(near, monkeypatch):
+    """Three blocks of five steps, of which none ends early."""
+    monkeypatch.setattr(benchmark, "BLOCK", 8)
+    seen = []
+
+    def record(data):
+        seen.append(tuple(data.tolist()))
+
+    class Recorder(Random):
+        def act(self, observation, carry, key):
+            jax.debug.callback(record, jax.random.key_data(key))
+            return jnp.zeros((len(observation), 2), jnp.int32), carry
+
+    assert tt.score(Recorder(), ["near"], tasks=20)["near"].solved == 0
+    jax.effects_barrier()
+    assert len(seen) == len(set(seen)) == 15
+
+
+@pytest.mark.parametrize(("max_steps", "counts"), [(2, False), (3, True)])
+def test_the_sets_own_limit_holds(near, max_steps, counts):
+    """Three steps lead to the food."""
+    name = f"Near{max_steps}"
+    tt.register(name, near.transfers, base=near.base, max_steps=max_steps)
+    assert (tt.score(Rightward(), [name], tasks=20)[name].solved > 0) == counts
+
+
+def test_scores_are_records(scores):
+    values = json.loads(json.dumps(scores.to_dict()))
+    assert (values["protocol"], values["version"], values["seed"]) == (PROTOCOL, tt.__version__, 0)
+    assert [each["set"] for each in values["sets"]] == ["near", "base"]
+    assert {"tasks", "solved", "percent", "interval"} <= values["sets"][0].keys()
+    lines = str(scores).splitlines()
+    assert lines[0].startswith("| set ")
+    assert re.search(rf" {scores['near'].solved} \| +{scores['near'].percent:.1f} \|", lines[2])
+    assert " 0 of 1 |" in lines[3]
+    assert lines[-1] == f"Protocol {PROTOCOL}, trap-tube-jax {tt.__version__}."
+    with pytest.raises(ValueError, match="no score of 'p'; allowed: near, base"):
+        scores["p"]
+
+
+def test_optimality_compares_the_first_tasks():
+    scores = tt.score(Rightward(), ["sy"], tasks=3, optimality=2)
+    found = scores["sy"].optimality
+    assert found is not None
+    assert (found.solvable, found.percent_of_solvable, found.mean) == (2, 0, None)
+    assert "of solvable %" in str(scores)
+
+
+def test_optimality_of_what_is_solved(near):
+    """Two steps are lost on the detour. What is not in the agent's row is beyond 5 steps."""
+
+    def far_if_below(key, state):
+        state = near.transfers[0](key, state)
+        is_below = state.food[0] > state.agent[0]
+        return state.replace(food=state.food + jnp.stack([0, 3 * is_below]))
+
+    tt.register("Far-v0", (far_if_below,), base=near.base, max_steps=5)
+    near_ones = rightward_food(evaluation_tasks("Far-v0", 6)).sum()
+    assert 0 < near_ones < 6
+    score = tt.score(Detour(), ["Far-v0"], tasks=8, optimality=6)["Far-v0"]
+    assert score.mean_steps == 5
+    assert score.optimality == Optimality(near_ones, 100, 3 / 5, 3 / 5)
+
+
+@pytest.mark.parametrize("function", [tt.score, tt.score_gymnasium])
+def test_the_number_of_features_is_that_of_the_tasks(near, function):
+    agent = Rightward() if function is tt.score else Single(RIGHT)
+    assert_refused(["num_features=5", "has 3"], function, agent, ["near"], num_features=5)
+
+
+def test_draws_are_those_of_the_seed_whatever_else_is_scored(near):
+    one: Any = np.int64(1)
+    first, other = (tt.score(Random(), ["near"], 64, seed=seed) for seed in (0, one))
+    assert json.loads(json.dumps(other.to_dict()))["seed"] == 1
+    first = first["near"]
+    assert first != other["near"]
+    assert 0 < first.solved < 64
+    assert tt.score(Random(), ["base", "near"], 64)["near"] == first
+
+
+SAME = [(UP, RIGHT), np.array([UP, RIGHT]), 4 * UP + RIGHT, np.int64(4 * UP + RIGHT)]
+
+
+@pytest.mark.parametrize("action", SAME)
+def test_single_actions_of_either_kind_come_to_the_same(scores, action):
+    agent = Single(action)
+    single = tt.score_gymnasium(agent, ["near"], 20)
+    assert single["near"] == scores["near"]
+    assert single.seed is None
+    assert agent.resets == 20
+    tasks = evaluation_tasks("near", 20)
+    np.testing.assert_array_equal(agent.seen[0], jax.vmap(tt.observe)(tasks)[0])
+
+
+def test_an_agent_may_keep_a_state(near):
+    """Its first step leads up, so it comes by the food one step later, and one row higher."""
+    assert tt.score_gymnasium(Recurrent(), ["near"], 6)["near"].solved == 0
+    base = near.base.replace(food=near.base.food + jnp.array([-1, 0]))
+    tt.register("Above-v0", (), base=base, max_steps=5)
+    assert tt.score_gymnasium(Recurrent(), ["Above-v0"], 1)["Above-v0"].mean_steps == 4
+
+
+def test_refusals():
+    assert_refused(["initial(batch)", "object has no initial"], tt.score, object())
+    assert_refused(["unknown task set 'q'", "pstsy"], tt.score, Rightward(), ["q"])
+    assert_refused(["sets must name task sets", "base, p", "'sy'"], tt.score, Rightward(), "sy")
+    assert_refused(["sets must name", "()"], tt.score, Rightward(), ())
+    assert_refused([">= 1", "0"], tt.score, Rightward(), ["sy"], 0)
+    assert_refused(["optimality", ">= 0", "-1"], tt.score, Rightward(), ["sy"], optimality=-1)
+    assert_refused(["predict(observation)", "neither"], tt.score_gymnasium, object())
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 2**70, 1.5, True, None, "0"])
+def test_seeds_are_checked(seed):
+    words = ["seed", ">= 0 and <= 4294967295", repr(seed)]
+    assert_refused(words, tt.score, Random(), ["base"], seed=seed)
+
+
+def test_the_purpose_of_tasks_is_checked():
+    words = ["purpose", "test, validation", "'train'"]
+    purpose: Any = "train"
+    assert_refused(words, evaluation_tasks, "base", 1, purpose=purpose)
+    assert_refused(words, evaluation_keys, "TrapTube-v0", 1, purpose)
+
+
+@pytest.mark.parametrize("action", [16, -1, (0, 4), (0, 1, 2), (), 0.0, "up", None])
+def test_single_actions_are_checked(action):
+    words = ["(grasp, move)", "0 to 3", "0 to 15", repr(action)]
+    assert_refused(words, tt.score_gymnasium, Single(action), ["base"])
+
+
+class Constant:
+    """Takes one action i32[2] three times, then others, i32[2] or i32[B, 2]."""
+
+    def __init__(self, action, later=None):
+        self.action, self.later = jnp.array(action), jnp.array(action if later is None else later)
+
+    def initial(self, batch):
+        return jnp.int32(0)
+
+    def act(self, observation, carry, key):
+        del key
+        action = jnp.where(carry < 3, self.action, self.later)
+        return jnp.broadcast_to(action, (len(observation), 2)), carry + 1
+
+
+@pytest.mark.parametrize("tasks", [2, 3])
+def test_act_must_return_a_carry(near, tasks):
+    class Carryless(Random):
+        def act(self, observation, carry, key) -> Any:
+            return super().act(observation, carry, key)[0]
+
+    words = ["act must return a pair (actions i32[B, 2], carry)", "got "]
+    assert_refused(words, tt.score, Carryless(), ["near"], tasks)
+
+
+def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
+    over = rightward_food(evaluation_tasks("near", 20))[:, None]
+    first, later = [UP, RIGHT], np.where(over, 9, RIGHT)
+    assert tt.score(Constant(first, later), ["near"], 20)["near"].solved == over.sum()
+    words = ["an invalid action", "(grasp, move)", "0 to 3"]
+    for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):
+        assert_refused(words, tt.score, action, ["near"], 20)
+    floats = Constant([0.0, 3.0])
+    assert_refused(["integer[2]", "float32[2]"], tt.score, floats, ["near"], 20)

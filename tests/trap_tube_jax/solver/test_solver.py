@@ -1,0 +1,367 @@
+"""The solver against an exhaustive search that shares no code with it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import brute_force
+import trap_tube_jax as tt
+from paths import ROOT
+from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
+from trap_tube_jax.positions import NUM_POSITIONS
+from trap_tube_jax.solver import pictures
+from trap_tube_jax.solver.distance import count_reachable
+from trap_tube_jax.solver.search import checked, levels, take
+from trap_tube_jax.solver.survey import draw_tasks
+from trap_tube_jax.transfers import swap_with_tool
+
+NUM_ROOMS = 30
+NUM_DRAWN = 16  # tasks of a set
+
+# The agent must push the food out of its cell through the exit.
+WORKSHOP = """
+    222222222222
+    2.....222222
+    2.A.T..e.e.2
+    2...TFx22222
+    2......22222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+    222222222222
+"""
+WALLED_IN = """
+    .1..........
+    A1..........
+    11..........
+    ............
+    ....1111....
+    .T..xF.e....
+    .T..x..e....
+    .T..2222....
+    ............
+    ............
+    ............
+    ............
+"""
+MAZE = """
+    A...........
+    11111111111.
+    ............
+    .11111111111
+    ............
+    11111111111.
+    ............
+    .11111111111
+    ............
+    11111111111.
+    .....T......
+    F...........
+"""
+
+
+def random_room(seed: int) -> tt.State:
+    """A room of 3 x 4 cells in a corner of the board, with anything anywhere in it."""
+    rng = np.random.default_rng(seed)
+    board = np.full((12, 12), TUBE1)
+    room = rng.choice([0, TUBE2, TRAP, EXIT], size=(3, 4), p=[0.7, 0.1, 0.08, 0.12])
+    board[:3, :4] = room
+    ground = np.argwhere(board == 0)
+    food_cells = np.argwhere((board == 0) | (board == EXIT))
+    agent = rng.choice(ground)
+    food = rng.choice([cell for cell in food_cells if (cell != agent).any()])
+    extent = rng.permutation(np.array([1, rng.integers(1, 4)]))
+    return tt.State.create(
+        board=board, agent=agent, food=food, tool=rng.integers(0, (3, 4)), tool_extent=extent
+    )
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[tt.State]:
+    return [random_room(seed) for seed in range(NUM_ROOMS)]
+
+
+@pytest.fixture(scope="module")
+def room_plans(rooms) -> tt.Plan:
+    return tt.solve_batch(stack(rooms))
+
+
+@pytest.fixture(scope="module")
+def workshop() -> tt.State:
+    return tt.State.from_ascii(WORKSHOP)
+
+
+@pytest.fixture(scope="module")
+def workshop_distances(workshop) -> tt.Distances:
+    return tt.distances(workshop)
+
+
+@pytest.fixture(scope="module")
+def base_plan() -> tt.Plan:
+    return tt.solve(tt.base_state())
+
+
+def stack(states: list[tt.State]) -> tt.State:
+    return jax.tree.map(lambda *fields: jnp.stack(fields), *states)
+
+
+@jax.jit
+@jax.vmap
+def play(state: tt.State, actions: jax.Array) -> tuple[tt.State, jax.Array]:
+    """The last states, and what `Environment.step` pays for plans i32[B, L, 2]: f32[B, L]."""
+
+    def step(state, action):
+        state, timestep = env.step(state, action)
+        return state, timestep.reward
+
+    env = tt.make("base")
+    return jax.lax.scan(step, state, actions)
+
+
+def assert_paid_exactly_at_the_end(states: tt.State, plans: tt.Plan):
+    _, rewards = play(states, plans.actions)
+    expected = np.arange(1, rewards.shape[1] + 1) == plans.length[:, None]
+    np.testing.assert_array_equal(rewards, expected)
+
+
+@pytest.mark.parametrize(
+    ("code", "length"), [(TOOL, 11), (TUBE1, 10), (TUBE2, 8), (TRAP, 10), (EXIT, 16)]
+)
+def test_lengths_of_the_symbolic_tasks(code, length):
+    state = swap_with_tool(tt.base_state(), jnp.int32(code))
+    plan = tt.solve(state)
+    assert (plan.length, plan.solvable) == (length, True)
+    assert plan.actions.shape == (length, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "mean", "standard_deviation"), [("p", 22.7, 6), ("pstsy", 12.5, 7)]
+)
+def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
+    name, mean, standard_deviation
+):
+    states = draw_tasks(tt.task_set(name), tasks=NUM_DRAWN, seed=0)
+    plans = tt.solve_batch(states)
+    assert plans.solvable.all()
+    assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(NUM_DRAWN)
+    assert plans.length.max() <= MAX_STEPS
+    assert_paid_exactly_at_the_end(states, plans)
+
+
+@pytest.mark.slow
+def test_random_actions_solve_the_base_task_as_rarely_as_environment_md_says():
+    """The exact probability, over the graph of all states that can be reached."""
+    found = list(levels(checked(tt.base_state())))
+    nodes, successors, solved = (
+        np.concatenate([getattr(level, name) for level in found])
+        for name in ("nodes", "successors", "solved")
+    )
+    place = np.zeros(NUM_POSITIONS, np.int32)
+    place[nodes] = np.arange(len(nodes))
+    following = place[successors][~solved]
+    probability, total = np.eye(1, len(nodes))[0], 0.0
+    for _ in range(MAX_STEPS):
+        share = np.broadcast_to(probability[:, None] / NUM_ACTIONS, successors.shape)
+        total += share[solved].sum()
+        probability = np.bincount(following, share[~solved], len(nodes))
+    np.testing.assert_allclose(total + probability.sum(), 1)
+    page = ROOT / "trap_tube_jax" / "environment.md"
+    assert f"in {1e6 * total:.2f} of 1,000,000 episodes" in page.read_text()
+
+
+def test_no_plan_is_beaten_by_brute_force(rooms, room_plans):
+    for index, room in enumerate(rooms):
+        expected = brute_force.first_plan(*brute_force.read(room))
+        plan = take(room_plans, index)
+        assert plan.solvable == (expected is not None), f"room {index}"
+        if expected is not None:
+            assert plan.actions[: plan.length].tolist() == [list(pair) for pair in expected]
+    assert 5 < room_plans.solvable.sum() < NUM_ROOMS - 5
+
+
+def test_some_rooms_need_the_tool(rooms, room_plans):
+    end, _ = play(stack(rooms), room_plans.actions)
+    is_moved = (end.tool != stack(rooms).tool).any(axis=1)
+    assert (is_moved & room_plans.solvable).sum() >= 3
+
+
+@pytest.mark.parametrize("code", [TOOL, TUBE2])
+def test_no_plan_of_a_paper_task_is_beaten_by_brute_force(code):
+    state = swap_with_tool(tt.base_state(), jnp.int32(code))
+    task, start = brute_force.read(state)
+    length = int(tt.solve(state).length)
+    assert brute_force.is_solved_within(task, start, length)
+    assert not brute_force.is_solved_within(task, start, length - 1)
+
+
+def test_a_batch_equals_its_single_tasks(rooms, room_plans):
+    longest = room_plans.length.max()
+    assert room_plans.actions.shape == (NUM_ROOMS, longest, 2)
+    for index in range(0, NUM_ROOMS, 5):
+        plan = tt.solve(rooms[index])
+        of_batch = take(room_plans, index)
+        assert (plan.length, plan.solvable) == (of_batch.length, of_batch.solvable)
+        steps = max(int(plan.length), 0)
+        np.testing.assert_array_equal(plan.actions, of_batch.actions[:steps])
+        assert (of_batch.actions[steps:] == -1).all()
+
+
+def test_the_padding_of_a_batch_changes_nothing(rooms, room_plans):
+    assert_paid_exactly_at_the_end(stack(rooms), room_plans)
+
+
+def test_equal_tasks_of_a_batch_get_equal_plans(base_plan):
+    plans = tt.solve_batch(stack([tt.base_state()] * 2))
+    np.testing.assert_array_equal(plans.actions, np.stack([base_plan.actions] * 2))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"board": np.array([[0] * 5, [0, 0, TUBE1, 0, 0], [0] * 5])},
+        {"tool_extent": (2, 1)},
+        {"food": (0, 4)},
+        {"tool": (1, 2)},
+        {"agent": (0, 0)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_tasks_of_a_batch_that_differ_in_anything_have_plans_of_their_own(change):
+    parts = {"agent": (1, 0), "food": (1, 4), "tool": (0, 2), "tool_extent": (1, 1)}
+    board = np.full((12, 12), TUBE1)
+    states = []
+    for changed in ({}, change):
+        fields = {"board": np.zeros((3, 5)), **parts, **changed}
+        board[:3, :5] = fields.pop("board")
+        states.append(tt.State.create(board=board.copy(), **fields))
+    one, other = map(tt.solve, states)
+    assert one.actions.tolist() != other.actions.tolist()
+    plans = tt.solve_batch(stack(states))
+    for index, plan in enumerate((one, other)):
+        found = take(plans, index)
+        np.testing.assert_array_equal(found.actions[: found.length], plan.actions)
+
+
+def test_dtypes_are_those_documented(base_plan, room_plans, workshop):
+    for plan in (base_plan, room_plans):
+        dtypes = [field.dtype for field in (plan.actions, plan.length, plan.solvable)]
+        assert dtypes == [np.int32, np.int32, np.bool_]
+    for _, level in zip(range(3), levels(checked(workshop)), strict=False):
+        assert [field.dtype for field in level] == [np.int32, np.int32, np.bool_, np.int64]
+
+
+@pytest.mark.parametrize("num_features", [1, 5])
+def test_colours_play_no_part(base_plan, num_features):
+    plan = tt.solve(tt.base_state(num_features))
+    np.testing.assert_array_equal(plan.actions, base_plan.actions)
+
+
+def test_a_task_without_a_way_to_the_goal():
+    state = tt.State.from_ascii(WALLED_IN)
+    plan = tt.solve(state)
+    assert (plan.length, plan.solvable, plan.actions.shape) == (-1, False, (0, 2))
+    plans = tt.solve_batch(stack([state]))
+    assert plans.actions.shape == (1, 0, 2)
+    found = tt.distances(state)
+    assert found.num_reachable == 2
+    assert (found.to_goal == -1).all()
+
+
+def test_plans_are_not_bound_by_the_step_limit():
+    assert tt.solve(tt.State.from_ascii(MAZE)).length == 6 * 11 + 11
+
+
+def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
+    env, state = tt.make("base"), tt.base_state()
+    for action in base_plan.actions[:4]:
+        state, _ = env.step(state, action)
+    np.testing.assert_array_equal(tt.solve(state).actions, base_plan.actions[4:])
+
+
+def test_distances_equal_those_of_brute_force(workshop, workshop_distances):
+    task, start = brute_force.read(workshop)
+    edges = brute_force.graph(task, start)
+    from_start = brute_force.distances_from(start, edges)
+    to_goal = brute_force.distances_to_goal(edges)
+    found = workshop_distances
+    assert found.num_reachable == len(edges) == count_reachable(workshop)
+    for agent, tool, food in edges:
+        place = (*food, *tool, *agent)
+        assert found.from_start[place] == from_start[agent, tool, food]
+        assert found.to_goal[place] == to_goal.get((agent, tool, food), -1)
+    assert np.count_nonzero(found.to_goal >= 0) == len(to_goal)
+
+
+def test_distances_satisfy_bellmans_equation(workshop, workshop_distances):
+    found = workshop_distances
+    cells = np.argwhere(found.to_goal > 0).astype(np.int32)
+    states = jax.vmap(lambda cell: workshop.replace(food=cell[:2], tool=cell[2:4], agent=cell[4:]))(
+        cells
+    )
+    actions = tt.action_from_index(jnp.arange(16))
+    env = tt.make("base")
+    step_all = jax.vmap(jax.vmap(lambda s, a: env.step(s, a)[0], (None, 0)), (0, None))
+    to_goal = found.lookup(jax.jit(step_all)(states, actions))
+    best = np.where(to_goal < 0, 1000, to_goal).min(axis=1)
+    np.testing.assert_array_equal(found.lookup(states), 1 + best)
+
+
+def test_distances_count_down_along_the_plan(workshop, workshop_distances):
+    found, plan = workshop_distances, tt.solve(workshop)
+    state = workshop
+    for time, action in enumerate(plan.actions):
+        assert found.lookup(state) == plan.length - time
+        cells = (*np.asarray(state.food), *np.asarray(state.tool), *np.asarray(state.agent))
+        assert found.from_start[cells] == time
+        state, _ = tt.make("base").step(state, action)
+    assert found.lookup(state) == 0
+
+
+def test_refused_states():
+    base = tt.base_state()
+    solved = base.replace(agent=base.food, terminated=jnp.array(True))
+    with pytest.raises(ValueError, match="state is terminated"):
+        tt.solve(solved)
+    with pytest.raises(ValueError, match="state is truncated"):
+        tt.distances(base.replace(truncated=jnp.array(True)))
+    with pytest.raises(ValueError, match=r"agent at .* stands on tube1"):
+        tt.solve(base.replace(agent=jnp.array([4, 4], jnp.int32)))
+    with pytest.raises(ValueError, match=r"expected a trap_tube_jax\.State"):
+        tt.solve((1, 2))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="runs on the host"):
+        jax.jit(lambda state: tt.solve(state).length)(base)
+    with pytest.raises(ValueError, match="state 1 of the batch: the state is terminated"):
+        tt.solve_batch(stack([base, solved]))
+    with pytest.raises(ValueError, match="one leading axis"):
+        tt.solve_batch(base)
+    with pytest.raises(ValueError, match="must be"):
+        tt.solve(stack([base, base]))
+
+
+def test_pictures_of_distances_count_the_steps_that_are_left(
+    workshop, workshop_distances, tmp_path, monkeypatch
+):
+    drawn = []
+
+    def draw(axis, state, steps, scale):
+        drawn.append((axis, state, steps))
+        pictures_draw(axis, state, steps, scale)
+
+    pictures_draw = pictures._draw_distances
+    monkeypatch.setattr(pictures, "_draw_distances", draw)
+    monkeypatch.setattr(pictures.Figure, "savefig", lambda *_, **__: None)
+    plan, found = tt.solve(workshop), workshop_distances
+    pictures.save_distances(workshop, plan, found, tmp_path / "none.png")
+    assert len(drawn) == pictures.MOMENTS
+    for axis, state, steps in drawn:
+        left, agent = found.lookup(state), tuple(np.asarray(state.agent).tolist())
+        assert axis.get_title() == f"{left} steps left"
+        assert steps[agent] == left
+        numbers = {text.get_position()[::-1]: int(text.get_text()) for text in axis.texts}
+        cells = {tuple(cell) for cell in np.argwhere(steps >= 0).tolist()}
+        assert numbers == {cell: steps[cell] for cell in cells - {agent}}
+    assert found.lookup(drawn[0][1]) == plan.length > found.lookup(drawn[-1][1])

@@ -1,0 +1,396 @@
+"""The contract of `Environment`."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from easy import DOWN, EASY, RIGHT, assert_same, rows
+from refusal import assert_refused
+
+OPTIMISED = False  # few steps
+# What pairs of transfers do, each of them and all three show already.
+IDS = [
+    pytest.param(entry.id, marks=[pytest.mark.slow] * (len(entry.transfers) == 2))
+    for entry in tt.PAPER_TASK_SETS
+]
+BATCH, SLICES, STEPS, LIMIT = 4096, 4, 4, 3
+
+
+class Pace(NamedTuple):
+    """State and timestep at one time, or with a leading time axis."""
+
+    state: Any
+    timestep: tt.TimeStep
+
+
+def stacked(paces: list[Pace], axis: int = 0) -> Pace:
+    return jax.tree.map(lambda *leaves: np.stack(leaves, axis), *paces)
+
+
+def play(reset: Callable, step: Callable, key: jax.Array, actions: jax.Array) -> list[Pace]:
+    """An episode, or a batch of them, step by step."""
+    paces = [Pace(*reset(key))]
+    for time in range(STEPS):
+        paces.append(Pace(*step(paces[-1].state, actions[..., time, :])))
+    return paces
+
+
+class Modes(NamedTuple):
+    """One environment under many keys, and the ways to run it."""
+
+    env: tt.Environment
+    keys: jax.Array
+    actions: jax.Array
+    reset: Callable  # jitted and vmapped
+    vmapped: Pace  # NumPy arrays [batch, time, ...]
+
+
+def traced_once(function: Callable, *, batched: bool = False) -> Callable:
+    chex.clear_trace_counter()
+    function = chex.assert_max_traces(function, n=1)
+    return jax.jit(jax.vmap(function) if batched else function)
+
+
+@pytest.fixture(scope="module", params=IDS)
+def modes(request) -> Modes:
+    env = tt.make(request.param, max_steps=LIMIT)
+    keys = jax.random.split(jax.random.key(0), BATCH)
+    actions = jax.random.randint(jax.random.key(1), (BATCH, STEPS, 2), 0, 4)
+    reset, step = (traced_once(method, batched=True) for method in (env.reset, env.step))
+    vmapped = stacked(play(reset, step, keys, actions), axis=1)
+    return Modes(env, keys, actions, reset, vmapped)
+
+
+def test_jit_gives_the_same(modes):
+    reset, step = traced_once(modes.env.reset), traced_once(modes.env.step)
+    for index in (0, 1, BATCH - 1):
+        alone = play(reset, step, modes.keys[index], modes.actions[index])
+        assert_same(stacked(alone), rows(modes.vmapped, index))
+
+
+def test_eager_gives_the_same(modes):
+    alone = play(modes.env.reset, modes.env.step, modes.keys[7], modes.actions[7])
+    assert_same(stacked(alone), rows(modes.vmapped, 7))
+
+
+def test_scanned_slices_of_the_batch_give_the_same(modes):
+    def advance(state, action):
+        pace = Pace(*modes.env.step(state, action))
+        return pace.state, pace
+
+    def episode(key, actions):
+        first = Pace(*modes.env.reset(key))
+        return first, jax.lax.scan(advance, first.state, actions)[1]
+
+    scan = traced_once(episode, batched=True)
+    for part in np.split(np.arange(BATCH), SLICES):
+        first, rest = scan(modes.keys[part], modes.actions[part])
+        assert_same(first, rows(modes.vmapped, (part, 0)))
+        assert_same(rest, rows(modes.vmapped, (part, slice(1, None))))
+
+
+def test_same_key_gives_the_same_bits_and_others_other_tasks(modes):
+    again = Pace(*modes.reset(modes.keys))
+    assert_same(again, rows(modes.vmapped, (slice(None), 0)))
+    # A symbolic swap is invisible, so that what is seen does not tell all tasks apart.
+    seen = (again.state.board, again.state.palette, again.state.agent)
+    tasks = np.unique(np.concatenate([np.reshape(part, (BATCH, -1)) for part in seen], 1), axis=0)
+    finite = {(): 1, (tt.symbolic,): 5}
+    if modes.env.transfers in finite:
+        assert len(tasks) == finite[modes.env.transfers]
+    else:
+        assert len(tasks) > 2_000
+
+
+def test_reset_starts_an_episode(modes):
+    state, timestep = rows(modes.vmapped, (slice(None), 0))
+    assert not np.any(state.time)
+    assert not np.any(timestep.reward)
+    assert not np.any(timestep.done)
+    assert np.all(timestep.discount == 1)
+    for index in range(0, BATCH, 100):
+        tt.validate(rows(state, index))
+
+
+CHANGED_BY = {
+    tt.perceptual: {"board", "tool", "tool_extent", "agent", "food"},
+    tt.structural: {"palette"},
+    tt.symbolic: {"board", "tool", "tool_extent", "palette"},
+}
+
+
+def test_reset_changes_what_its_transfers_change(modes):
+    start, base = rows(modes.vmapped.state, (slice(None), 0)), modes.env.base
+    changed = set().union(*(CHANGED_BY[transfer] for transfer in modes.env.transfers))
+    for name in ("board", "palette", "tool", "tool_extent", "agent", "food", "time"):
+        differs = np.any(getattr(start, name) != np.asarray(getattr(base, name))[None])
+        assert differs == (name in changed), name
+
+
+def test_episodes_end_at_the_limit_and_stay_ended(modes):
+    timestep, state = modes.vmapped.timestep, modes.vmapped.state
+    solved = np.asarray(timestep.terminated)
+    at_limit = np.arange(STEPS + 1) >= LIMIT
+    np.testing.assert_array_equal(timestep.truncated, at_limit & ~solved)
+    np.testing.assert_array_equal(timestep.discount, 1 - solved)
+    assert np.all(np.asarray(state.time) <= LIMIT)
+    unsolved = ~solved[:, -1]
+    assert_same(
+        rows(modes.vmapped.state, (unsolved, LIMIT)), rows(modes.vmapped.state, (unsolved, -1))
+    )
+    np.testing.assert_array_equal(
+        rows(timestep.observation, (unsolved, LIMIT)), rows(timestep.observation, (unsolved, -1))
+    )
+
+
+@pytest.fixture(scope="module")
+def easy_step() -> Callable:
+    return jax.jit(tt.Environment(base=EASY, max_steps=2).step)
+
+
+def test_success_on_the_last_step_is_no_truncation(easy_step):
+    state, timestep = easy_step(EASY, RIGHT)
+    assert (timestep.reward, timestep.done, timestep.discount) == (0, False, 1)
+    state, timestep = easy_step(state, RIGHT)
+    assert (timestep.reward, timestep.discount) == (1, 0)
+    assert (timestep.terminated, timestep.truncated) == (True, False)
+    after, timestep = easy_step(state, DOWN)
+    assert_same(after, state)
+    assert (timestep.reward, timestep.discount) == (0, 0)
+    assert (timestep.terminated, timestep.truncated) == (True, False)
+
+
+def test_the_limit_truncates_and_keeps_the_discount(easy_step):
+    state, _ = easy_step(EASY, DOWN)
+    state, timestep = easy_step(state, RIGHT)
+    assert (timestep.reward, timestep.discount) == (0, 1)
+    assert (timestep.terminated, timestep.truncated) == (False, True)
+    after, timestep = easy_step(state, RIGHT)
+    assert_same(after, state)
+    assert (timestep.terminated, timestep.truncated) == (False, True)
+
+
+def test_a_truncated_state_stays_under_a_larger_limit(easy_step):
+    truncated = EASY.replace(time=jnp.int32(1), truncated=jnp.array(True))
+    after, timestep = easy_step(truncated, RIGHT)
+    assert_same(after, truncated)
+    assert (timestep.done, timestep.reward) == (True, 0)
+
+
+def test_an_environment_may_be_made_within_a_traced_function():
+    assert jax.eval_shape(lambda: tt.Environment(base=tt.base_state()).base.food).shape == (2,)
+
+
+def test_fifty_steps_unless_told_otherwise():
+    env = tt.Environment()
+    assert env.max_steps == 50
+
+    def advance(state, action):
+        state, timestep = env.step(state, action)
+        return state, timestep.truncated
+
+    _, truncated = jax.jit(lambda state: jax.lax.scan(advance, state, jnp.zeros((51, 2), int)))(
+        env.base
+    )
+    np.testing.assert_array_equal(truncated, np.arange(1, 52) >= 50)
+
+
+def test_own_transfers_apply_in_order_to_an_own_base():
+    def to_last_row(key, state):
+        del key
+        return state.replace(agent=jnp.array((11, 1)))
+
+    def to_last_column(key, state):
+        del key
+        return state.replace(agent=jnp.stack([state.agent[0], jnp.int32(11)]))
+
+    env = tt.Environment((to_last_row, to_last_column), base=EASY)
+    state, _ = jax.jit(env.reset)(jax.random.key(0))
+    np.testing.assert_array_equal(state.agent, (11, 11))
+    assert repr(env) == "Environment(transfers=(to_last_row, to_last_column), max_steps=50)"
+
+
+def test_own_transfers_may_build_on_each_other():
+    """The second puts the agent where the base task has a trap."""
+
+    def clear(key, state):
+        del key
+        return state.replace(board=jnp.zeros_like(state.board))
+
+    def into_the_tube(key, state):
+        del key
+        return state.replace(agent=jnp.array([5, 4], jnp.int32))
+
+    state, _ = tt.Environment((clear, into_the_tube)).reset(jax.random.key(0))
+    np.testing.assert_array_equal(state.agent, [5, 4])
+    assert_refused(["into_the_tube", "stands on trap"], tt.Environment, (into_the_tube, clear))
+
+
+@pytest.mark.parametrize("make_key", [jax.random.key, jax.random.PRNGKey], ids=["typed", "raw"])
+def test_own_transfers_get_keys_that_mix_with_own_keys(make_key):
+    """Typed keys, whatever `reset` was given, and those that `compose` promises."""
+
+    def own(key, state):
+        jnp.stack([key, jax.random.key(1)])
+        jax.lax.cond(state.time == 0, lambda: key, lambda: jax.random.key(2))
+        return state.replace(agent=jax.random.randint(key, (2,), 8, 12))
+
+    key = make_key(3)
+    state, _ = tt.Environment((tt.structural, own), base=EASY).reset(key)
+    expected = jax.random.fold_in(key, 1)
+    np.testing.assert_array_equal(state.agent, jax.random.randint(expected, (2,), 8, 12))
+
+
+def test_action_numbers_are_four_times_grasp_plus_move():
+    actions = np.array([(grasp, move) for grasp in range(4) for move in range(4)])
+    np.testing.assert_array_equal(tt.action_from_index(jnp.arange(16)), actions)
+    np.testing.assert_array_equal(tt.action_to_index(jnp.asarray(actions)), np.arange(16))
+    env = tt.Environment()
+    assert env.num_actions == 16
+    assert (env.action_spec.shape, env.action_spec.minimum, env.action_spec.maximum) == ((2,), 0, 3)
+
+
+def test_other_numbers_are_no_directions():
+    index = jnp.array([[-1, 16], [99, 15]])
+    expected = [[[-1, -1], [-1, -1]], [[-1, -1], [3, 3]]]
+    np.testing.assert_array_equal(jax.jit(tt.action_from_index)(index), expected)
+    with pytest.raises(ValueError, match="an action's index must be an integer, got float32"):
+        tt.action_from_index(jnp.array(3.0))
+
+
+def test_64_bit_numbers_change_no_task():
+    """Nor the types of what comes with it."""
+
+    def play():
+        env = tt.make("pstsy")
+        state, first = env.reset(jax.random.key(3))
+        return [state, first, *env.step(state, jnp.array([0, 3]))]
+
+    expected = play()
+    with jax.enable_x64(True):
+        for one, other in zip(*map(jax.tree.leaves, (play(), expected)), strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+
+
+def broken(**fields: Any) -> tt.Transfer:
+    def transfer(key, state):
+        del key
+        return state.replace(**fields)
+
+    return transfer
+
+
+def no_state(key, state):
+    del key, state
+
+
+def one_argument(state):
+    return state
+
+
+def branching(key, state):
+    del key
+    return state if state.time > 0 else tt.base_state()
+
+
+BAD_ENVIRONMENTS: list[tuple[str, dict[str, Any], list[str]]] = [
+    ("no step", {"max_steps": 0}, ["max_steps", ">= 1", "0"]),
+    ("negative steps", {"max_steps": -5}, ["max_steps", ">= 1", "-5"]),
+    ("half a step", {"max_steps": 2.5}, ["max_steps", "integer >= 1", "2.5"]),
+    ("steps a text", {"max_steps": "50"}, ["max_steps", "integer >= 1", "'50'"]),
+    ("steps a truth", {"max_steps": True}, ["max_steps", "integer >= 1", "True"]),
+    ("too many steps", {"max_steps": 10**10}, ["max_steps", "<= 2147483647", "10000000000"]),
+    ("base no state", {"base": "TrapTube-v0"}, ["trap_tube_jax.State", "str"]),
+    ("base solved", {"base": EASY.replace(agent=EASY.food)}, ["share cell (0, 3)", "apart"]),
+    ("base in play", {"base": EASY.replace(time=np.int32(3))}, ["time 3", "allowed: time 0"]),
+    ("no transfers", {"transfers": None}, ["transfers", "(key, state) -> state", "None"]),
+    ("a bare function", {"transfers": tt.symbolic}, ["transfers", "sequence", "symbolic"]),
+    ("a name", {"transfers": ("symbolic",)}, ["(key, state) -> state", "'symbolic'"]),
+    ("nothing returned", {"transfers": (no_state,)}, ["no_state", "broken", "State", "NoneType"]),
+    (
+        "one argument",
+        {"transfers": (one_argument,)},
+        ["one_argument", "a function (key, state) -> state"],
+    ),
+    ("a branch", {"transfers": (branching,)}, ["branching", "runs under jax.jit", "TracerBool"]),
+    (
+        "broken in combination",
+        {"transfers": (broken(agent=jnp.array((0, 0))), broken(food=jnp.array((0, 0))))},
+        ["broken", "share cell (0, 0)"],
+    ),
+    (
+        "agent of floats",
+        {"transfers": (broken(agent=jnp.zeros(2)),)},
+        ["broken", "state.agent", "int32[2]", "float32[2]"],
+    ),
+    (
+        "board too small",
+        {"transfers": (broken(board=jnp.zeros((9, 9), jnp.uint8)),)},
+        ["broken", "state.board", "uint8[12, 12]", "uint8[9, 9]"],
+    ),
+    (
+        "tool off the board",
+        {"transfers": (broken(tool=jnp.array((12, 0))),)},
+        ["broken", "tool", "(12, 0)", "0 to 11"],
+    ),
+    (
+        "food in a wall",
+        {"transfers": (tt.perceptual, broken(board=jnp.full((12, 12), 3, jnp.uint8)))},
+        ["broken", "stands on tube1", "allowed: ground"],
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [case[1:] for case in BAD_ENVIRONMENTS],
+    ids=[case[0] for case in BAD_ENVIRONMENTS],
+)
+def test_environment_refuses(options, words):
+    assert_refused(words, tt.Environment, **options)
+
+
+BAD_ACTIONS: list[tuple[str, Any, list[str]]] = [
+    ("one number", np.int32(3), ["integer[2]", "int32[]", "action_from_index"]),
+    ("three numbers", np.zeros(3, np.int32), ["integer[2]", "int32[3]"]),
+    ("a batch", np.zeros((5, 2), np.int32), ["integer[2]", "int32[5, 2]", "jax.vmap"]),
+    ("floats", np.zeros(2, np.float32), ["integer[2]", "float32[2]"]),
+    ("truths", np.zeros(2, bool), ["integer[2]", "bool[2]"]),
+    ("grasp too large", np.array((4, 0), np.int32), ["(4, 0)", "0 up", "3 right"]),
+    ("move below 0", np.array((0, -1), np.int32), ["(0, -1)", "0 up", "3 right"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("action", "words"), [case[1:] for case in BAD_ACTIONS], ids=[case[0] for case in BAD_ACTIONS]
+)
+def test_step_refuses(action, words):
+    assert_refused(words, tt.Environment().step, tt.base_state(), action)
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        (0, ["PRNG key", "int", "jax.random.key"]),
+        (None, ["PRNG key", "NoneType", "jax.random.key"]),
+        (jnp.zeros(2), ["PRNG key", "(2,)", "jax.random.key"]),
+        (jax.random.split(jax.random.key(0), 3), ["PRNG key", "(3,)", "jax.vmap"]),
+    ],
+    ids=["a number", "nothing", "floats", "a batch"],
+)
+def test_reset_refuses(key, words):
+    assert_refused(words, tt.Environment().reset, key)
+    assert_refused(words, tt.AutoReset(tt.Environment()).reset, key)
+
+
+def test_raw_keys_serve_as_well():
+    _, typed = tt.make("st").reset(jax.random.key(5))
+    _, raw = tt.make("st").reset(jax.random.PRNGKey(5))
+    np.testing.assert_array_equal(typed.observation, raw.observation)

@@ -1,0 +1,233 @@
+"""Graded transfers against their exact distributions, enumerated from graded.md."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import spec_reference as spec
+import trap_tube_jax as tt
+from goodness_of_fit import assert_fits
+from refusal import assert_refused
+from samples import BOARDS, OUTLINES, draw, find_boards, flat, tally
+from trap_tube_jax.graded import points_between
+
+DRAWS = 2**15
+STRENGTHS = (0.3, 0.7)
+BASE = jax.tree.map(np.asarray, tt.base_state())
+POINTS_OF = (spec.TOOL, spec.TUBE1, spec.TRAP, spec.EXIT, spec.GROUND)
+
+
+def near(distances: list[int], strength: float) -> np.ndarray:
+    """bool[n]: the outcomes no farther than the strength allows."""
+    low, high = min(distances), max(distances)
+    return np.array([distance - low <= strength * (high - low) + 1e-9 for distance in distances])
+
+
+def near_cells(cells: list[tuple[int, int]], target: Any, strength: float) -> list[tuple[int, int]]:
+    steps = [abs(row - target[0]) + abs(column - target[1]) for row, column in cells]
+    return [cell for cell, is_near in zip(cells, near(steps, strength), strict=True) if is_near]
+
+
+@functools.cache
+def layout_chances(strength: float) -> np.ndarray:
+    """[outline, variant, vertical]: the chances of board and direction of the tool."""
+    own_shape = {(row, 0) for row in range(4)}
+    distances, chances = [], []
+    for (outline, chance), boards in zip(spec.outlines().items(), BOARDS, strict=True):
+        for board in boards:
+            for vertical in (False, True):
+                shape = spec.tool_cells(outline, vertical, (0, 0))
+                distances.append(int(np.sum(board != BASE.board)) + len(shape ^ own_shape))
+                chances.append(chance / 16)
+    weights = np.array(chances) * near(distances, strength)
+    return (weights / weights.sum()).reshape(9, 8, 2)
+
+
+@functools.cache
+def placements(strength: float) -> np.ndarray:
+    """[outline, vertical, tool, agent]: the joint chances."""
+    table = np.zeros((9, 2, 144, 144))
+    by_frame = layout_chances(strength).sum(axis=1)
+    for index, outline in enumerate(OUTLINES):
+        for vertical in (False, True):
+            corners = near_cells(spec.tool_corners(outline, vertical), BASE.tool, strength)
+            for corner in corners:
+                cells = spec.agent_cells(outline, vertical, corner)
+                cells = near_cells(cells, BASE.agent, strength)
+                chance = by_frame[index, int(vertical)] / len(corners) / len(cells)
+                where = (index, int(vertical), spec.flat(corner), [spec.flat(c) for c in cells])
+                table[where] = chance
+    return table
+
+
+class Drawn(NamedTuple):
+    """What was drawn, each i64[n]; cells as flat indices."""
+
+    outline: np.ndarray
+    variant: np.ndarray
+    vertical: np.ndarray
+    tool: np.ndarray
+    agent: np.ndarray
+    food: np.ndarray
+
+
+@functools.cache
+def layouts(strength: float) -> Drawn:
+    drawn = draw(tt.graded_perceptual(strength), 1, tt.base_state(), DRAWS)
+    index = find_boards(drawn.board)
+    assert np.all(index >= 0), "a board that environment.md does not allow"
+    outline, variant = np.divmod(index, 8)
+    vertical = (drawn.tool_extent[:, 0] > 1).astype(int)
+    sizes = np.array(OUTLINES)[outline, :2]
+    length = np.where(vertical, sizes[:, 0], sizes[:, 1])
+    np.testing.assert_array_equal(drawn.tool_extent.max(axis=1), length)
+    return Drawn(outline, variant, vertical, *map(flat, (drawn.tool, drawn.agent, drawn.food)))
+
+
+@pytest.mark.parametrize("strength", STRENGTHS)
+def test_boards_and_food(strength):
+    drawn = layouts(strength)
+    chances = np.zeros((9, 8, 2, 144))
+    for index, outline in enumerate(OUTLINES):
+        cells = near_cells(spec.food_cells(outline), BASE.food, strength)
+        share = layout_chances(strength)[index, ..., None] / len(cells)
+        chances[index][..., [spec.flat(cell) for cell in cells]] = share
+    counts = tally(chances.shape, drawn.outline, drawn.variant, drawn.vertical, drawn.food)
+    assert np.all(counts[chances > 0] > 0)
+    assert_fits(counts, chances)
+
+
+@pytest.mark.parametrize("strength", STRENGTHS)
+def test_tool_and_agent(strength):
+    drawn, chances = layouts(strength), placements(strength)
+    where = (drawn.outline, drawn.vertical, drawn.tool, drawn.agent)
+    assert np.all(chances[where] > 0), "an agent outside the support"
+    by_tool, by_agent = chances.sum(axis=3), chances.sum(axis=2)
+    counts = tally(by_tool.shape, *where[:3])
+    assert np.all(counts[by_tool * DRAWS > 20] > 0)
+    assert_fits(counts, by_tool)
+    assert_fits(tally(by_agent.shape, drawn.outline, drawn.vertical, drawn.agent), by_agent)
+
+
+def test_what_is_drawn_can_be_drawn_at_any_higher_strength():
+    drawn = layouts(STRENGTHS[0])
+    for strength in (0.5, STRENGTHS[1], 1.0):
+        assert np.all(layout_chances(strength)[drawn.outline, drawn.variant, drawn.vertical] > 0)
+        where = (drawn.outline, drawn.vertical, drawn.tool, drawn.agent)
+        assert np.all(placements(strength)[where] > 0)
+    np.testing.assert_allclose(placements(1.0), spec.placements())
+
+
+def test_the_ends_are_the_base_task_and_the_papers_transfers():
+    assert tt.graded_perceptual(1) is tt.perceptual
+    assert tt.graded_structural(1.0) is tt.structural
+    other = tt.State.from_ascii(["A" + "." * 11, "TT" + "." * 9 + "F", *["." * 12] * 10])
+    drawn = draw(tt.graded_perceptual(0), 2, other, 100)
+    for name in ("board", "agent", "tool", "tool_extent", "food"):
+        base = getattr(BASE, name)
+        np.testing.assert_array_equal(
+            getattr(drawn, name), np.broadcast_to(base, (100, *base.shape))
+        )
+
+
+@pytest.mark.parametrize("num_features", [1, 2, 3, 8])
+def test_structural_of_strength_0_keeps_every_palette(num_features):
+    features = np.arange(256).repeat(num_features).reshape(32, 8, num_features)
+    transfer = tt.graded_structural(0)
+    for palette in (*features.astype(np.uint8), np.asarray(tt.base_state(num_features).palette)):
+        state = tt.base_state(num_features).replace(palette=jnp.asarray(palette))
+        drawn = draw(transfer, 3, state, 20)
+        np.testing.assert_array_equal(drawn.palette, np.broadcast_to(palette, drawn.palette.shape))
+
+
+def directions(palette: np.ndarray) -> np.ndarray:
+    """f64[..., N]: the middle of what becomes each feature, scaled to length 1."""
+    points = (palette.astype(float) + 0.5) / 255 * 2 - 1
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+@functools.cache
+def palettes(strength: float) -> np.ndarray:
+    return draw(tt.graded_structural(strength), 4, tt.base_state(), DRAWS).palette
+
+
+@pytest.mark.parametrize("strength", STRENGTHS)
+@pytest.mark.parametrize("code", POINTS_OF)
+def test_structural_angles(strength, code):
+    """An angle theta from 0 to pi has density sin(theta) / 2, and here it is scaled."""
+    own = directions(BASE.palette[code])
+    angles = np.arccos(directions(palettes(strength)[:, code]) @ own)
+    limit = strength * np.pi
+    assert angles.max() < limit + 0.02
+    edges = np.linspace(0, limit, 11)
+    counts = np.histogram(angles.clip(max=limit), edges)[0]
+    assert_fits(counts, -np.diff(np.cos(edges / strength)) / 2)
+
+
+@pytest.mark.parametrize("strength", STRENGTHS)
+def test_structural_goes_to_every_side(strength):
+    """Around the state's own point, no direction is preferred."""
+    own = directions(BASE.palette[spec.TOOL])
+    first = np.linalg.svd(own[None])[2][1:]  # two vectors orthogonal to it and each other
+    sides = directions(palettes(strength)[:, spec.TOOL]) @ first.T
+    turns = np.arctan2(sides[:, 0], sides[:, 1]) / (2 * np.pi) % 1
+    assert_fits(np.bincount((turns * 12).astype(int), minlength=12), np.full(12, 1 / 12))
+
+
+@pytest.mark.parametrize("num_features", [1, 2, 3, 8])
+def test_structural_goes_along_the_great_circle(num_features):
+    """Linear in the strength: the angle and the distance from the centre."""
+    rng = np.random.default_rng(5)
+    own = rng.uniform(-1, 1, (50, num_features))
+    drawn = rng.normal(size=(50, num_features))
+    drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+    radius = np.linalg.norm(own, axis=1)
+    whole = np.arccos((np.sum(own * drawn, axis=1) / radius).clip(-1, 1))
+    for strength in (0, 0.2, 0.6, 1):
+        points = np.asarray(points_between(jnp.asarray(own), jnp.asarray(drawn), strength))
+        if num_features == 1:
+            np.testing.assert_allclose(points, own + strength * (drawn - own), atol=1e-5)
+            continue
+        length = np.linalg.norm(points, axis=1)
+        np.testing.assert_allclose(length, radius + strength * (1 - radius), atol=1e-5)
+        turned = np.arccos((np.sum(own * points, axis=1) / radius / length).clip(-1, 1))
+        rest = np.arccos((np.sum(drawn * points, axis=1) / length).clip(-1, 1))
+        np.testing.assert_allclose(turned, strength * whole, atol=2e-3)
+        np.testing.assert_allclose(turned + rest, whole, atol=2e-3)
+
+
+def test_structural_goes_straight_from_the_centre():
+    drawn = np.array([[0.6, 0.8, 0], [0, 0, -1]], np.float32)
+    points = points_between(jnp.zeros((2, 3)), jnp.asarray(drawn), 0.25)
+    np.testing.assert_allclose(points, drawn / 4, atol=1e-6)
+
+
+def test_structural_leaves_agent_and_food_and_the_tubes_alike():
+    drawn = palettes(0.7)
+    np.testing.assert_array_equal(drawn[:, spec.TUBE1], drawn[:, spec.TUBE2])
+    for code in (spec.AGENT, spec.FOOD):
+        assert np.all(drawn[:, code] == BASE.palette[code])
+
+
+@pytest.mark.parametrize("transfer", [tt.graded_perceptual(0.4), tt.graded_structural(0.4)])
+def test_the_same_jitted_vmapped_and_in_an_environment(transfer):
+    start, keys = tt.base_state(), jax.random.split(jax.random.key(6), 64)
+    states = jax.jit(jax.vmap(transfer, (0, None)))(keys, start)
+    for index in (0, 63):
+        row = jax.tree.map(lambda leaf, i=index: leaf[i], states)
+        jax.tree.map(np.testing.assert_array_equal, row, transfer(keys[index], start))
+    env = tt.Environment((transfer,))
+    assert repr(env).startswith(f"Environment(transfers=({transfer.__name__})")
+    assert transfer.__name__.endswith(" 0.4")
+    state, _ = env.reset(jax.random.key(0))
+    tt.validate(state)
+
+
+@pytest.mark.parametrize("factory", [tt.graded_perceptual, tt.graded_structural])
+@pytest.mark.parametrize("strength", [-0.1, 1.01, float("nan"), "1", True, None])
+def test_other_strengths_are_refused(factory, strength):
+    assert_refused(["strength", "from 0 to 1", repr(strength)], factory, strength)

@@ -1,0 +1,120 @@
+"""What the agent sees, for any number of feature channels, and pictures for people."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import spec_reference as spec
+import trap_tube_jax as tt
+
+FEATURES = (1, 2, 3, 4, 5, 8, 16)
+
+
+@pytest.fixture(scope="module")
+def scattered() -> list[tt.State]:
+    """States with everything anywhere, one thing over another included."""
+    random = np.random.default_rng(7)
+    states = []
+    for _ in range(200):
+        length = random.integers(1, 5)
+        extent = (length, 1) if random.random() < 0.5 else (1, length)
+        tool = random.integers(0, 13 - np.array(extent))
+        beside_tool = np.clip(tool + random.integers(-1, 2, (2, 2)), 0, 11)
+        agent, food = np.where(random.random((2, 1)) < 0.5, beside_tool, random.integers(0, 12))
+        fields = {
+            "board": random.integers(0, 5, (12, 12)).astype(np.uint8),
+            "palette": random.integers(0, 256, (8, 3)).astype(np.uint8),
+            "agent": agent.astype(np.int32),
+            "tool": tool.astype(np.int32),
+            "tool_extent": np.array(extent, np.int32),
+            "food": food.astype(np.int32),
+        }
+        states.append(tt.base_state().replace(**fields))
+    return states
+
+
+def expected_objects(state: tt.State) -> np.ndarray:
+    board = np.asarray(state.board)
+    return spec.visible(board, state.agent, state.tool, state.tool_extent, state.food)
+
+
+def test_later_objects_hide_earlier_ones(scattered):
+    visible_objects, observe = jax.jit(tt.visible_objects), jax.jit(tt.observe)
+    hidden = 0
+    for state in scattered:
+        expected = expected_objects(state)
+        objects, observation = visible_objects(state), observe(state)
+        np.testing.assert_array_equal(objects, expected)
+        np.testing.assert_array_equal(observation, np.asarray(state.palette)[expected])
+        assert (objects.dtype, observation.dtype) == (np.uint8, np.uint8)
+        hidden += spec.FOOD not in expected
+    assert hidden > 20
+
+
+def test_ascii_pictures_read_back():
+    picture = tt.render_ascii(tt.base_state())
+    assert picture.splitlines()[5] == ".T..xF.e...."
+    again = tt.State.from_ascii(picture)
+    jax.tree.map(np.testing.assert_array_equal, again, tt.base_state())
+
+
+def test_ascii_pictures_show_the_topmost_objects(scattered):
+    for state in scattered[:20]:
+        rows = tt.render_ascii(state).splitlines()
+        shown = np.array([[".xe12FTA".index(char) for char in row] for row in rows])
+        np.testing.assert_array_equal(shown, expected_objects(state))
+
+
+def test_three_features_are_the_base_colors():
+    np.testing.assert_array_equal(tt.base_palette(3), spec.BASE_COLORS)
+    np.testing.assert_array_equal(tt.base_palette(), spec.BASE_COLORS)
+    assert tt.base_palette().dtype == np.uint8
+
+
+@pytest.mark.parametrize("num_features", [number for number in FEATURES if number > 1])
+def test_more_or_fewer_features_repeat_or_drop_colors(num_features):
+    palette = tt.base_palette(num_features)
+    assert (palette.shape, palette.dtype) == ((8, num_features), np.uint8)
+    for channel in range(num_features):
+        np.testing.assert_array_equal(palette[:, channel], spec.BASE_COLORS[:, channel % 3])
+
+
+def test_one_feature_is_the_luma():
+    luma = [0.299 * r + 0.587 * g + 0.114 * b for r, g, b in spec.BASE_COLORS.tolist()]
+    np.testing.assert_array_equal(tt.base_palette(1)[:, 0], np.round(luma))
+
+
+@pytest.mark.parametrize("num_features", FEATURES)
+def test_objects_differ_for_any_number_of_features(num_features):
+    palette = tt.base_palette(num_features)
+    np.testing.assert_array_equal(palette[spec.TUBE1], palette[spec.TUBE2])
+    distinct = {tuple(row) for row in palette.tolist()}
+    assert len(distinct) == 7
+
+
+@pytest.mark.parametrize("num_features", [1, 2, 5])
+def test_any_number_of_features_works_end_to_end(num_features):
+    env = tt.make("stsy", num_features=num_features)
+
+    @jax.jit
+    def reset_and_step(key, action):
+        state, first = env.reset(key)
+        return state, first.observation, env.step(state, action)[1].observation
+
+    state, first, second = reset_and_step(jax.random.key(0), jnp.array((0, 1)))
+    described = env.observation_spec
+    assert described.shape == (12, 12, num_features)
+    assert (described.minimum, described.maximum) == (0, 255)
+    for observation in (first, second):
+        assert (observation.shape, observation.dtype) == (described.shape, described.dtype)
+    np.testing.assert_array_equal(first, np.asarray(state.palette)[expected_objects(state)])
+
+
+@pytest.mark.parametrize("num_features", FEATURES)
+def test_a_picture_is_drawn_for_any_number_of_features(num_features):
+    picture = np.asarray(tt.render(tt.base_state(num_features), 8))
+    assert (picture.shape, picture.dtype) == ((96, 96, 3), np.uint8)
+    cells = picture.reshape(12, 8, 12, 8, 3)[:, 1:-1, :, 1:-1]
+    looks = {cells[row, :, column].tobytes() for row in range(12) for column in range(12)}
+    assert len(looks) >= 7

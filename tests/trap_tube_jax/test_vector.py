@@ -1,0 +1,131 @@
+"""The fast path against its plain reference, `jax.vmap` of an `AutoReset`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from refusal import assert_refused
+from trap_tube_jax.vector import VectorEnvironment, draw_movable, draw_static
+
+OPTIMISED = False  # few environments, few steps
+NUM_ENVS = 24
+NUM_STEPS = 16
+MAX_STEPS = 5
+
+
+def rollout(reset, step):
+    """Runs fixed actions through an environment of NUM_ENVS and returns all it says."""
+    keys = jax.random.split(jax.random.key(3), NUM_ENVS)
+    actions = jax.random.randint(jax.random.key(4), (NUM_STEPS, NUM_ENVS, 2), 0, 4)
+    state, first = reset(keys)
+    state, timesteps = jax.lax.scan(step, state, actions)
+    return state, first, timesteps
+
+
+def stagger(episodes):
+    """The same episodes at different times, so that only some end together."""
+    time = jnp.arange(NUM_ENVS, dtype=jnp.int32) % MAX_STEPS
+    return episodes.replace(inner=episodes.inner.replace(time=time))
+
+
+def run_fast(env, chunk_size):
+    fast = VectorEnvironment(env, chunk_size=chunk_size)
+
+    def reset(keys):
+        state, timestep = fast.reset(keys)
+        return state.replace(episodes=stagger(state.episodes)), timestep
+
+    state, first, timesteps = jax.jit(lambda: rollout(reset, fast.step))()
+    return state.episodes, first, timesteps
+
+
+def run_plain(env):
+    plain = tt.AutoReset(env)
+
+    def reset(keys):
+        episodes, timestep = jax.vmap(plain.reset)(keys)
+        return stagger(episodes), timestep
+
+    return jax.jit(lambda: rollout(reset, jax.vmap(plain.step)))()
+
+
+def as_numpy(tree):
+    def convert(leaf):
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+
+    return jax.tree.map(convert, tree)
+
+
+@pytest.mark.parametrize(
+    ("task_set", "num_features", "chunk_size"),
+    [
+        ("pstsy", 3, 3),
+        ("base", 1, 64),
+        pytest.param("st", 9, 1, marks=pytest.mark.slow),
+    ],
+)
+def test_equals_the_plain_reference_in_every_bit(task_set, num_features, chunk_size):
+    env = tt.make(task_set, num_features=num_features, max_steps=MAX_STEPS)
+    fast = as_numpy(run_fast(env, chunk_size))
+    plain = as_numpy(run_plain(env))
+    ends = plain[2].truncated.sum(axis=1)
+    assert 0 < ends.min(), "every step must end some episode"
+    assert ends.max() < NUM_ENVS, "no step may end all"
+    jax.tree.map(np.testing.assert_array_equal, fast, plain)
+
+
+def test_a_success_starts_over_with_its_reward_and_last_observation():
+    base = tt.State.from_ascii(["AF.........T"] + ["............"] * 11)
+    fast = VectorEnvironment(tt.Environment((tt.structural,), base=base))
+    state, first = jax.jit(fast.reset)(jax.random.split(jax.random.key(0), 2))
+    actions = jnp.array([[0, 3], [0, 1]])  # the first steps right onto the food
+    state, timestep = jax.jit(fast.step)(state, actions)
+    np.testing.assert_array_equal(timestep.reward, [1, 0])
+    np.testing.assert_array_equal(timestep.terminated, [True, False])
+    np.testing.assert_array_equal(state.episodes.inner.time, [0, 1])
+    np.testing.assert_array_equal(state.episodes.inner.agent, [[0, 0], [1, 0]])
+    agent_color = np.asarray(base.palette[7])
+    np.testing.assert_array_equal(timestep.final_observation[0, 0, 1], agent_color)
+    np.testing.assert_array_equal(timestep.observation[0, 0, 0], agent_color)
+    assert np.any(timestep.observation[0] != first.observation[0]), "a task of a new palette"
+
+
+@pytest.mark.parametrize("num_features", [2, 3, 9])
+def test_draws_what_observe_shows(num_features):
+    env = tt.make("pstsy", num_features=num_features)
+    keys = jax.random.split(jax.random.key(num_features), 32)
+    state, timestep = jax.jit(jax.vmap(env.reset))(keys)
+    drawn = jax.jit(jax.vmap(lambda s: draw_movable(s, draw_static(s))))(state)
+    np.testing.assert_array_equal(drawn.reshape(timestep.observation.shape), timestep.observation)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"chunk_size": 0}, "chunk_size must be an integer >= 1, got 0"),
+        ({"chunk_size": 2.0}, "chunk_size must be an integer >= 1, got 2.0"),
+        ({"chunk_size": True}, "chunk_size must be an integer >= 1, got True"),
+    ],
+)
+def test_refuses_bad_chunk_sizes(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        VectorEnvironment(tt.make("base"), **arguments)
+
+
+def test_refuses_a_wrapped_environment():
+    with pytest.raises(ValueError, match=r"must be a trap_tube_jax\.Environment, got AutoReset"):
+        VectorEnvironment(tt.AutoReset(tt.make("base")))  # pyright: ignore[reportArgumentType]
+
+
+def test_refuses_one_key_and_what_is_not_its_state():
+    vector, keys = VectorEnvironment(tt.make("base")), jax.random.split(jax.random.key(0), 3)
+    for key in (keys[0], jax.random.PRNGKey(0), 0):
+        assert_refused(["reset takes PRNG keys [B]", "jax.random.split"], vector.reset, key)
+    state, timestep = jax.eval_shape(vector.reset, keys)
+    actions = np.zeros((3, 2), np.int32)
+    words = ["VectorState, got AutoResetTimeStep", "return (state, timestep)"]
+    assert_refused(words, vector.step, timestep, actions)
+    assert_refused(["actions must be integer[3, 2], got"], vector.step, state, actions[:2])

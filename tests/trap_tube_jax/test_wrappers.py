@@ -1,0 +1,135 @@
+"""Starting over and counting: the wrappers `AutoReset` and `EpisodeStatistics`."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from easy import DOWN, EASY, RIGHT, assert_same, rows
+from refusal import assert_refused
+
+LIMIT, TURNS, ROWS = 6, 40, 256
+
+
+class Turns(NamedTuple):
+    """An auto-resetting environment with statistics: NumPy arrays [time, row, ...]."""
+
+    before: tt.State
+    action: np.ndarray
+    after: tt.State
+    timestep: Any
+    statistics: Any
+
+
+@pytest.fixture(scope="module")
+def auto_reset() -> Turns:
+    """Many short episodes [time, row], of which some succeed and every one looks different."""
+    env = tt.Environment((tt.structural,), base=EASY, max_steps=LIMIT)
+    counted = tt.EpisodeStatistics(tt.AutoReset(env))
+
+    def turn(state, action):
+        after, timestep = jax.vmap(counted.step)(state, action)
+        statistics = after.replace(inner=None)
+        return after, Turns(state.inner.inner, action, after.inner.inner, timestep, statistics)
+
+    @jax.jit
+    def run(key):
+        reset_key, action_key = jax.random.split(key)
+        state, first = jax.vmap(counted.reset)(jax.random.split(reset_key, ROWS))
+        actions = jax.random.randint(action_key, (TURNS, ROWS, 2), 0, 4)
+        return first, jax.lax.scan(turn, state, actions)[1]
+
+    first, turns = jax.tree.map(np.asarray, run(jax.random.key(3)))
+    np.testing.assert_array_equal(first.observation, first.final_observation)
+    ends = turns.timestep.terminated.sum(), turns.timestep.truncated.sum()
+    assert min(ends) > 100
+    return turns
+
+
+def test_auto_reset_takes_the_plain_step_first(auto_reset):
+    env = tt.Environment(base=EASY, max_steps=LIMIT)
+    step = jax.jit(jax.vmap(jax.vmap(env.step)))
+    plain, timestep = step(auto_reset.before, auto_reset.action)
+    for name in ("reward", "terminated", "truncated", "discount"):
+        np.testing.assert_array_equal(
+            getattr(auto_reset.timestep, name), getattr(timestep, name), err_msg=name
+        )
+    np.testing.assert_array_equal(auto_reset.timestep.final_observation, timestep.observation)
+    going_on = ~np.asarray(timestep.done)
+    assert_same(rows(auto_reset.after, going_on), rows(plain, going_on))
+
+
+def test_auto_reset_shows_the_next_episode_where_one_ended(auto_reset):
+    after, timestep = auto_reset.after, auto_reset.timestep
+    shown = jax.jit(jax.vmap(jax.vmap(tt.observe)))(after)
+    np.testing.assert_array_equal(timestep.observation, shown)
+    done = np.asarray(timestep.done)
+    fresh = rows(after, done)
+    np.testing.assert_array_equal(fresh.time, 0)
+    np.testing.assert_array_equal(fresh.agent, np.broadcast_to(EASY.agent, fresh.agent.shape))
+    assert not np.any(fresh.terminated | fresh.truncated)
+    looks = np.asarray(fresh.palette).reshape(done.sum(), -1)
+    assert len(np.unique(looks, axis=0)) == done.sum()
+
+
+def test_episode_statistics_count_what_happened(auto_reset):
+    done, reward = auto_reset.timestep.done, auto_reset.timestep.reward
+    for row in range(ROWS):
+        length, total, episodes, last = 0, 0.0, 0, (0, 0.0)
+        for time in range(TURNS):
+            length, total = length + 1, total + reward[time, row]
+            if done[time, row]:
+                episodes, last, length, total = episodes + 1, (length, total), 0, 0.0
+            counted = rows(auto_reset.statistics, (time, row))
+            assert (counted.last_length, counted.last_return) == last
+            assert (counted.running_length, counted.running_return) == (length, total)
+            assert counted.episodes == episodes
+
+
+def test_episode_statistics_around_a_bare_environment_count_one_episode():
+    env = tt.EpisodeStatistics(tt.Environment(base=EASY, max_steps=9))
+    step = jax.jit(env.step)
+    state, _ = env.reset(jax.random.key(0))
+    for _ in range(5):
+        state, _ = step(state, RIGHT)
+    assert (state.episodes, state.last_length, state.last_return) == (1, 2, 1)
+
+
+def test_episode_statistics_of_a_vector_count_each_environment():
+    fast = tt.EpisodeStatistics(tt.VectorEnvironment(tt.Environment(base=EASY, max_steps=3)))
+
+    @jax.jit
+    def run(keys):
+        state, _ = fast.reset(keys)
+        actions = jnp.broadcast_to(jnp.stack([RIGHT, DOWN]), (6, 2, 2))
+        return jax.lax.scan(fast.step, state, actions)[0]
+
+    state = run(jax.random.split(jax.random.key(0), 2))
+    np.testing.assert_array_equal(state.episodes, [3, 2])
+    np.testing.assert_array_equal(state.last_length, [2, 3])
+    np.testing.assert_array_equal(state.last_return, [1, 0])
+
+
+def test_statistics_go_around_what_starts_over():
+    with pytest.raises(ValueError, match=r"allowed: EpisodeStatistics\(AutoReset\(env\)\)"):
+        tt.AutoReset(tt.EpisodeStatistics(tt.Environment()))
+
+
+@pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
+def test_auto_reset_refuses_what_starts_over_by_itself(wrapper):
+    env = wrapper(tt.Environment())
+    words = [wrapper.__name__, "starts over by itself", "trap_tube_jax.Environment"]
+    assert_refused(words, tt.AutoReset, env)
+    assert_refused(["starts over by itself"], tt.AutoReset, tt.EpisodeStatistics(env))
+
+
+@pytest.mark.parametrize("wrap", [tt.AutoReset, tt.EpisodeStatistics])
+def test_a_state_of_another_kind_is_refused(wrap):
+    env = wrap(tt.make("base"))
+    _, timestep = env.reset(jax.random.key(0))
+    for state in (timestep, tt.base_state()):
+        words = [f"{wrap.__name__}State, got {type(state).__name__}", "return (state, timestep)"]
+        assert_refused(words, env.step, state, jnp.array([DOWN, RIGHT]))
