@@ -11,11 +11,12 @@ from rich.console import Console
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.acting.policy import Policy
+from agents.command_line import Flag, Imports
 from agents.pretrained import load_shipped
 from agents.runs import compilation, report
 from agents.runs.folder import write_json
 from agents.runs.loading import load_policies
-from trap_tube_jax.command_line import Flag, Imports, plain_errors
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.solver import solve_batch
 

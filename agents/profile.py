@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from agents.acting.policy import Policy
+from agents.command_line import Imports
 from agents.experiments.records import check_clean, read_record
 from agents.pretrained import load_shipped
 from agents.profiles import figures, tables
@@ -18,7 +19,7 @@ from agents.profiles.measure import SCHEMA, Settings, profile
 from agents.runs import compilation
 from agents.runs.folder import RunFolder, read_json, write_json
 from agents.runs.loading import load_policy
-from trap_tube_jax.command_line import Imports, plain_errors
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import import_modules
 
 PROGRAM = "python -m agents.profile"

@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
+from agents.command_line import Imports
 from agents.config import PRESETS, Config
 from agents.experiments import figures, workers
 from agents.experiments.protocol import parse_value
@@ -24,7 +25,7 @@ from agents.runs.folder import check_name, is_done, write_json
 from agents.runs.results import results
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
 from agents.runs.table import Table
-from trap_tube_jax.command_line import Imports, plain_errors
+from trap_tube_jax.command_line import plain_errors
 
 PERCENT = "percent_"
 
@@ -86,8 +87,7 @@ class Options:
             raise ValueError(f"a setting may be given only once, got {' '.join(self.settings)}")
         if self.env is not None and "env_id" in values:
             raise ValueError(f"give --env {self.env} or the setting env_id, not both")
-        given: dict[str, Any] = {"imports": self.imports} if self.imports else {}
-        given |= {} if self.env is None else {"env_id": self.env}
+        given = {} if self.env is None else {"env_id": self.env}
         configs = {}
         for point in itertools.product(*values.values()):
             settings = dict(zip(values, point, strict=True))

@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
+from agents.command_line import Flag, Imports
 from agents.config import PRESETS, Config
 from agents.parallel import processes
 from agents.parallel.cores import become_devices
@@ -21,7 +22,7 @@ from agents.runs import compilation
 from agents.runs.folder import Run, RunFolder, check_name
 from agents.runs.session import Session
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
-from trap_tube_jax.command_line import Flag, Imports, plain_errors
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import import_modules
 
 PROGRAM = "python -m agents.train"
@@ -62,7 +63,6 @@ class Selection(processes.Job):
 class Settings(Config):
     """`Config`, of which no option gives what `Selection` gives."""
 
-    imports: Annotated[tuple[str, ...], tyro.conf.Suppress]
     env_id: Annotated[str, tyro.conf.Suppress]
 
 
@@ -171,7 +171,6 @@ def take_up(options: Options, folder: RunFolder, run: Run, console: Console) -> 
     Raises:
       ValueError: the run cannot be trained or continued.
     """
-    import_modules(run.config.imports)  # in the processes that were told of the run
     compilation.enable_cache()
     session = Session(
         folder,
@@ -225,8 +224,8 @@ def parse(selection: Selection, arguments: Sequence[str]) -> tuple[Run | None, O
       ValueError: a value is not allowed.
     """
     given: dict[str, Any] = {} if selection.env is None else {"env_id": selection.env}
-    own = {"imports": selection.imports} if selection.imports else {}
-    config = Config.preset(selection.preset, **given, **own)
+    import_modules(selection.imports)
+    config = Config.preset(selection.preset, **given)
     stored, defaults = None, Options(preset=selection.preset, config=config)
     path = run_path(selection, config.env_id)
     if selection.resume:
@@ -241,7 +240,7 @@ def parse(selection: Selection, arguments: Sequence[str]) -> tuple[Run | None, O
             preset=stored.preset,
             seed=stored.seed,
             seeds=stored.seeds,
-            config=dataclasses.replace(stored.config, **own),
+            config=stored.config,
         )
     options = tyro.cli(
         Options, args=arguments, prog=PROGRAM, default=defaults, config=(tyro.conf.OmitArgPrefixes,)

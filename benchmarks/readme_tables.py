@@ -26,11 +26,11 @@ import tyro
 import agents.profiles.figures
 import agents.profiles.tables
 import benchmarks.tables
+from agents.command_line import Flag
 from agents.experiments import figures, tables
 from agents.experiments.records import SCHEMA, Record, read_record
 from agents.profiles import measure
 from benchmarks import harness, scaling
-from trap_tube_jax.command_line import Flag
 
 ROOT = Path(__file__).parent.parent
 PAGES = ("*.md", "agents/**/*.md", "benchmarks/**/*.md", "trap_tube_jax/**/*.md")

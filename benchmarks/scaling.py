@@ -167,7 +167,7 @@ def main(arguments: Arguments) -> list[Point]:
     harness.check_counts(arguments.num_envs)
     for seeds in arguments.seeds:
         check_integer("seeds", seeds)
-    minibatch = Config.preset("fast").minibatch
+    minibatch = Config.preset("fast").minibatch_size
     harness.check_multiples("episodes", arguments.episodes, "minibatch", minibatch)
     harness.check_recordable(arguments.json)
     console = Console()

@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 from agents.acting.rollout import sample_action
+from agents.command_line import Flag
 from agents.config import PRESETS, Config
 from agents.networks.actions import ActionDistribution
 from agents.parallel.sharding import Placement
@@ -25,7 +26,7 @@ from agents.ppo.learner import make_train
 from agents.runs.programs import Programs
 from agents.runs.table import Table, number
 from benchmarks import harness
-from trap_tube_jax.command_line import Flag, plain_errors
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
 from trap_tube_jax.registry import task_set
 
@@ -135,7 +136,9 @@ def compiled_exchanges(config: Config, devices: int) -> list[Exchange]:
 def share_seconds(config: Config, devices: int) -> float:
     """Seconds of an iteration of 1 / `devices` of the episodes and of every minibatch."""
     share = dataclasses.replace(
-        config, episodes=config.episodes // devices, minibatch=config.minibatch // devices
+        config,
+        episodes=config.episodes_per_iteration // devices,
+        minibatch=config.minibatch_size // devices,
     )
     train = make_train(share)
     state = jax.jit(train.init)(jax.random.key(0))
@@ -148,7 +151,7 @@ def repeated_seconds(config: Config) -> float:
     curiosity = "counts" if config.curiosity == "counts" else "none"
     train = make_train(dataclasses.replace(config, curiosity=curiosity))
     state = jax.jit(train.init)(jax.random.key(0))
-    logits = jnp.zeros((config.episodes, NUM_DIRECTIONS))
+    logits = jnp.zeros((config.episodes_per_iteration, NUM_DIRECTIONS))
     step_keys = jax.random.split(jax.random.key(2), train.env.max_steps)
 
     @jax.jit
@@ -157,7 +160,7 @@ def repeated_seconds(config: Config) -> float:
         actions = jax.lax.map(lambda key: sample_action(key, distribution), step_keys)
         return actions, train.prepare(state, trajectory)
 
-    reset_keys = jax.random.split(jax.random.key(1), config.episodes)
+    reset_keys = jax.random.split(jax.random.key(1), config.episodes_per_iteration)
     trajectory = jax.jit(train.play)(state.params, reset_keys, jax.random.key(3))
     return harness.measure(lambda: repeat(trajectory)).median_s
 
@@ -166,8 +169,10 @@ def speed_up_rows(
     options: Options, config: Config, found: Sequence[Exchange]
 ) -> list[dict[str, float | int | None]]:
     """The model for 1 to `SEEDS` x minibatch devices, powers of two."""
-    updates = config.epochs * config.episodes // config.minibatch
-    counts = [2**n for n in range(config.minibatch.bit_length()) if config.minibatch % 2**n == 0]
+    updates = config.epochs * config.episodes_per_iteration // config.minibatch_size
+    counts = [
+        2**n for n in range(config.minibatch_size.bit_length()) if config.minibatch_size % 2**n == 0
+    ]
     repeated = repeated_seconds(config)
     times, rows = {}, []
     for devices in counts:

@@ -100,7 +100,7 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     for _ in range(warm):
         state, _ = iterate(state)
     reset_key, action_key = jax.random.split(state.key)
-    reset_keys = jax.random.split(reset_key, config.episodes)
+    reset_keys = jax.random.split(reset_key, config.episodes_per_iteration)
 
     def play(train: Learner, state: TrainState) -> Trajectory:
         return train.play(state.params, reset_keys, action_key)
@@ -130,7 +130,7 @@ def useful_flop(train: Learner, state: TrainState, batch: Batch) -> Flop:
     def step(params: Params, features: jax.Array) -> Any:
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
         first = agent.initial_state(params, 1)
-        return agent.act(params, agent.step(params, first, features, action, reward))
+        return agent.policy_and_value(params, agent.step(params, first, features, action, reward))
 
     board = batch.episodes.observations()[0, :1]
     per_observation = matrix_flop(jax.make_jaxpr(agent.encode)(state.params, board))
@@ -179,8 +179,8 @@ def matrix_product_flops() -> float:
 def _minibatches(config: Config) -> jax.Array:
     """i32[epochs * minibatches, minibatch]: episodes, shuffled anew in each epoch."""
     keys = jax.random.split(jax.random.key(0), config.epochs)
-    orders = jax.vmap(lambda key: jax.random.permutation(key, config.episodes))(keys)
-    return orders.reshape(-1, config.minibatch)
+    orders = jax.vmap(lambda key: jax.random.permutation(key, config.episodes_per_iteration))(keys)
+    return orders.reshape(-1, config.minibatch_size)
 
 
 def _distinct_per_epoch(config: Config, batch: Batch) -> jax.Array:
@@ -210,7 +210,7 @@ def _encoder_only(train: Learner, state: TrainState, batch: Batch) -> Params:
             {"encoder": params["encoder"]},
             part.episodes,
             part.observation_id,
-            chunk=train.config.chunk,
+            chunk=train.config.encode_chunk_size,
         )
         return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
 
@@ -239,7 +239,7 @@ def _core_only(train: Learner, state: TrainState, batch: Batch, trajectory: Traj
             own = train.curiosity.losses(params["curiosity"], experience)
         else:
             embedding, own = agent.unroll(*given), {}
-        everything = jax.tree.leaves((agent.act(params, embedding), own))
+        everything = jax.tree.leaves((agent.policy_and_value(params, embedding), own))
         return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 
     def gradient(episodes: jax.Array) -> Params:
@@ -261,7 +261,9 @@ def _optimizer_only(train: Learner, state: TrainState) -> Params:
         updates, opt_state = optimizer.update(params, opt_state, params)
         return (jax.tree.map(jnp.add, params, updates), opt_state), None
 
-    steps = train.config.epochs * (train.config.episodes // train.config.minibatch)
+    steps = train.config.epochs * (
+        train.config.episodes_per_iteration // train.config.minibatch_size
+    )
     return jax.lax.scan(update, (state.params, state.opt_state), jnp.arange(steps))[0][0]
 
 

@@ -110,7 +110,7 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
     cells = replay(initial, action)
     features = jax.vmap(lambda image: agent.encode(params, image))(jnp.asarray(images))
     embedding = agent.unroll(params, features, action, reward)
-    outputs = agent.act(params, embedding)
+    outputs = agent.policy_and_value(params, embedding)
     return Trajectory(
         episodes=Episodes(
             layout=initial,

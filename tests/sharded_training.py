@@ -13,11 +13,12 @@ from jax.sharding import Mesh, PartitionSpec
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import evaluate
+from agents.arrays import to_arrays
 from agents.config import Config
 from agents.networks.agent import Agent
 from agents.parallel.sharding import EPISODES, Placement, Shards
 from agents.ppo.learner import make_train
-from agents.runs.checkpoint import Checkpoints, digest, to_arrays
+from agents.runs.checkpoint import Checkpoints, digest
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 SEEDS = 2
@@ -25,15 +26,15 @@ CONFIG = Config.preset(
     "fast",
     env_id="TrapTube-v0",
     curiosity="icm",
-    episodes=16,
-    minibatch=8,
+    episodes_per_iteration=16,
+    minibatch_size=8,
     epochs=2,
     max_steps=6,
     filters=(2, 2),
     hidden=4,
     embedding=2,
     eval_episodes=3,
-    chunk=8,
+    encode_chunk_size=8,
 )
 
 

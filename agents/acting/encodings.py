@@ -79,7 +79,7 @@ class Cache(NamedTuple):
     ) -> tuple[jax.Array, "Cache"]:
         """The features f32[B, F] of B states' observations at `time`, and the cache with them.
 
-        At most `agent.config.chunk` observations are encoded at once.
+        At most `agent.config.encode_chunk_size` observations are encoded at once.
         """
         position = jax.vmap(position_id)(state)
         slot = slots(jnp.stack([self.layout_id, position], axis=1), CACHE_BITS)
@@ -88,7 +88,9 @@ class Cache(NamedTuple):
         groups = group(is_known.astype(jnp.int32), self.layout_id, position)
         num_new = jnp.max(jnp.where(is_known, -1, groups.number)) + 1
         rows = jax.vmap(observe)(state)[groups.representative]
-        new: Any = chunks.map_rows(agent.encode_rows, agent.config.chunk, params, rows, num_new)
+        new: Any = chunks.map_rows(
+            agent.encode_rows, agent.config.encode_chunk_size, params, rows, num_new
+        )
         features = jnp.where(is_known[:, None], known, new[groups.number])
         batch = len(self.layout_id)
         return features, self._replace(

@@ -71,7 +71,7 @@ def play_greedily(
     Arguments are those of `evaluate`.
     """
     frame = Frame.of(jnp.zeros(len(tasks.time), jnp.int32))
-    if agent.config.facing:
+    if agent.config.align_to_food:
         frame = jax.vmap(Frame.facing_food)(jax.vmap(tt.observe)(tasks))
     seen = jax.vmap(Frame.state)(frame, tasks)
     unused_key = jax.random.key(0)

@@ -83,14 +83,14 @@ class Policy(NamedTuple):
             raise ValueError("a policy that draws its actions needs a key; greedy ones do not")
         agent = Agent(self.config)
         frame = carry.frame
-        if self.config.facing:
+        if self.config.align_to_food:
             first = jax.vmap(Frame.facing_food)(observation)
             frame = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, frame)
             observation = jax.vmap(Frame.picture)(frame, observation)
         features = agent.encode(self.params, observation)
         reward_tm1 = jnp.zeros(len(observation))
         embedding = agent.step(self.params, carry.embedding, features, carry.action_tm1, reward_tm1)
-        outputs = agent.act(self.params, embedding)
+        outputs = agent.policy_and_value(self.params, embedding)
         if key is None or self.greedy:
             action = outputs.actions.mode()
         else:

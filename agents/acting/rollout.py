@@ -83,7 +83,7 @@ def rollout(
         before, embedding, action_tm1, reward_tm1, cache = carry
         features, cache = cache.encode(agent, params, before, time)
         embedding = agent.step(params, embedding, features, action_tm1, reward_tm1)
-        actions, value = agent.act(params, embedding)
+        actions, value = agent.policy_and_value(params, embedding)
         action = choose(step_key, actions)
         after, timestep = jax.vmap(env.step)(before, action)
         record = {

@@ -45,7 +45,7 @@ def check_curiosity(curiosity: Any, config: Config, env: Environment) -> None:
 
 def shapes_of(curiosity: Curiosity, params: Params, config: Config, env: Environment) -> Experience:
     """The shapes of what a curiosity sees of an iteration's episodes."""
-    steps, batch = env.max_steps, config.episodes
+    steps, batch = env.max_steps, config.episodes_per_iteration
     per_step = _array(jnp.float32, steps, batch)
     episodes = Episodes(
         layout=jax.tree.map(lambda x: _array(x.dtype, batch, *x.shape), env.base),

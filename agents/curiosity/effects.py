@@ -33,13 +33,13 @@ class Effects(Curiosity):
     It assumes that the agent knows its own colour and the food's, which no transfer changes.
 
     Args:
-      config: the settings, of which `reward_rate` counts.
+      config: the settings, of which `reward_ema_decay` counts.
     """
 
     needs_all_episodes = True
 
     def __init__(self, config: Config):
-        self._keep = config.reward_rate
+        self._keep = config.reward_ema_decay
 
     def memory(self) -> jax.Array:
         """The rates f32[3]; each is 0 until it is first above 0, and is then taken as it is."""

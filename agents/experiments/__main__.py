@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from agents.command_line import Flag, Imports
 from agents.config import PRESETS
 from agents.experiments import records, reporting, training
 from agents.experiments.protocol import PROGRAM, PROTOCOLS, QUICK, Protocol, parse_setting
@@ -21,7 +22,7 @@ from agents.parallel.cores import become_devices
 from agents.runs import compilation
 from agents.runs.folder import check_name, read_json, write_json
 from agents.runs.stopping import AGAIN, Stopped, StopSignals
-from trap_tube_jax.command_line import Flag, Imports, plain_errors
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.registry import task_set
 

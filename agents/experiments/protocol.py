@@ -192,7 +192,6 @@ class Protocol:
           ValueError: unknown preset or setting, or a setting's value is not allowed.
         """
         fixed = {
-            "imports": self.imports,
             "env_id": task_set(self.train_set).id,
             "iterations": self.iterations,
             "eval_episodes": self.tasks,

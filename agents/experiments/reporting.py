@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import pretrained
 from agents.acting.evaluation import Evaluator
+from agents.acting.policy_files import load_policy
 from agents.experiments import figures, records, tables
 from agents.experiments.protocol import Protocol, algorithms
 from agents.experiments.records import Record, Steps
@@ -124,7 +124,7 @@ def best_steps(
     path, key = entry.folder.tested(seed), [iteration, protocol.num_reported]
     known = read_json(path)
     if known is None or known["iteration_and_tasks"] != key:
-        policy = pretrained.load(entry.folder.best(seed, iteration))
+        policy = load_policy(entry.folder.best(seed, iteration))
         played = evaluator(policy.params).items()
         steps = {name: (each.length * each.solved).tolist() for name, each in played}
         known = {"iteration_and_tasks": key, "steps": steps}

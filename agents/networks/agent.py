@@ -25,13 +25,13 @@ class Agent:
     Parameters are a dictionary of `PARTS`; other entries are ignored.
 
     Attributes:
-      config: the settings. Whoever plays heeds `facing` and `chunk`, which are not done here.
+      config: the settings. Whoever plays heeds `align_to_food` and `chunk`, which are not done here.
     """
 
     def __init__(self, config: Config):
         self.encoder = make_encoder(config)
         self.core = Core(config.hidden, config.embedding, config.recurrent)
-        self.heads = Heads(config.streams)
+        self.heads = Heads(config.num_value_heads)
         self.config = config
 
     @functools.cached_property
@@ -89,7 +89,7 @@ class Agent:
         """The GRU's state f32[batch, hidden] before the first step."""
         return _apply(self.core, params["core"], batch, method=Core.initial_state)
 
-    def act(self, params: Params, embedding: jax.Array) -> Outputs:
+    def policy_and_value(self, params: Params, embedding: jax.Array) -> Outputs:
         """Distribution of actions and value of an embedding f32[..., hidden]."""
         return _apply(self.heads, params["heads"], embedding)
 

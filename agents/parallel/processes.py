@@ -17,7 +17,7 @@ from typing import NoReturn, TypeVar
 import jax
 import numpy as np
 
-from trap_tube_jax.command_line import Flag
+from agents.command_line import Flag
 
 Value = TypeVar("Value")
 

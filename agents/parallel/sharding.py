@@ -122,7 +122,7 @@ class Placement:
         wanted = available if devices in ("all", None) else devices
         if wanted not in allowed:
             raise ValueError(
-                f"{wanted} devices cannot share minibatch={config.minibatch} and seeds={seeds} "
+                f"{wanted} devices cannot share minibatch={config.minibatch_size} and seeds={seeds} "
                 f"evenly; {available} {jax.default_backend()} devices of {processes} process(es) "
                 f"are there; allowed: {', '.join(map(str, allowed)) or 'none'}"
             )
@@ -226,4 +226,4 @@ def _is_even(devices: int, processes: int, config: Config, seeds: int) -> bool:
     per_process, rest = divmod(devices, processes)
     shards = devices // math.gcd(devices, seeds)
     enough = per_process <= jax.local_device_count()
-    return rest == 0 and enough and config.minibatch % shards == 0
+    return rest == 0 and enough and config.minibatch_size % shards == 0

@@ -1,6 +1,6 @@
 """Advantages and value targets from the rewards of episodes.
 
-Two rules join the task's reward and the curiosity's: `of_sum` adds the rewards, `of_streams` the
+Two rules join the task's reward and the curiosity's: `combined_advantages` adds the rewards, `separate_advantages` the
 advantages.
 
 Source: Schulman et al. (2016); Burda et al. (2019b), "Combining intrinsic and extrinsic returns";
@@ -27,14 +27,14 @@ RewardMoments = tuple[returns.Moments, returns.Moments]
 
 def intrinsic_scale(config: Config) -> optax.Schedule:
     """The weight of the intrinsic reward, by iterations: constant, or falling geometrically."""
-    start, end = config.intrinsic_start, config.intrinsic_scale
-    falling = round(config.intrinsic_fall * config.iterations)
+    start, end = config.intrinsic_coef_init, config.intrinsic_coef
+    falling = round(config.intrinsic_anneal_fraction * config.iterations)
     if not start or not falling:
         return optax.constant_schedule(end)
     return optax.exponential_decay(start, falling, end / start, end_value=end)
 
 
-def of_sum(
+def combined_advantages(
     config: Config,
     episodes: Episodes,
     novelty: jax.Array,
@@ -55,15 +55,15 @@ def of_sum(
     Returns:
       Advantages f32[T, B], the values' targets f32[T, B, 1], and the new moments.
     """
-    extrinsic = moments[0].update(episodes.reward, episodes.mask, config.reward_rate)
-    intrinsic = moments[1].update(novelty, episodes.mask, config.reward_rate)
+    extrinsic = moments[0].update(episodes.reward, episodes.mask, config.reward_ema_decay)
+    intrinsic = moments[1].update(novelty, episodes.mask, config.reward_ema_decay)
     reward = episodes.reward / extrinsic.deviation
     reward = reward + scale * novelty / intrinsic.deviation
     advantage, target = advantages_and_targets(config, reward, episodes, value[..., 0])
     return advantage, target[..., None], (extrinsic, intrinsic)
 
 
-def of_streams(
+def separate_advantages(
     config: Config,
     episodes: Episodes,
     novelty: jax.Array,
@@ -79,17 +79,17 @@ def of_streams(
     The task's reward, at most 1 an episode, is taken as it is; the curiosity's is scaled so that
     its returns deviate by `RETURN_DEVIATION`.
 
-    Arguments and results are those of `of_sum`, but for two streams, the task's and the
+    Arguments and results are those of `combined_advantages`, but for two streams, the task's and the
     curiosity's: values f32[T + 1, B, 2], their targets f32[T, B, 2], and the second moments are
     those of the intrinsic returns. Without a curiosity there is one stream, the task's.
     """
     gamma, lambda_ = jnp.float32(config.discount), jnp.float32(config.gae_lambda)
     mask = episodes.mask
     task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
-    if config.streams == 1:
+    if config.num_value_heads == 1:
         return task, task_target[..., None], moments
     intrinsic = moments[1].update(
-        returns.discounted_returns(novelty, gamma), mask, config.reward_rate
+        returns.discounted_returns(novelty, gamma), mask, config.reward_ema_decay
     )
     own = continuing_value(value[..., 1], mask)
     discount = jnp.full_like(novelty, gamma)

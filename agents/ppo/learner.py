@@ -27,8 +27,8 @@ from agents.curiosity.checks import check_curiosity
 from agents.networks.agent import Agent, Params
 from agents.parallel.sharding import ALONE, Shards
 from agents.ppo import advantages, losses, returns
-from agents.ppo.failures import Failures
 from agents.ppo.optimizer import make_optimizer
+from agents.ppo.task_replay import TaskReplay
 from agents.registry import curiosities
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import BOARD_SIZE
@@ -41,11 +41,26 @@ COUNTABLE = np.iinfo(np.int32).max  # by `TrainState.transitions`
 # The names of all other metrics, which a curiosity's losses may not have: those of play, of
 # gradient steps, and what a run adds to them. Those of evaluations begin with GREEDY.
 RESERVED_NAMES = {
-    "success", "replayed_success", "episode_length", "intrinsic_reward", "distinct_observations",
-    "policy_loss", "value_loss", "entropy_loss", "loss", "entropy", "steps",
-    "gradient_norm", "seed", "iteration", "episodes", "transitions", "evaluation", "seconds",
+    "success",
+    "replayed_success",
+    "episode_length",
+    "intrinsic_reward",
+    "distinct_observations",
+    "policy_loss",
+    "value_loss",
+    "entropy_loss",
+    "loss",
+    "entropy",
+    "steps",
+    "gradient_norm",
+    "seed",
+    "iteration",
+    "episodes",
+    "transitions",
+    "evaluation",
+    "seconds",
     "transitions_per_second",
-}  # fmt: skip
+}
 GREEDY = "greedy_"
 
 
@@ -58,7 +73,7 @@ class TrainState(NamedTuple):
       extrinsic: moments of the extrinsic reward.
       intrinsic: moments of the intrinsic reward, or of its returns where rewards are apart.
       memory: what the curiosity carries along.
-      failures: failed tasks, to be played again.
+      task_replay: failed tasks, to be played again.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
@@ -70,7 +85,7 @@ class TrainState(NamedTuple):
     extrinsic: returns.Moments
     intrinsic: returns.Moments
     memory: Any
-    failures: Failures
+    task_replay: TaskReplay
     key: jax.Array
     iteration: jax.Array
     episodes: jax.Array
@@ -130,8 +145,8 @@ class Learner:
             extrinsic=returns.Moments.zero(),
             intrinsic=returns.Moments.zero(),
             memory=self.curiosity.memory(),
-            failures=Failures.untried(
-                failures_key, len(self.config.replayed), self.config.failures
+            task_replay=TaskReplay.untried(
+                failures_key, len(self.config.replay_fractions), self.config.replay_capacity
             ),
             key=key,
             iteration=zero,
@@ -158,12 +173,12 @@ class Learner:
         The parameters are those before. `learn` is to follow.
         """
         reset_key, action_key, _, _ = _keys(state)
-        reset_keys = self.draw_tasks(state.failures, reset_key)
+        reset_keys = self.draw_tasks(state.task_replay, reset_key)
         trajectory = self.play(state.params, reset_keys, action_key)
         state, batch, metrics = self.prepare(state, trajectory)
         if again := self.config.num_replayed:
-            failures = state.failures.remember(reset_keys, ~batch.episodes.solved, again)
-            state = state._replace(failures=failures)
+            task_replay = state.task_replay.remember(reset_keys, ~batch.episodes.solved, again)
+            state = state._replace(task_replay=task_replay)
         return state, batch, metrics
 
     def learn(self, state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
@@ -175,23 +190,23 @@ class Learner:
             opt_state=opt_state,
             key=key,
             iteration=state.iteration + 1,
-            episodes=state.episodes + self.config.episodes,
+            episodes=state.episodes + self.config.episodes_per_iteration,
         )
         return state, metrics
 
-    def draw_tasks(self, failures: Failures, key: jax.Array) -> jax.Array:
+    def draw_tasks(self, task_replay: TaskReplay, key: jax.Array) -> jax.Array:
         """The reset keys [B] of an iteration's tasks: first new ones, then those failed before."""
         config = self.config
-        if not config.replayed:
-            return jax.random.split(key, config.episodes)
+        if not config.replay_fractions:
+            return jax.random.split(key, config.episodes_per_iteration)
         failures_key, key = jax.random.split(key)
         new = jax.random.split(key, config.num_new)
-        return jnp.concatenate([new, failures.draw(failures_key, config.num_replayed)])
+        return jnp.concatenate([new, task_replay.draw(failures_key, config.num_replayed)])
 
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays this device's share of an iteration's episodes."""
         initial, timestep = jax.vmap(self.env.reset)(self.shards.part(reset_keys))
-        if self.config.facing:
+        if self.config.align_to_food:
             frame = jax.vmap(Frame.facing_food)(timestep.observation)
             initial = jax.vmap(Frame.state)(frame, initial)
         choose = self.shards.drawing(sample_action)
@@ -214,7 +229,11 @@ class Learner:
         novelty, memory = self.intrinsic_reward(state, trajectory)
         episodes = self._whole(trajectory.episodes)
         log_prob, value = self.shards.whole((trajectory.log_prob, trajectory.value), axis=1)
-        join = advantages.of_sum if config.rewards == "summed" else advantages.of_streams
+        join = (
+            advantages.combined_advantages
+            if config.value_heads == "shared"
+            else advantages.separate_advantages
+        )
         moments = (state.extrinsic, state.intrinsic)
         scale = advantages.intrinsic_scale(config)(state.iteration)
         advantage, target, moments = join(config, episodes, novelty, scale, value, moments)
@@ -273,7 +292,7 @@ class Learner:
                 return self.curiosity.encode(own, rows), None
 
             features = encode_episodes(
-                encode, own, episodes, observation_id, chunk=self.config.chunk
+                encode, own, episodes, observation_id, chunk=self.config.encode_chunk_size
             )
         experience = Experience(episodes, observation_id, features)
         if not self.curiosity.needs_embeddings:
@@ -306,12 +325,12 @@ class Learner:
             return (optax.apply_updates(params, updates), opt_state), metrics
 
         def permute(epoch_key: jax.Array) -> jax.Array:
-            order = jax.random.permutation(epoch_key, config.episodes)
-            return order.reshape(-1, config.minibatch)
+            order = jax.random.permutation(epoch_key, config.episodes_per_iteration)
+            return order.reshape(-1, config.minibatch_size)
 
         minibatches = jax.vmap(permute)(jax.random.split(key, config.epochs))
         (params, opt_state), metrics = jax.lax.scan(
-            update, (state.params, state.opt_state), minibatches.reshape(-1, config.minibatch)
+            update, (state.params, state.opt_state), minibatches.reshape(-1, config.minibatch_size)
         )
         return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
@@ -334,9 +353,11 @@ class Learner:
         """
         config, mask = self.config, batch.episodes.mask
         embedding, experience = self.learning_experience(params, batch)
-        actions, value = self.agent.act(params, embedding)
+        actions, value = self.agent.policy_and_value(params, embedding)
         log_prob = actions.log_prob(batch.episodes.action)
-        surrogate = losses.clipped_surrogate(log_prob, batch.log_prob, batch.advantage, config.clip)
+        surrogate = losses.clipped_surrogate(
+            log_prob, batch.log_prob, batch.advantage, config.clip_eps
+        )
         value_error = jnp.sum(optax.squared_error(value, batch.value_target), axis=-1)
         entropy = actions.entropy()
         terms = {
@@ -365,7 +386,7 @@ class Learner:
             return (features, self.curiosity.encode(params["curiosity"], rows)), remembered
 
         features, own = encode_episodes(
-            encode, read, episodes, batch.observation_id, chunk=self.config.chunk
+            encode, read, episodes, batch.observation_id, chunk=self.config.encode_chunk_size
         )
         experience = Experience(episodes, batch.observation_id, own)
         given = (params, features, episodes.action, episodes.reward)
@@ -408,10 +429,10 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
                 f"the environment's {name} is {getattr(env, name)}, the config's "
                 f"{getattr(config, name)}; they must agree"
             )
-    steps = config.iterations * config.episodes * env.max_steps
+    steps = config.iterations * config.episodes_per_iteration * env.max_steps
     if min(steps, config.max_transitions or steps) > COUNTABLE:
         raise ValueError(
-            f"iterations={config.iterations} of {config.episodes} episodes of {env.max_steps} "
+            f"iterations={config.iterations} of {config.episodes_per_iteration} episodes of {env.max_steps} "
             f"steps are {steps:,} steps; allowed: at most {COUNTABLE:,}"
         )
     curiosity = curiosities.factory(config.curiosity)(config, env)

@@ -68,7 +68,7 @@ def make_optimizer(config: Config) -> optax.GradientTransformation:
 def step_size(config: Config) -> optax.Schedule:
     """The learning rate by gradient steps: constant, then falling geometrically in the cooldown."""
     total = config.iterations * config.gradient_steps
-    falling = round(config.cooldown * total)
+    falling = round(config.lr_decay_fraction * total)
     if not falling:
         return optax.constant_schedule(config.learning_rate)
     return optax.exponential_decay(

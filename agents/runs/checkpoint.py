@@ -12,16 +12,12 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from agents.parallel.sharding import is_key, key_data
+from agents.arrays import Arrays, from_arrays, to_arrays
 from trap_tube_jax._version import __version__
 
 Tree = TypeVar("Tree")
-Arrays = dict[str, np.ndarray]
-
-SEPARATOR = "/"
 
 
 class CheckpointError(ValueError):
@@ -173,31 +169,6 @@ class Checkpoints:
         )
 
 
-def to_arrays(tree: Any) -> Arrays:
-    """Every leaf as a NumPy array of its own, by its place in `tree`; keys as their data."""
-    leaves, _ = jax.tree.flatten_with_path(tree)
-    return {_name(path): _to_array(leaf) for path, leaf in leaves}
-
-
-def from_arrays(arrays: Arrays, template: Tree) -> Tree:
-    """The inverse of `to_arrays`.
-
-    Args:
-      arrays: as `to_arrays` gives them; more of them than the template has is an error.
-      template: a pytree of that structure, of arrays or `jax.ShapeDtypeStruct`.
-
-    Raises:
-      ValueError: a name, shape or dtype differs; the message names it.
-    """
-    leaves, structure = jax.tree.flatten_with_path(template)
-    names = [_name(path) for path, _ in leaves]
-    for name in set(names) ^ set(arrays):
-        raise ValueError(f"{name} is {'missing' if name in names else 'not expected'}")
-    return structure.unflatten(
-        [_to_leaf(name, arrays[name], leaf) for name, (_, leaf) in zip(names, leaves, strict=True)]
-    )
-
-
 def digest(arrays: Arrays) -> str:
     """A SHA-256 over names, types, shapes and values."""
     total = hashlib.sha256()
@@ -216,28 +187,6 @@ def _this_process_alone(ocp: Any) -> Any:
     return ocp.options.MultiprocessingOptions(
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
     )
-
-
-def _name(path: Any) -> str:
-    return jax.tree_util.keystr(path, simple=True, separator=SEPARATOR)
-
-
-def _to_array(leaf: Any) -> np.ndarray:
-    # A copy: on a CPU the array could be a view of memory that is donated next.
-    return np.array(key_data(leaf))
-
-
-def _to_leaf(name: str, array: np.ndarray, template: Any) -> jax.Array:
-    if is_key(template):
-        if array.dtype != np.uint32 or array.shape[:-1] != template.shape:
-            raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, not PRNG keys")
-        return jax.random.wrap_key_data(jnp.asarray(array))
-    if (array.dtype, array.shape) != (template.dtype, template.shape):
-        raise ValueError(
-            f"{name} is {array.dtype}{list(array.shape)}, "
-            f"not {template.dtype}{list(template.shape)}"
-        )
-    return jnp.asarray(array)
 
 
 def _first_line(error: Exception) -> str:

@@ -41,16 +41,7 @@ def enable_cache() -> None:
 
 
 def compiled(lowered: jax.stages.Lowered, config: Config) -> jax.stages.Compiled:
-    """The program, compiled as `config.compile_quickly` says.
-
-    On other devices than a CPU, and by an XLA that does not know the options, it compiles as usual.
-    """
-    if config.compile_quickly and jax.default_backend() == "cpu":
-        try:
-            return lowered.compile(QUICKLY)
-        except jax.errors.JaxRuntimeError as error:
-            if "No such compile option" not in str(error):
-                raise
+    """The program, compiled"""
     return lowered.compile()
 
 

@@ -80,7 +80,7 @@ class Run:
                     f"the run has {name}={value}, not {new[name]}; only "
                     f"{', '.join(EXTENDABLE[:-1])} and {EXTENDABLE[-1]} may change"
                 )
-        for name in ("cooldown", "intrinsic_start"):
+        for name in ("cooldown", "intrinsic_coef_init"):
             if old[name] > 0 and new["iterations"] != old["iterations"]:
                 raise ValueError(
                     f"the run has {name}={old[name]} and iterations={old['iterations']}, not "
@@ -148,12 +148,12 @@ class RunFolder:
 
     def best(self, seed: int, iteration: int) -> Path:
         """The parameters of a seed's evaluation on several sets that was the best until then."""
-        return self.path / f"best-seed{seed}-iteration{iteration}.npz"
+        return self.path / f"best-seed{seed}-iteration{iteration}.safetensors"
 
     def kept_best(self, seed: int) -> dict[int, Path]:
         """The files of these parameters, by iteration, in order; the last is the best."""
         prefix = f"best-seed{seed}-iteration"
-        paths = self.path.glob(f"{prefix}*.npz")
+        paths = self.path.glob(f"{prefix}*.safetensors")
         kept = {int(path.stem.removeprefix(prefix)): path for path in paths}
         return dict(sorted(kept.items()))
 

@@ -6,9 +6,11 @@ from typing import Any
 import jax
 
 from agents import pretrained
+from agents.acting import policy_files
 from agents.acting.policy import Policy
+from agents.arrays import from_arrays
 from agents.networks.agent import PARTS, Agent
-from agents.runs.checkpoint import Checkpoints, from_arrays
+from agents.runs.checkpoint import Checkpoints
 from agents.runs.folder import Run, RunFolder
 
 SEED = "seed "  # before its number, the name of a run's policy
@@ -48,7 +50,7 @@ def load_policies(source: str | Path, iteration: int | None = None) -> list[Poli
             raise ValueError(f"{error}; shipped parameters: {shipped}") from error
     if iteration is not None:
         raise ValueError(f"iteration names a checkpoint of a run: {source} is not a run")
-    return [pretrained.load(path) if is_file else pretrained.load_shipped(str(source))]
+    return [policy_files.load_policy(path) if is_file else pretrained.load_shipped(str(source))]
 
 
 def load_run(path: Path, iteration: int | None = None) -> list[Policy]:

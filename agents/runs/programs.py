@@ -21,7 +21,6 @@ from agents.acting.evaluation import evaluate
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import Batch, Learner, Metrics, TrainState
 from agents.runs.compilation import compiled, in_background
-from agents.runs.traces import Traces
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 # States of all seeds [S, ...], their batches between play and learning, and bool[S]; to states,
@@ -102,20 +101,13 @@ class Programs:
         self.pending: list[futures.Future[jax.stages.Compiled]] = []
         self.ready_at = time.perf_counter()
 
-        traces = Traces.of(train.config)
-        depends_on = (train.config.to_dict(), placement.mesh)
-
         def lower(
             make: Callable[[Learner], Phase], before: futures.Future | None
         ) -> tuple[jax.stages.Lowered, Any]:
             inputs = (states, None, active) if before is None else (*before.result()[1], active)
 
-            def shard() -> Phase:
-                return placement.shard(make(train))
-
             with _uncollected():
-                name = make.__name__
-                phase = traces.kept(shard, inputs, name, *depends_on) if traces else shard()
+                phase = placement.shard(make(train))
                 jitted = jax.jit(phase, donate_argnums=0, in_shardings=placement.sharding)
                 traced = jitted.trace(*inputs)
                 return traced.lower(), traced.out_info[0]

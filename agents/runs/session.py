@@ -14,12 +14,13 @@ from rich.console import Console
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.acting.policy import Policy
+from agents.arrays import from_arrays, to_arrays
 from agents.networks.agent import PARTS, num_parameters
 from agents.parallel import processes
 from agents.parallel.sharding import Placement
 from agents.ppo.learner import TrainState, make_train
 from agents.runs import report, report_page
-from agents.runs.checkpoint import Checkpoints, from_arrays, to_arrays
+from agents.runs.checkpoint import Checkpoints
 from agents.runs.compilation import compiled, in_background
 from agents.runs.folder import Run, RunFolder, write_json
 from agents.runs.loading import policies

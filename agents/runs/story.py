@@ -92,7 +92,9 @@ def _next_step(
     """What to try after a run."""
     config = run.config
     more = f"--iterations {2 * config.iterations}"
-    can_go_on = not (config.cooldown or config.intrinsic_start or config.max_transitions)
+    can_go_on = not (
+        config.lr_decay_fraction or config.intrinsic_coef_init or config.max_transitions
+    )
     if config.stop_when_solved > 0 and all(solved):
         more += " --stop-when-solved 0"
         can_go_on &= run.seeds == 1  # several may have stopped at different iterations

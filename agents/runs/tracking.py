@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from agents import pretrained
 from agents.acting.evaluation import Evaluator
 from agents.acting.policy import Policy
+from agents.acting.policy_files import save_policy
 from agents.ppo.learner import GREEDY
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import Row
@@ -21,7 +21,7 @@ class Tracker:
 
     Each evaluation adds to the metrics the share of tasks solved of every set, `greedy_<set>`,
     and their mean over the ranked sets, `greedy_overall`; in between these are NaN. The run's
-    `best-seed<seed>-iteration<iteration>.npz` gets the parameters of the best evaluation so far.
+    `best-seed<seed>-iteration<iteration>.safetensors` gets the parameters of the best evaluation so far.
     Those of the best until a checkpoint stay at least until the next one, so that a run that is
     killed and continues from there finds them.
     """
@@ -84,5 +84,5 @@ class Tracker:
         overall = float(np.mean([shares[name] for name in self._ranked]))
         if overall > self._best[seed]:
             self._best[seed] = overall
-            pretrained.save(self._folder.best(seed, policy.iteration), policy)
+            save_policy(self._folder.best(seed, policy.iteration), policy)
         return {**{GREEDY + name: share for name, share in shares.items()}, OVERALL: overall}

@@ -16,13 +16,28 @@ from paths import ROOT
 def test_paper_preset_is_the_specification():
     config = Config.preset("paper")
     expected = {
-        "episodes": 1024, "max_steps": None, "epochs": 10, "minibatch": 128, "discount": 0.99,
-        "gae_lambda": 0.95, "clip": 0.2, "value_coef": 0.01, "entropy_coef": 1e-4,
-        "learning_rate": 1e-3, "adam_epsilon": 1e-7, "max_gradient_norm": 1.0,
-        "curiosity": "icm", "intrinsic_scale": 0.1, "curiosity_coef": 10.0, "reward_rate": 0.9,
-        "filters": (32, 64), "hidden": 64, "embedding": 8, "iterations": 250,
+        "episodes_per_iteration": 1024,
+        "max_steps": None,
+        "epochs": 10,
+        "minibatch_size": 128,
+        "discount": 0.99,
+        "gae_lambda": 0.95,
+        "clip_eps": 0.2,
+        "value_coef": 0.01,
+        "entropy_coef": 1e-4,
+        "learning_rate": 1e-3,
+        "adam_epsilon": 1e-7,
+        "max_gradient_norm": 1.0,
+        "curiosity": "icm",
+        "intrinsic_coef": 0.1,
+        "curiosity_coef": 10.0,
+        "reward_ema_decay": 0.9,
+        "filters": (32, 64),
+        "hidden": 64,
+        "embedding": 8,
+        "iterations": 250,
         "bootstrap": "baseline",
-    }  # fmt: skip
+    }
     assert {name: getattr(config, name) for name in expected} == expected
 
 
@@ -52,8 +67,8 @@ def test_every_setting_is_documented():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"minibatch": 100}, ["minibatch", "100", "1024", "512"]),
-        ({"minibatch": 0}, ["minibatch", "0", "1"]),
+        ({"minibatch_size": 100}, ["minibatch", "100", "1024", "512"]),
+        ({"minibatch_size": 0}, ["minibatch", "0", "1"]),
         ({"curiosity": "rdn"}, ["curiosity", "rdn", "icm-detached", "rnd", "none"]),
         ({"discount": 1.5}, ["discount", "1.5", "[0, 1]"]),
         ({"gae_lambda": -0.1}, ["gae_lambda", "-0.1"]),
@@ -62,18 +77,24 @@ def test_every_setting_is_documented():
         ({"episodes": True}, ["episodes", "int", "True"]),
         ({"filters": (32,)}, ["filters", "tuple[int, int]", "(32,)"]),
         ({"filters": (0, 64)}, ["filters", "0"]),
-        ({"replayed": 0.5}, ["replayed", "tuple[float, ...]", "0.5"]),
-        ({"replayed": (0.6,), "episodes": 1, "minibatch": 1}, ["1 episodes to new", "(0.6,)"]),
+        ({"replay_fractions": 0.5}, ["replayed", "tuple[float, ...]", "0.5"]),
+        (
+            {"replay_fractions": (0.6,), "episodes_per_iteration": 1, "minibatch_size": 1},
+            ["1 episodes to new", "(0.6,)"],
+        ),
         ({"adam_epsilon": 0.0}, ["adam_epsilon", "1e-12", "0.0"]),
-        ({"intrinsic_start": 0.01}, ["intrinsic_start", "at least intrinsic_scale=0.1", "0.01"]),
+        (
+            {"intrinsic_coef_init": 0.01},
+            ["intrinsic_coef_init", "at least intrinsic_coef=0.1", "0.01"],
+        ),
         ({"learning_rate": "fast"}, ["learning_rate", "float", "fast"]),
-        ({"facing": 1}, ["facing", "bool", "1"]),
+        ({"align_to_food": 1}, ["align_to_food", "bool", "1"]),
         ({"bootstrap": "none"}, ["bootstrap", "none", "value, baseline"]),
-        ({"curiosity": "none", "intrinsic_scale": 0.7}, ["intrinsic_scale", "0.7", "'none'"]),
+        ({"curiosity": "none", "intrinsic_coef": 0.7}, ["intrinsic_scale", "0.7", "'none'"]),
         ({"curiosity": "counts", "curiosity_coef": 1.0}, ["curiosity_coef", "'counts'", "10.0"]),
-        ({"failures": 3}, ["failures", "replayed=()"]),
-        ({"rewards": "apart"}, ["rewards='apart'", "bootstrap='value'", "'baseline'"]),
-        ({"intrinsic_start": 1.0, "intrinsic_scale": 0.0}, ["intrinsic_start > 0", "got 0"]),
+        ({"failures": 3}, ["failures", "replay_fractions=()"]),
+        ({"value_heads": "separate"}, ["rewards='apart'", "bootstrap='value'", "'baseline'"]),
+        ({"intrinsic_coef_init": 1.0, "intrinsic_coef": 0.0}, ["intrinsic_coef_init > 0", "got 0"]),
         ({"num_features": 0}, ["num_features", "0"]),
         ({"max_steps": 0}, ["max_steps", "0"]),
         ({"max_steps": 5.0}, ["max_steps", "int | None", "5.0"]),

@@ -11,9 +11,15 @@ from agents.curiosity import Experience
 from agents.examples import custom_curiosity, custom_transfer, oracle
 
 SMALL = {
-    "episodes": 8, "minibatch": 8, "epochs": 1, "max_steps": 20, "filters": (2, 2), "hidden": 4,
-    "embedding": 2, "chunk": 8,
-}  # fmt: skip
+    "episodes_per_iteration": 8,
+    "minibatch_size": 8,
+    "epochs": 1,
+    "max_steps": 20,
+    "filters": (2, 2),
+    "hidden": 4,
+    "embedding": 2,
+    "encode_chunk_size": 8,
+}
 
 
 def test_a_custom_curiosity_pays_moves_of_the_tool():

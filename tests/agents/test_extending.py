@@ -16,7 +16,8 @@ from test_train import TINY, final_state, run, untimed
 
 import agents
 import trap_tube_jax as tt
-from agents import Config, evaluate, make_train, pretrained, registry
+from agents import Config, evaluate, make_train, registry
+from agents.acting.policy_files import save_policy
 from agents.runs.folder import Run, RunFolder
 from agents.train import main, parse, select
 from paths import ROOT
@@ -83,8 +84,8 @@ def test_the_pages_module_is_trained_with_and_remembered(trained, own_tables, mo
     arguments = shlex.split(RESUME)[3:]
     _, options = parse(select(arguments), arguments)
     assert options.config == dataclasses.replace(policy.config, iterations=200)
-    pretrained.save(folder / "mine.npz", policy)
-    assert agents.load(folder / "mine.npz").config == policy.config
+    save_policy(folder / "mine.safetensors", policy)
+    assert agents.load(folder / "mine.safetensors").config == policy.config
     _, timestep = tt.make("cold").reset(jax.random.key(0))
     action, _ = policy.act(timestep.observation[None], policy.initial(1))
     assert action.shape == (1, 2)
@@ -100,8 +101,17 @@ def test_the_pages_other_commands_run(trained):
 
 
 def test_the_pages_curiosity_pays_for_a_moved_tool(here, own_tables):
-    config = Config(imports=("my_module",), env_id="cold", curiosity="tool-moved", encoder="flat",
-                    episodes=4, minibatch=2, hidden=4, embedding=2, chunk=4)  # fmt: skip
+    config = Config(
+        imports=("my_module",),
+        env_id="cold",
+        curiosity="tool-moved",
+        encoder="flat",
+        episodes_per_iteration=4,
+        minibatch_size=2,
+        hidden=4,
+        embedding=2,
+        encode_chunk_size=4,
+    )
     learner = make_train(config)
     assert learner.env.max_steps == 30
     start = learner.init(jax.random.key(0))
@@ -158,7 +168,14 @@ def test_unknown_encoders_are_refused(capsys):
 
 @pytest.mark.slow
 def test_the_pages_experiment_runs(here):
-    settings = ["episodes=2", "minibatch=2", "epochs=1", "filters=[2,2]", "hidden=4", "embedding=2"]
+    settings = [
+        "episodes_per_iteration=2",
+        "minibatch_size=2",
+        "epochs=1",
+        "filters=[2,2]",
+        "hidden=4",
+        "embedding=2",
+    ]
     counts = ["--seeds", 1, "--iterations", 1, "--tasks", 2, "--reported", 2]
     rest = ["--settings", *settings, *counts]
     output = command(EXPERIMENT, *rest, folder=here)

@@ -15,8 +15,8 @@ from agents.networks.core import Core
 DISCOUNT, ITERATIONS = 0.5, 100
 CONFIG = Config(
     max_steps=probes.STEPS,
-    episodes=64,
-    minibatch=32,
+    episodes_per_iteration=64,
+    minibatch_size=32,
     epochs=4,
     curiosity="none",
     discount=DISCOUNT,
@@ -24,12 +24,12 @@ CONFIG = Config(
     filters=(8, 8),
     hidden=16,
     embedding=4,
-    chunk=16,
+    encode_chunk_size=16,
     value_coef=0.5,
     entropy_coef=1e-3,
     learning_rate=5e-3,
     iterations=ITERATIONS,
-    cooldown=0.7,
+    lr_decay_fraction=0.7,
 )
 OPTIMISED = True  # they train for long
 Learner = Callable[..., tuple[jax.Array, Trajectory]]

@@ -22,7 +22,14 @@ from agents.runs.metrics import MetricsLog, read_metrics
 from agents.runs.stopping import Stopped, StopSignals
 from paths import ROOT
 
-SMALL = ("filters=[2,2]", "hidden=4", "embedding=2", "episodes=8", "minibatch=4", "max_steps=6")
+SMALL = (
+    "filters=[2,2]",
+    "hidden=4",
+    "embedding=2",
+    "episodes_per_iteration=8",
+    "minibatch_size=4",
+    "max_steps=6",
+)
 
 # In the place of training: ends at once, badly if its name says so, or waits to be stopped.
 FAKE = """
@@ -47,24 +54,30 @@ def options(*settings, **given):
 
 
 def test_the_grid_holds_every_combination():
-    configs = options("learning_rate=1e-3,3e-4", "curiosity=icm,none", "clip=0.3").configs()
+    configs = options("learning_rate=1e-3,3e-4", "curiosity=icm,none", "clip_eps=0.3").configs()
     assert list(configs) == [
-        "learning_rate=0.001,curiosity=icm", "learning_rate=0.001,curiosity=none",
-        "learning_rate=0.0003,curiosity=icm", "learning_rate=0.0003,curiosity=none",
-    ]  # fmt: skip
+        "learning_rate=0.001,curiosity=icm",
+        "learning_rate=0.001,curiosity=none",
+        "learning_rate=0.0003,curiosity=icm",
+        "learning_rate=0.0003,curiosity=none",
+    ]
     config = configs["learning_rate=0.0003,curiosity=icm"]
-    assert (config.learning_rate, config.curiosity, config.clip) == (3e-4, "icm", 0.3)
+    assert (config.learning_rate, config.curiosity, config.clip_eps) == (3e-4, "icm", 0.3)
     assert (config.filters, config.compile_quickly) == ((2, 2), True)
 
 
 def test_lists_and_truth_values_are_values_too():
     configs = sweep.Options(
-        settings=("filters=[2,3],[4,5]", "facing=true,false"), env="sy"
+        settings=("filters=[2,3],[4,5]", "align_to_food=true,false"), env="sy"
     ).configs()
-    assert next(iter(configs)) == "filters=2x3,facing=true"
-    config = configs["filters=4x5,facing=false"]
-    assert (config.filters, config.facing, config.env_id) == ((4, 5), False, "SymbolicTrapTube-v0")
-    assert list(sweep.Options(settings=("clip=0.3",), preset="paper").configs()) == ["paper"]
+    assert next(iter(configs)) == "filters=2x3,align_to_food=true"
+    config = configs["filters=4x5,align_to_food=false"]
+    assert (config.filters, config.align_to_food, config.env_id) == (
+        (4, 5),
+        False,
+        "SymbolicTrapTube-v0",
+    )
+    assert list(sweep.Options(settings=("clip_eps=0.3",), preset="paper").configs()) == ["paper"]
 
 
 def test_modules_of_ones_own_are_imported_first():
@@ -80,7 +93,7 @@ def test_modules_of_ones_own_are_imported_first():
     [
         (["--settings", "clip"], "NAME=VALUE,VALUE, got 'clip'"),
         (["--settings", "clip="], "NAME=VALUE,VALUE, got 'clip='"),
-        (["--settings", "clip=1", "clip=2"], "a setting may be given only once"),
+        (["--settings", "clip_eps=1", "clip_eps=2"], "a setting may be given only once"),
         (["--env", "sy", "--settings", "env_id=p"], "give --env sy or the setting env_id"),
         (["--settings", "klip=1,2"], "did you mean 'clip'"),
         (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
@@ -121,8 +134,9 @@ def test_runs_share_the_cores_and_failures_do_not_stop_the_others(tmp_path, monk
     assert sorted(folder.path.name for folder in failed) == ["bad-seed0", "bad-seed1"]
     assert "no such luck" in failed[0].log.read_text()
     assert sorted(path.parent.name for path in tmp_path.glob("*/ended")) == [
-        "good-seed0", "good-seed1",
-    ]  # fmt: skip
+        "good-seed0",
+        "good-seed1",
+    ]
     assert sorted(given[:2]) == [[0, 2], [1]]
     assert len(given) == 4
     assert "good-seed1: done" in console.export_text()
@@ -149,10 +163,10 @@ def test_a_request_stops_all_and_starts_no_more(tmp_path, monkeypatch):
 @pytest.fixture
 def finished(tmp_path):
     """Two points with two seeds each; one seed of `b` has not been trained."""
-    for folder, run in planned(tmp_path, "clip=1", "clip=2", seeds=2):
-        if folder.path.name == "clip=2-seed1":
+    for folder, run in planned(tmp_path, "clip_eps=1", "clip_eps=2", seeds=2):
+        if folder.path.name == "clip_eps=2-seed1":
             continue
-        solved = folder.path.name.startswith("clip=1")
+        solved = folder.path.name.startswith("clip_eps=1")
         log = MetricsLog(folder.metrics)
         for iteration in (1, 2, 3):
             row = {"seed": run.seed, "iteration": iteration, "transitions": 50 * iteration}
@@ -172,15 +186,29 @@ def test_results_are_plain_records(finished):
     kinds = {type(value) for record in records for value in record.values()}
     assert kinds == {str, int, float, bool, tuple, type(None)}
     assert [(Path(record["run"]).name, record["seed"]) for record in records] == [
-        ("clip=1-seed0", 0), ("clip=1-seed1", 1), ("clip=2-seed0", 0), ("clip=2-seed1", 1),
-    ]  # fmt: skip
+        ("clip_eps=1-seed0", 0),
+        ("clip_eps=1-seed1", 1),
+        ("clip_eps=2-seed0", 0),
+        ("clip_eps=2-seed1", 1),
+    ]
     assert len({tuple(record) for record in records}) == 1
     known = {
-        "preset": "paper", "curiosity": "icm", "clip": 0.2, "finished": True,
-        "trained_iterations": 3, "trained_episodes": 33, "trained_transitions": 150,
-        "trained_seconds": 1.5, "success": 0.5, "evaluation": 1.0, "solved_iterations": 2,
-        "solved_episodes": 22, "solved_transitions": 100, "percent_base": 100.0, "percent_p": 5.0,
-    }  # fmt: skip
+        "preset": "paper",
+        "curiosity": "icm",
+        "clip_eps": 0.2,
+        "finished": True,
+        "trained_iterations": 3,
+        "trained_episodes": 33,
+        "trained_transitions": 150,
+        "trained_seconds": 1.5,
+        "success": 0.5,
+        "evaluation": 1.0,
+        "solved_iterations": 2,
+        "solved_episodes": 22,
+        "solved_transitions": 100,
+        "percent_base": 100.0,
+        "percent_p": 5.0,
+    }
     assert {name: records[1][name] for name in known} == known
     unknown = {"finished": False, "trained_iterations": 0, "solved_episodes": None}
     unknown |= {"evaluation": None, "percent_p": None}
@@ -188,7 +216,7 @@ def test_results_are_plain_records(finished):
 
 
 def test_a_run_is_done_when_it_has_reached_the_threshold_of_now(finished):
-    (folder, run), *_ = planned(finished, "clip=1")
+    (folder, run), *_ = planned(finished, "clip_eps=1")
 
     def done(share, iterations=9):
         config = Config(iterations=iterations, stop_when_solved=share)
@@ -208,7 +236,7 @@ def test_a_run_is_done_when_it_has_reached_the_threshold_of_now(finished):
 
 
 def test_evaluations_of_runs_that_are_extended_are_out_of_date(finished):
-    folder = RunFolder(finished / "clip=1-seed0")
+    folder = RunFolder(finished / "clip_eps=1-seed0")
     row = read_metrics(folder.metrics)[-1]
     MetricsLog(folder.metrics, last_iteration=3).append([{**row, "iteration": 4}])
     records = agents.results(finished)
@@ -216,7 +244,7 @@ def test_evaluations_of_runs_that_are_extended_are_out_of_date(finished):
 
 
 def test_results_of_several_folders(finished, tmp_path):
-    first, second = finished / "clip=2-seed0", finished / "clip=1-seed1"
+    first, second = finished / "clip_eps=2-seed0", finished / "clip_eps=1-seed1"
     records = agents.results([first, str(second)])
     assert [record["run"] for record in records] == [str(first), str(second)]
     (tmp_path / "empty").mkdir()
@@ -232,12 +260,12 @@ def test_a_sweep_ends_in_a_table_and_a_figure(finished):
     assert heads[:2] == ["settings", "seeds"]
     assert heads[-2:] == ["base %", "p %"]
     assert "mean ± sd [95 % confidence interval" in lines[0]
-    assert one[:5] == ["clip=1", "2", "2", "2", "21 ± 1 [8, 34]"]
+    assert one[:5] == ["clip_eps=1", "2", "2", "2", "21 ± 1 [8, 34]"]
     assert one[5:] == [*["100.0 ± 0.0 [100.0, 100.0]"] * 2, "4.5 ± 0.7 [0.0, 10.9]"]
-    assert two == ["clip=2", "2", "1", "0", "–", "0.0", "0.0", "4.0"]
+    assert two == ["clip_eps=2", "2", "1", "0", "–", "0.0", "0.0", "4.0"]
     assert (finished / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert len(json.loads((finished / "results.json").read_text())) == 4
-    assert "clip=1" in console.export_text()
+    assert "clip_eps=1" in console.export_text()
 
 
 def start(out):
@@ -286,7 +314,7 @@ def test_stopped_sweeps_continue_to_the_same_result(tmp_path):
 
 
 def test_a_worker_is_told_of_every_limit_that_may_have_changed(tmp_path):
-    before = Run(Config(episodes=8, minibatch=8, max_transitions=900))
+    before = Run(Config(episodes_per_iteration=8, minibatch_size=8, max_transitions=900))
     folder = RunFolder.create(tmp_path / "x", before)
     for limits in ({"max_transitions": None, "stop_when_solved": 0.5}, {"max_transitions": 4000}):
         run = dataclasses.replace(before, config=dataclasses.replace(before.config, **limits))

@@ -31,7 +31,18 @@ from refusal import refused
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
 TINY = [
-    *("--episodes", "8", "--minibatch", "4", "--epochs", "1", "--max-steps", "6", "--chunk", "8"),
+    *(
+        "--episodes-per-iteration",
+        "8",
+        "--minibatch-size",
+        "4",
+        "--epochs",
+        "1",
+        "--max-steps",
+        "6",
+        "--encode-chunk-size",
+        "8",
+    ),
     *("--filters", "2", "2", "--hidden", "4", "--embedding", "2", "--eval-episodes", "2"),
 ]
 ITERATIONS = 30
@@ -162,7 +173,10 @@ def test_evaluate_command_line(whole, tmp_path):
     [
         ("--preset slow", f"unknown preset 'slow'; allowed: {', '.join(PRESETS)}"),
         ("--env q", "unknown task set 'q'; allowed: TrapTube-v0 (base), "),
-        ("--minibatch 3 --episodes 8", "minibatch must divide episodes=8, got 3; allowed: 1, 2"),
+        (
+            "--minibatch-size 3 --episodes-per-iteration 8",
+            "minibatch must divide episodes_per_iteration=8, got 3; allowed: 1, 2",
+        ),
         ("--episodess 8", "Unrecognized options: --episodess, 8"),
         ("--curiosity icmm", "unknown curiosity 'icmm'; allowed: icm, "),
         ("--discount 2", "discount must lie in [0, 1], got 2"),
@@ -334,7 +348,7 @@ def test_after_stopping_a_further_ctrl_c_ends_the_process():
             signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("schedule", [{"cooldown": 0.5}, {"intrinsic_start": 3.0}])
+@pytest.mark.parametrize("schedule", [{"lr_decay_fraction": 0.5}, {"intrinsic_coef_init": 3.0}])
 def test_a_run_with_a_schedule_is_not_extended(tmp_path, schedule):
     """What is scheduled has been falling towards the last iteration that was known then."""
     RunFolder.create(tmp_path / "x", Run(Config(iterations=20, **schedule)))
@@ -441,7 +455,9 @@ def test_training_goes_on_until_every_seed_is_solved():
 
 def test_no_iteration_begins_that_could_take_too_many_steps():
     """Iterations of 48 steps and at most 8 * 50 = 400."""
-    config = Config(iterations=10, episodes=8, minibatch=8, max_transitions=48 * 3 + 400)
+    config = Config(
+        iterations=10, episodes_per_iteration=8, minibatch_size=8, max_transitions=48 * 3 + 400
+    )
     assert [is_last(row_of(0, n, 0.0), config) for n in (1, 3, 4, 10)] == [False, False, True, True]
     run = Run(config, seeds=2)
     rows = [row_of(0, 4, 0.0), {**row_of(1, 4, 0.0), "transitions": 100}]

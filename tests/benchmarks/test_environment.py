@@ -239,7 +239,11 @@ def test_an_unknown_set_ends_in_one_line(capsys, monkeypatch, module, option):
         ),
         (scaling, ("--num-envs", "4", "0"), "num_envs must be an integer >= 1, got 0"),
         (scaling, ("--seeds", "1", "0"), "seeds must be an integer >= 1, got 0"),
-        (scaling, ("--episodes", "64", "9"), "episodes must be multiples of minibatch=32, got 9"),
+        (
+            scaling,
+            ("--episodes-per-iteration", "64", "9"),
+            "episodes must be multiples of minibatch_size=32, got 9",
+        ),
         (train_throughput, ("--repeats", "0"), "repeats must be an integer >= 1, got 0"),
         (train_throughput, ("--warm", "-1"), "warm must be an integer >= 0, got -1"),
         (scaling_model, ("--latency", "-1"), "latency must be >= 0, got -1.0"),

@@ -8,17 +8,24 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import pytest
-from benchmarks.scaling_model import Exchange
 
 from agents import Config
 from agents.experiments import figures, records
 from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
 from benchmarks import harness, scaling, scaling_model, tables, train_throughput
+from benchmarks.scaling_model import Exchange
 from timings import TIMING
 
 CONFIG = Config(
-    max_steps=4, episodes=4, minibatch=2, epochs=2, filters=(2, 3), hidden=4, embedding=2, chunk=4
+    max_steps=4,
+    episodes_per_iteration=4,
+    minibatch_size=2,
+    epochs=2,
+    filters=(2, 3),
+    hidden=4,
+    embedding=2,
+    encode_chunk_size=4,
 )
 
 
@@ -98,7 +105,7 @@ def counting_learner(config):
         return Count(jax.random.key_data(key)[-1], jnp.uint32(0))
 
     def iterate(state):
-        played = config.episodes * (1 + state.seed)
+        played = config.episodes_per_iteration * (1 + state.seed)
         return Count(state.seed, state.transitions + played), {}
 
     return SimpleNamespace(init=init, iterate=iterate)
@@ -123,7 +130,7 @@ def test_a_share_is_of_the_episodes_and_of_every_minibatch(monkeypatch, timed):
 
     monkeypatch.setattr(scaling_model, "make_train", make_train)
     assert scaling_model.share_seconds(CONFIG, 2) == 2.0
-    assert shares == [dataclasses.replace(CONFIG, episodes=2, minibatch=1)]
+    assert shares == [dataclasses.replace(CONFIG, episodes_per_iteration=2, minibatch_size=1)]
     assert timed[0][0].transitions == 2
 
 
@@ -132,7 +139,7 @@ def test_the_speed_up_is_that_of_the_model(monkeypatch):
     monkeypatch.setattr(scaling_model, "repeated_seconds", lambda config: 1.0)
     monkeypatch.setattr(scaling_model, "share_seconds", lambda config, devices: 8.0 / devices)
     options = scaling_model.Options(latency=0.25, bandwidth=8.0)
-    config = dataclasses.replace(CONFIG, minibatch=4)
+    config = dataclasses.replace(CONFIG, minibatch_size=4)
     rows = scaling_model.speed_up_rows(options, config, [Exchange("all-reduce", 8, 1)])
     two, four = 8 / (4 + 0.5 + 1.5), 8 / (2 + 0.75 + 3)
     parts = ((8, 0, 0), (4, 0.5, 1.5), (2, 0.75, 3))

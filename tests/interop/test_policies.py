@@ -9,7 +9,8 @@ import pytest
 from test_policy import CONFIG, FOOD_BESIDE, SEEDS, STEPS, random_params
 
 import trap_tube_jax as tt
-from agents import Policy, evaluate, pretrained
+from agents import Policy, evaluate
+from agents.acting.policy_files import save_policy
 from trap_tube_jax import registry
 
 pytest.importorskip("gymnasium")
@@ -28,13 +29,13 @@ ACT = jax.jit(POLICY.act)
 def expected(tmp_path_factory):
     """The percentages that `agents.evaluate` finds on four sets of one task each."""
     folder = tmp_path_factory.mktemp("policy")
-    pretrained.save(folder / "mine.npz", POLICY)
+    save_policy(folder / "mine.safetensors", POLICY)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registry, "_task_sets", dict(registry._task_sets))
         for name, cell in zip(NAMES, FOOD_BESIDE, strict=True):
             base = tt.base_state(1).replace(food=jnp.array(cell, jnp.int32))
             tt.register(name, (), base=base, max_steps=STEPS)
-        arguments = [str(folder / "mine.npz"), "--sets", *NAMES]
+        arguments = [str(folder / "mine.safetensors"), "--sets", *NAMES]
         evaluate.main([*arguments, "--json", str(folder / "table.json")])
         (table,) = json.loads((folder / "table.json").read_text())
         found = [score["percent"] for score in table["sets"]]

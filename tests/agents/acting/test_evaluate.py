@@ -36,14 +36,14 @@ from trap_tube_jax.scoring.tasks import (
 )
 
 TINY = {
-    "episodes": 4,
-    "minibatch": 2,
+    "episodes_per_iteration": 4,
+    "minibatch_size": 2,
     "epochs": 1,
     "max_steps": 6,
     "filters": (2, 2),
     "hidden": 4,
     "embedding": 2,
-    "chunk": 3,
+    "encode_chunk_size": 3,
 }
 SHORTS = [entry.short for entry in PAPER_TASK_SETS]
 # The food beside the agent, on each side in turn: whichever way the first move of a policy
@@ -136,7 +136,7 @@ def test_keys_of_tasks_are_never_drawn_in_training(monkeypatch):
             state, _ = iterate(state)
     jax.effects_barrier()
     training = set(seen)
-    assert len(training) == 3 * 2 * config.episodes
+    assert len(training) == 3 * 2 * config.episodes_per_iteration
 
     seen.clear()
     for entry in PAPER_TASK_SETS:

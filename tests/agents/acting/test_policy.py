@@ -10,8 +10,9 @@ import pytest
 
 import agents
 import trap_tube_jax as tt
-from agents import Config, Policy, evaluate, pretrained
+from agents import Config, Policy, evaluate
 from agents.acting.evaluation import Evaluator
+from agents.acting.policy_files import save_policy
 from agents.networks.agent import Agent
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.folder import Run, RunFolder
@@ -74,7 +75,7 @@ def run_path(tmp_path_factory):
 
 def test_a_policy_that_faces_the_food_reaches_them_too():
     """From observations alone it finds the frame that the evaluator finds."""
-    config = dataclasses.replace(CONFIG, facing=True)
+    config = dataclasses.replace(CONFIG, align_to_food=True)
     policy, tasks = Policy("x", config, random_params(SEEDS[1]), 1), make_tasks()
     solved, length, actions = drive(policy, tasks)
     played = Evaluator(config, {"mine": tasks})(policy.params)["mine"]
@@ -126,10 +127,10 @@ def test_driving_scoring_and_evaluating_come_to_the_same(run_path, tmp_path, own
 def test_runs_files_and_names_are_loaded(run_path, tmp_path):
     first = agents.load(str(run_path))
     assert (first.name, first.iteration, first.greedy) == ("seed 3", 6, True)
-    pretrained.save(tmp_path / "x.npz", first)
-    again = agents.load(tmp_path / "x.npz")
+    save_policy(tmp_path / "x.safetensors", first)
+    again = agents.load(tmp_path / "x.safetensors")
     jax.tree.map(np.testing.assert_array_equal, again.params, first.params)
-    assert agents.load("base").config.env_id == "TrapTube-v0"
+    assert agents.load("fast-base").config.env_id == "TrapTube-v0"
 
 
 def test_a_policy_may_draw_its_actions(run_path):
@@ -161,6 +162,6 @@ def test_impossible_requests_are_refused(run_path, tmp_path):
     ):
         agents.load(tmp_path / "none")
     with pytest.raises(ValueError, match="of a run: base is not a run"):
-        agents.load("base", iteration=5)
+        agents.load("fast-base", iteration=5)
     with pytest.raises(ValueError, match="base has no seed 0; allowed: none"):
-        agents.load("base", seed=0)
+        agents.load("fast-base", seed=0)

@@ -20,9 +20,17 @@ from agents.networks.agent import Agent
 from agents.ppo import learner
 
 CONFIG = Config(
-    env_id="psy", max_steps=7, episodes=12, minibatch=6, epochs=2, curiosity="icm-detached",
-    filters=(3, 4), hidden=6, embedding=2, chunk=4,
-)  # fmt: skip
+    env_id="psy",
+    max_steps=7,
+    episodes_per_iteration=12,
+    minibatch_size=6,
+    epochs=2,
+    curiosity="icm-detached",
+    filters=(3, 4),
+    hidden=6,
+    embedding=2,
+    encode_chunk_size=4,
+)
 
 
 counts: list[int] = []  # distinct observations that `play` encoded, step by step
@@ -64,7 +72,7 @@ def played(make_play):
     env = tt.make(CONFIG.env_id, max_steps=CONFIG.max_steps)
     agent = Agent(CONFIG)
     params = jax.jit(agent.init)(jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), CONFIG.episodes)
+    keys = jax.random.split(jax.random.key(1), CONFIG.episodes_per_iteration)
     initial, _ = jax.jit(jax.vmap(env.reset))(keys)
     # One episode is solved by its first move, so that an early end is among them.
     initial = initial.replace(
@@ -91,7 +99,7 @@ def test_episodes_follow_the_environment(played):
     env, _, _, initial, _, trajectory = played
     episodes = trajectory.episodes
     step = jax.jit(jax.vmap(env.step))
-    state, done = initial, np.zeros(CONFIG.episodes, bool)
+    state, done = initial, np.zeros(CONFIG.episodes_per_iteration, bool)
     for t in range(env.max_steps):
         np.testing.assert_array_equal(episodes.mask[t], ~done)
         for name, index in (("agent", 0), ("tool", 1), ("food", 2)):
@@ -130,7 +138,7 @@ def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch)
         play = make_play(params, initial)
     for env_id in ("base", "st"):
         # Several episodes of each layout, which meet again what the others have met before.
-        keys = jnp.repeat(jax.random.split(jax.random.key(1), 3), CONFIG.episodes // 3)
+        keys = jnp.repeat(jax.random.split(jax.random.key(1), 3), CONFIG.episodes_per_iteration // 3)
         layouts, _ = jax.jit(jax.vmap(tt.make(env_id).reset))(keys)
         jax.effects_barrier()
         counts.clear()
@@ -154,7 +162,7 @@ def test_network_saw_the_episodes_in_order(played):
         action = jnp.concatenate([episodes.action, episodes.action[-1:]])
         reward = jnp.concatenate([episodes.reward, episodes.reward[-1:]])
         embedding = agent.unroll(params, shown, action, reward)
-        actions, value = agent.act(params, embedding)
+        actions, value = agent.policy_and_value(params, embedding)
         return embedding[:-1], value, actions.log_prob(action)[:-1]
 
     embedding, value, log_prob = expected(params, trajectory)

@@ -16,9 +16,17 @@ from agents.curiosity.counts import observation_slots, visit_bonus
 from refusal import assert_refused
 
 TINY = Config(
-    env_id="sy", max_steps=4, episodes=4, minibatch=2, epochs=1, filters=(2, 3), hidden=4,
-    embedding=2, chunk=4, curiosity="none",
-).to_dict()  # fmt: skip
+    env_id="sy",
+    max_steps=4,
+    episodes_per_iteration=4,
+    minibatch_size=2,
+    epochs=1,
+    filters=(2, 3),
+    hidden=4,
+    embedding=2,
+    encode_chunk_size=4,
+    curiosity="none",
+).to_dict()
 
 
 class Corners(Curiosity):
@@ -177,7 +185,7 @@ def test_the_contract_is_checked_with_the_shapes_of_training(trajectory):
     """Those of what an iteration gives, and with every curiosity of the project."""
     register("mine", lambda config, env: Embedded())
     for name in ("mine", "icm", "rnd", "effects", "counts", "none"):
-        config = Config.from_dict({**TINY, "episodes": 40, "curiosity": name})
+        config = Config.from_dict({**TINY, "episodes_per_iteration": 40, "curiosity": name})
         train = make_train(config)
         check_curiosity(train.curiosity, config, train.env)
         params = jax.eval_shape(train.init_params, jax.random.key(0))

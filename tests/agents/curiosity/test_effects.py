@@ -119,7 +119,7 @@ def test_the_hand_meets_every_look_once(by_hand):
 
 
 def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
-    curiosity = Effects(Config(reward_rate=0.75))
+    curiosity = Effects(Config(reward_ema_decay=0.75))
     experience = Experience(by_hand, jnp.zeros((5, 2), jnp.int32), jnp.zeros((5, 2, 0)))
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)
     np.testing.assert_allclose(memory, [2 / 6, 3 / 6, 0], rtol=1e-6)

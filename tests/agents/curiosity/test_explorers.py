@@ -10,16 +10,26 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, curiosity, make_train, registry
 from agents.acting.episodes import Episodes
+from agents.arrays import from_arrays, to_arrays
 from agents.curiosity import Experience
 from agents.curiosity.e3b import elliptical_bonus
 from agents.networks.layers import draw
 from agents.ppo.learner import Learner
-from agents.runs.checkpoint import digest, from_arrays, to_arrays
+from agents.runs.checkpoint import digest
 
 SETTINGS = Config(
-    env_id="sy", max_steps=6, episodes=8, minibatch=4, epochs=1, filters=(2, 3), hidden=4,
-    embedding=2, chunk=4, eval_episodes=2, bootstrap="value",
-).to_dict()  # fmt: skip
+    env_id="sy",
+    max_steps=6,
+    episodes_per_iteration=8,
+    minibatch_size=4,
+    epochs=1,
+    filters=(2, 3),
+    hidden=4,
+    embedding=2,
+    encode_chunk_size=4,
+    eval_episodes=2,
+    bootstrap="value",
+).to_dict()
 
 
 def learner_of(name: str) -> Learner:

@@ -19,9 +19,10 @@ from rich.console import Console
 from test_train import TIMING_COLUMNS
 
 import trap_tube_jax as tt
-from agents import pretrained
 from agents.acting import evaluation
+from agents.acting import policy_files as pretrained
 from agents.acting.policy import Policy
+from agents.arrays import to_arrays
 from agents.config import Config
 from agents.experiments import __main__ as experiments
 from agents.experiments import figures, records, reporting, statistics, tables, training
@@ -29,7 +30,7 @@ from agents.experiments.protocol import Protocol
 from agents.parallel.sharding import ALONE, Placement
 from agents.ppo.learner import make_train
 from agents.runs import programs, report, session, stopping, tracking
-from agents.runs.checkpoint import Checkpoints, digest, to_arrays
+from agents.runs.checkpoint import Checkpoints, digest
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import MetricsLog
 from paths import ROOT
@@ -162,7 +163,7 @@ def contents(folder):
     run_folder = RunFolder(folder)
     with Checkpoints(run_folder.checkpoints) as checkpoints:
         arrays, _ = checkpoints.load()
-    best = [pretrained.load(path) for path in sorted(folder.glob("best-*.npz"))]
+    best = [pretrained.load_policy(path) for path in sorted(folder.glob("best-*.safetensors"))]
     return {
         "metrics": untimed(run_folder.metrics),
         "state": digest(arrays),
@@ -195,7 +196,7 @@ def test_the_best_parameters_are_kept(whole):
     for seed, iteration in ((0, 4), (1, 2)):
         kept = RunFolder(whole / f"ppo-seed{seed}").kept_best(seed)
         assert max(kept) == iteration
-        policy = pretrained.load(kept[iteration])
+        policy = pretrained.load_policy(kept[iteration])
         assert policy.iteration == iteration
         assert np.all(jax.tree.leaves(policy.params)[0] == 100 * seed + iteration)
 
@@ -289,7 +290,7 @@ def test_killed_experiments_continue_to_the_same_bits(whole, tmp_path):
         return lambda log, rows: (rows[0]["seed"], rows[0]["iteration"]) == (seed, 4)
 
     moments = [
-        (pretrained, "save", lambda path, policy: policy.iteration == 4),
+        (pretrained, "save_policy", lambda path, policy: policy.iteration == 4),
         (MetricsLog, "append", appended(seed=0)),
         (MetricsLog, "append", appended(seed=1)),
     ]
@@ -355,10 +356,14 @@ def test_a_folder_holds_one_experiment(capsys, whole):
 
 
 def test_runs_with_a_cooldown_are_not_extended(tmp_path):
-    short = Protocol(algorithms=("ppo",), seeds=1, settings={"cooldown": 0.5}, iterations=4)
+    short = Protocol(
+        algorithms=("ppo",), seeds=1, settings={"lr_decay_fraction": 0.5}, iterations=4
+    )
     training.plan_runs(tmp_path, {"ppo": short.config("ppo")}, short.preset, range(1))
     longer = dataclasses.replace(short, iterations=8)
-    with pytest.raises(ValueError, match=r"ppo-seed0: the run has cooldown=0.5 and iterations=4"):
+    with pytest.raises(
+        ValueError, match=r"ppo-seed0: the run has lr_decay_fraction=0.5 and iterations=4"
+    ):
         training.plan_runs(tmp_path, {"ppo": longer.config("ppo")}, longer.preset, range(1))
 
 
@@ -366,7 +371,7 @@ def test_the_best_parameters_of_the_last_checkpoint_outlive_a_kill(tmp_path, mon
     """The best evaluation is the second; a third, better one comes after the checkpoint."""
     run, folder = Run(Config(curiosity="none")), RunFolder(tmp_path)
     shares = {1: 0.25, 2: 0.5, 3: 0.75, 4: 0.25}
-    monkeypatch.setattr(pretrained, "save", lambda path, policy: path.write_text("x"))
+    monkeypatch.setattr(pretrained, "save_policy", lambda path, policy: path.write_text("x"))
 
     def played(iteration):
         solved: Any = np.arange(4) < 4 * shares[iteration]
@@ -399,13 +404,13 @@ def test_the_best_parameters_of_the_last_checkpoint_outlive_a_kill(tmp_path, mon
 
 
 def test_the_best_parameters_are_found_by_their_iteration(tmp_path, monkeypatch):
-    name = "best-seed0-iteration2.npz"
+    name = "best-seed0-iteration2.safetensors"
     (tmp_path / name).touch()
-    (tmp_path / "best-seed0-iteration4.npz").touch()  # after the metrics end
+    (tmp_path / "best-seed0-iteration4.safetensors").touch()  # after the metrics end
     rows = [{"seed": 0, "iteration": i, "greedy_overall": x} for i, x in ((1, 0.0), (2, 0.5))]
     entry = training.AlgorithmRun("ppo", RunFolder(tmp_path), Run(Config()), rows)
     policy = Policy("x", Config(), {"parameters": 0}, 2)
-    monkeypatch.setattr(pretrained, "load", {tmp_path / name: policy}.__getitem__)
+    monkeypatch.setattr(pretrained, "load_policy", {tmp_path / name: policy}.__getitem__)
     played = evaluation.Evaluation(jnp.array([True, False]), jnp.array([3, 6]), *2 * [jnp.zeros(2)])
     evaluator: Any = lambda params: {"p": played} if params == policy.params else None  # noqa: E731
     assert reporting.best_steps(entry, 0, Protocol(), evaluator) == {"p": [3, 0]}
@@ -449,7 +454,14 @@ def test_a_higher_threshold_continues_to_the_same_bits(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_quick_protocol_runs(tmp_path):
     """A slice of it, as a process: one short iteration of real training, all sets."""
-    settings = ["episodes=2", "minibatch=2", "epochs=1", "max_steps=4", "chunk=8", *SMALL]
+    settings = [
+        "episodes_per_iteration=2",
+        "minibatch_size=2",
+        "epochs=1",
+        "max_steps=4",
+        "encode_chunk_size=8",
+        *SMALL,
+    ]
     counts = ["--iterations", "1", "--tasks", "1", "--evaluate-every", "1", "--algorithms", "ppo"]
     command = [sys.executable, "-W", "error", "-m", "agents.experiments", "exp1", "--quick"]
     done = subprocess.run(

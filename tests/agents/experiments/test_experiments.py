@@ -71,7 +71,11 @@ def test_protocols_are_the_papers():
         assert (protocol.preset, protocol.seeds, protocol.tasks) == ("paper", 5, 128)
         assert protocol.algorithms == ("ppo", "ppo+icm")
         config = protocol.config("ppo+icm")
-        assert (config.curiosity, config.episodes, config.stop_when_solved) == ("icm", 1024, 0)
+        assert (config.curiosity, config.episodes_per_iteration, config.stop_when_solved) == (
+            "icm",
+            1024,
+            0,
+        )
         assert protocol.config("ppo").curiosity == "none"
         assert (protocol.selection, protocol.num_reported) == ("validation", 1000)
     fast = QUICK["exp1"].config("preset")

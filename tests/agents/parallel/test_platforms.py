@@ -23,9 +23,16 @@ from agents.runs.programs import PHASES
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 TINY = Config(
-    env_id="sy", max_steps=4, episodes=4, minibatch=2, epochs=1, filters=(2, 3), hidden=4,
-    embedding=2, chunk=4,
-).to_dict()  # fmt: skip
+    env_id="sy",
+    max_steps=4,
+    episodes_per_iteration=4,
+    minibatch_size=2,
+    epochs=1,
+    filters=(2, 3),
+    hidden=4,
+    embedding=2,
+    encode_chunk_size=4,
+).to_dict()
 OBJECTS = {"curiosity": "rnd", "encoder": "objects"}
 CURIOSITIES = curiosities.names()
 # What XLA wants to know of a GPU that it cannot ask.

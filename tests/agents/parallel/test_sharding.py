@@ -25,7 +25,18 @@ from paths import ROOT
 from refusal import refused
 
 SETTINGS = [
-    *("--episodes", "8", "--minibatch", "4", "--epochs", "1", "--max-steps", "4", "--chunk", "8"),
+    *(
+        "--episodes-per-iteration",
+        "8",
+        "--minibatch-size",
+        "4",
+        "--epochs",
+        "1",
+        "--max-steps",
+        "4",
+        "--encode-chunk-size",
+        "8",
+    ),
     *("--filters", "2", "2", "--hidden", "4", "--embedding", "2", "--eval-episodes", "1"),
     *("--curiosity", "none", "--iterations", "100000"),
 ]
@@ -166,7 +177,7 @@ def test_impossible_devices_are_refused(capsys, tmp_path, arguments, message):
 def test_uneven_shares_are_refused(monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda: 12 * jax.local_devices())
     monkeypatch.setattr(jax, "local_device_count", lambda: 12)
-    config = Config(episodes=16, minibatch=8)
+    config = Config(episodes_per_iteration=16, minibatch_size=8)
     with pytest.raises(ValueError, match=r"^12 devices cannot .* allowed: 1, 2, 4, 8$"):
         Placement.of("all", config, seeds=1)
     with pytest.raises(ValueError, match=r"^5 devices cannot .* allowed: 1, 2, 3, 4, 6, 8, 12$"):

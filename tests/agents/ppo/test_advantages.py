@@ -35,11 +35,13 @@ def test_a_stream_that_hardly_pays_is_not_blown_up():
 
 
 def test_the_intrinsic_weight_falls_geometrically():
-    config = Config(intrinsic_start=8.0, intrinsic_scale=0.5, intrinsic_fall=0.4, iterations=10)
+    config = Config(
+        intrinsic_coef_init=8.0, intrinsic_coef=0.5, intrinsic_anneal_fraction=0.4, iterations=10
+    )
     weight = advantages.intrinsic_scale(config)
     found = np.array([weight(iteration) for iteration in range(6)])
     np.testing.assert_allclose(found, [8, 4, 2, 1, 0.5, 0.5], rtol=1e-6)
-    constant = advantages.intrinsic_scale(Config(intrinsic_scale=0.7))
+    constant = advantages.intrinsic_scale(Config(intrinsic_coef=0.7))
     assert [constant(iteration) for iteration in (0, 9)] == [0.7, 0.7]
 
 
@@ -61,7 +63,7 @@ def normal(x, mask):
 def test_two_streams_step_by_step():
     """Of two episodes one is solved at its third step; the old moments have a variance of 4."""
     config = Config.preset("best")
-    gamma, lambda_, rate = config.discount, config.gae_lambda, config.reward_rate
+    gamma, lambda_, rate = config.discount, config.gae_lambda, config.reward_ema_decay
     rng = np.random.default_rng(0)
     value, novelty = rng.normal(size=(6, 2, 2)), rng.random((5, 2))
     mask, reward, going_on = np.ones((5, 2)), np.zeros((5, 2)), np.ones((5, 2))
@@ -81,7 +83,7 @@ def test_two_streams_step_by_step():
     arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
     episodes = Episodes(tt.base_state(), *[jnp.zeros(())] * 2, *arrays)  # pyright: ignore
     old = returns.Moments(jnp.float32(9), jnp.float32(4), jnp.int32(3))
-    advantage, target, moments = advantages.of_streams(
+    advantage, target, moments = advantages.separate_advantages(
         config, episodes, jnp.float32(novelty), 0.7, jnp.float32(value), (old, old)
     )
     for found, expected in (
@@ -102,7 +104,7 @@ def test_without_curiosity_the_task_has_the_only_value():
     ones = jnp.ones((6, 8))
     episodes = Episodes(tt.base_state(), ones, ones, ones, ones, ones)
     moments = (returns.Moments.zero(), returns.Moments.zero())
-    found, target, _ = advantages.of_streams(
+    found, target, _ = advantages.separate_advantages(
         train.config, episodes, jnp.zeros((6, 8)), 3.0, value, moments
     )
     expected = advantages.advantages_and_targets(train.config, ones, episodes, value[..., 0])

@@ -16,15 +16,25 @@ import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
+from agents.arrays import to_arrays
 from agents.ppo import advantages, learner
 from agents.ppo.learner import RESERVED_NAMES, Learner, TrainState
-from agents.runs.checkpoint import to_arrays
 
 BEST = Config.preset(
-    "best", episodes=8, minibatch=4, epochs=3, filters=(4, 4), hidden=4, embedding=2,
-    max_steps=6, chunk=8, failures=5, replayed=(0.25, 0.25), iterations=10,
+    "best",
+    episodes_per_iteration=8,
+    minibatch_size=4,
+    epochs=3,
+    filters=(4, 4),
+    hidden=4,
+    embedding=2,
+    max_steps=6,
+    encode_chunk_size=8,
+    replay_capacity=5,
+    replay_fractions=(0.25, 0.25),
+    iterations=10,
     max_transitions=None,
-)  # fmt: skip
+)
 STEPS, EPISODES = 6, 8
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
@@ -32,7 +42,7 @@ SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new
 class Scripted(Learner):
     """Plays tasks of known keys, solves those of `SOLVED`, and does not learn."""
 
-    def draw_tasks(self, failures, key):
+    def draw_tasks(self, task_replay, key):
         return reset_keys()
 
     def play(self, params, reset_keys, action_key):
@@ -47,7 +57,9 @@ class Scripted(Learner):
             discount=1 - reward,
             mask=jnp.ones(shape),
         )
-        value = jax.random.normal(jax.random.key(3), (STEPS + 1, EPISODES, self.config.streams))
+        value = jax.random.normal(
+            jax.random.key(3), (STEPS + 1, EPISODES, self.config.num_value_heads)
+        )
         nothing = jnp.zeros((*shape, 0))
         return Trajectory(episodes, nothing, nothing, jnp.zeros(shape), value)
 
@@ -77,9 +89,9 @@ def scripted() -> tuple[Learner, TrainState, Any]:
 
 def test_new_tasks_are_new_and_others_are_of_the_lists():
     train = make_train(BEST)
-    failures = train.init(jax.random.key(0)).failures
-    drawn = data(train.draw_tasks(failures, jax.random.key(1)))
-    once, twice = data(failures.keys[0]), data(failures.keys[1])
+    task_replay = train.init(jax.random.key(0)).task_replay
+    drawn = data(train.draw_tasks(task_replay, jax.random.key(1)))
+    once, twice = data(task_replay.keys[0]), data(task_replay.keys[1])
     assert len(set(drawn[:4]) - {*once, *twice}) == 4
     assert set(drawn[4:6]) <= set(once)
     assert set(drawn[6:]) <= set(twice)
@@ -88,10 +100,10 @@ def test_new_tasks_are_new_and_others_are_of_the_lists():
 def test_tasks_that_failed_are_remembered_and_success_is_that_on_new_tasks(scripted):
     _, state, iterate = scripted
     after, metrics = iterate(state)
-    keys, first, second = data(reset_keys()), *map(data, state.failures.keys)
+    keys, first, second = data(reset_keys()), *map(data, state.task_replay.keys)
     # New tasks 1, 2, 3 failed, and of the tasks failed once the first.
-    assert data(after.failures.keys[0]) == [*keys[1:4], *first[3:]]
-    assert data(after.failures.keys[1]) == [keys[4], *second[1:]]
+    assert data(after.task_replay.keys[0]) == [*keys[1:4], *first[3:]]
+    assert data(after.task_replay.keys[1]) == [keys[4], *second[1:]]
     assert float(metrics["success"]) == 1 / 4
     assert float(metrics["replayed_success"]) == 3 / 4
 
@@ -112,7 +124,7 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, w
     trajectory = train.play(None, reset_keys(), None)
     novelty, _ = train.intrinsic_reward(state, trajectory)
     moments = (state.extrinsic, state.intrinsic)
-    expected, _, _ = advantages.of_streams(
+    expected, _, _ = advantages.separate_advantages(
         BEST, trajectory.episodes, novelty, weight, trajectory.value, moments
     )
     # Normalised once more.
@@ -157,8 +169,14 @@ def test_no_key_is_used_twice(monkeypatch):
             return state.params, state.opt_state, {}
 
     monkeypatch.setattr(learner, "sample_action", choose)
-    small = {"max_steps": STEPS, "filters": (2, 2), "hidden": 4, "embedding": 2, "chunk": 4}
-    config = Config(**small, episodes=EPISODES, minibatch=4, curiosity="none")
+    small = {
+        "max_steps": STEPS,
+        "filters": (2, 2),
+        "hidden": 4,
+        "embedding": 2,
+        "encode_chunk_size": 4,
+    }
+    config = Config(**small, episodes_per_iteration=EPISODES, minibatch_size=4, curiosity="none")
     train = Playing(**vars(make_train(config, Environment(max_steps=STEPS))))
     state, iterate = train.init(jax.random.key(0)), jax.jit(train.iterate)
     iterate(iterate(state)[0])
@@ -204,7 +222,13 @@ def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
 @pytest.mark.slow
 def test_seeds_side_by_side_are_those_alone():
     """With the cache of encodings and the loops of the real rollout; up to rounding."""
-    small = {"max_steps": 4, "episodes": 4, "minibatch": 4, "epochs": 1, "chunk": 4}
+    small = {
+        "max_steps": 4,
+        "episodes_per_iteration": 4,
+        "minibatch_size": 4,
+        "epochs": 1,
+        "encode_chunk_size": 4,
+    }
     network = {"filters": (2, 3), "hidden": 4, "embedding": 2}
     train = make_train(Config(**small, **network, env_id="sy", curiosity="none"))
     both = jax.vmap(train.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))

@@ -10,7 +10,12 @@ from agents.ppo.optimizer import adam, step_size
 
 def test_the_cooldown_counts_gradient_steps():
     config = Config(
-        iterations=10, epochs=2, episodes=8, minibatch=4, cooldown=0.3, learning_rate=0.5
+        iterations=10,
+        epochs=2,
+        episodes_per_iteration=8,
+        minibatch_size=4,
+        lr_decay_fraction=0.3,
+        learning_rate=0.5,
     )
     assert config.gradient_steps == 4
     schedule = step_size(config)
@@ -20,7 +25,13 @@ def test_the_cooldown_counts_gradient_steps():
 
 @pytest.mark.parametrize("cooldown", [0.0, 1.0])
 def test_none_or_all_of_training_may_be_cooldown(cooldown):
-    config = Config(iterations=1, epochs=2, episodes=8, minibatch=4, cooldown=cooldown)
+    config = Config(
+        iterations=1,
+        epochs=2,
+        episodes_per_iteration=8,
+        minibatch_size=4,
+        lr_decay_fraction=cooldown,
+    )
     rates = jnp.stack([jnp.asarray(step_size(config)(jnp.int32(n))) for n in range(4)])
     expected = 1e-3 * 50 ** (-cooldown * np.arange(4) / 4)
     np.testing.assert_allclose(rates, expected, rtol=1e-5)

@@ -14,7 +14,7 @@ from agents.ppo.learner import make_train
 from paths import DATA
 from reference_update import Recording, make_trajectory
 
-CONFIG = Config.preset("paper", episodes=8, minibatch=8, epochs=5)
+CONFIG = Config.preset("paper", episodes_per_iteration=8, minibatch_size=8, epochs=5)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_replayed_boards_are_the_recorded_ones(recording, ours):
 
 def test_network_outputs(recording, ours):
     trajectory, (error, inferred) = ours["trajectory"], ours["prediction"]
-    actions, _ = ours["train"].agent.act(ours["params"], trajectory.embedding)
+    actions, _ = ours["train"].agent.policy_and_value(ours["params"], trajectory.embedding)
     assert_close(trajectory.embedding, recording.steps("out/embedding"))
     assert_close(trajectory.log_prob, recording.steps("out/log_probs"))
     assert_close(actions.entropy(), recording.steps("out/entropy"))
@@ -111,7 +111,7 @@ def test_rewards_and_targets(recording, ours):
     assert_close(extrinsic.deviation, recording["reward/extrinsic_std"])
     assert_close(intrinsic.deviation, recording["reward/intrinsic_std"])
     reward = ours["trajectory"].episodes.reward / extrinsic.deviation
-    reward = reward + CONFIG.intrinsic_scale * raw * mask / intrinsic.deviation
+    reward = reward + CONFIG.intrinsic_coef * raw * mask / intrinsic.deviation
     assert_close(reward, recording.steps("reward/total") * mask)
     assert_close(ours["batch"].advantage, recording.steps("target/advantages") * mask)
     assert_close(

@@ -5,44 +5,44 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.ppo.failures import Failures
+from agents.ppo.task_replay import TaskReplay
 
 LISTS, CAPACITY = 2, 5
 
 
 @pytest.fixture
-def failures() -> Failures:
-    return Failures.untried(jax.random.key(0), LISTS, CAPACITY)
+def replay() -> TaskReplay:
+    return TaskReplay.untried(jax.random.key(0), LISTS, CAPACITY)
 
 
 def data(keys: jax.Array) -> np.ndarray:
     return np.asarray(jax.random.key_data(keys))
 
 
-def test_failed_tasks_are_added_to_the_next_list_in_the_oldest_places(failures):
+def test_failed_tasks_are_added_to_the_next_list_in_the_oldest_places(replay):
     keys = jax.random.split(jax.random.key(1), 6)
     new = data(keys)
     failed = jnp.array([True, False, True, True, True, True])
     # Three new tasks, two of the first list, one of the last.
-    after = failures.remember(keys, failed, (2, 1))
-    once, twice = data(failures.keys)
+    after = replay.remember(keys, failed, (2, 1))
+    once, twice = data(replay.keys)
     np.testing.assert_array_equal(data(after.keys[0]), [new[0], new[2], *once[2:]])
     np.testing.assert_array_equal(data(after.keys[1]), [new[3], new[4], *twice[2:]])
     np.testing.assert_array_equal(after.next, [2, 2])
 
 
-def test_places_are_filled_in_turn(failures):
+def test_places_are_filled_in_turn(replay):
     keys = jax.random.split(jax.random.key(1), 6)
     for pair in (keys[:2], keys[2:4], keys[4:]):
-        failures = failures.remember(pair, jnp.array([True, True]), (0, 0))
-    assert int(failures.next[0]) == 6 % CAPACITY
-    np.testing.assert_array_equal(data(failures.keys[0, 0]), data(keys[5]))
+        replay = replay.remember(pair, jnp.array([True, True]), (0, 0))
+    assert int(replay.next[0]) == 6 % CAPACITY
+    np.testing.assert_array_equal(data(replay.keys[0, 0]), data(keys[5]))
 
 
-def test_of_more_failures_than_places_the_last_are_kept(failures):
+def test_of_more_failures_than_places_the_last_are_kept(replay):
     keys = jax.random.split(jax.random.key(1), 2 * CAPACITY + 3)
     failed = jnp.ones(len(keys), bool).at[-2].set(False)
-    after = failures.remember(keys, failed, (0, 0))
+    after = replay.remember(keys, failed, (0, 0))
     kept = [*data(keys[-CAPACITY - 1 : -2]), data(keys[-1])]
     assert {tuple(key) for key in data(after.keys[0])} == {tuple(key) for key in kept}
     assert int(after.next[0]) == len(keys[:-1]) % CAPACITY
@@ -52,20 +52,20 @@ def test_of_more_failures_than_places_the_last_are_kept(failures):
     "key", [jax.random.key(0, impl="rbg"), jax.random.PRNGKey(0)], ids=["rbg", "raw"]
 )
 def test_keys_of_any_kind_are_remembered(key):
-    failures = Failures.untried(key, LISTS, CAPACITY)
-    drawn = failures.draw(key, (2, 2))
-    after = failures.remember(drawn, jnp.ones(4, bool), (2, 2))
-    assert after.keys.dtype == failures.keys.dtype
+    replay = TaskReplay.untried(key, LISTS, CAPACITY)
+    drawn = replay.draw(key, (2, 2))
+    after = replay.remember(drawn, jnp.ones(4, bool), (2, 2))
+    assert after.keys.dtype == replay.keys.dtype
     np.testing.assert_array_equal(data(after.keys[1, :2]), data(drawn[:2]))
 
 
-def test_solved_tasks_stay(failures):
-    keys = failures.draw(jax.random.key(1), (4, 4))
-    after = failures.remember(keys, jnp.zeros(8, bool), (4, 4))
-    np.testing.assert_array_equal(data(after.keys), data(failures.keys))
+def test_solved_tasks_stay(replay):
+    keys = replay.draw(jax.random.key(1), (4, 4))
+    after = replay.remember(keys, jnp.zeros(8, bool), (4, 4))
+    np.testing.assert_array_equal(data(after.keys), data(replay.keys))
 
 
-def test_all_that_is_remembered_is_drawn_in_its_place(failures):
-    drawn = data(failures.draw(jax.random.key(1), (300, 200)))
-    for part, keys in zip((drawn[:300], drawn[300:]), data(failures.keys), strict=True):
+def test_all_that_is_remembered_is_drawn_in_its_place(replay):
+    drawn = data(replay.draw(jax.random.key(1), (300, 200)))
+    for part, keys in zip((drawn[:300], drawn[300:]), data(replay.keys), strict=True):
         assert {tuple(key) for key in part} == {tuple(key) for key in keys}

@@ -37,7 +37,7 @@ UP, DOWN, LEFT, RIGHT = range(4)
 PLAN = [(UP, UP), *[(UP, RIGHT)] * 6, (DOWN, RIGHT), *[(UP, UP)] * 3]
 TINY = {
     "episodes": 4,
-    "minibatch": 2,
+    "minibatch_size": 2,
     "epochs": 1,
     "max_steps": 6,
     "filters": (2, 2),
@@ -286,11 +286,13 @@ def profile_at_random(**settings):
 
 @pytest.fixture(scope="module")
 def tiny():
-    return profile_at_random(episodes=2)
+    return profile_at_random(episodes_per_iteration=2)
 
 
 def test_a_policy_without_a_step_limit_plays_as_long_as_the_base_task():
-    record = profile_at_random(config={"max_steps": None}, parts=("colours",), episodes=0)
+    record = profile_at_random(
+        config={"max_steps": None}, parts=("colours",), episodes_per_iteration=0
+    )
     assert record["policies"][0]["config"]["max_steps"] == 50
     assert set(record["policies"][0]["steps"]) == {"base", "colours 1"}
 
@@ -344,7 +346,7 @@ def test_pages_hold_the_tables_of_a_profile(tiny, tmp_path):
 
 
 def test_records_of_profiles_name_a_commit_known_before_measuring(tmp_path, monkeypatch, capsys):
-    arguments = ["--pretrained", "base", "--parts", "swaps"]
+    arguments = ["--pretrained", "fast-base", "--parts", "swaps"]
     arguments += ["--out", str(tmp_path / "out"), "--record", str(tmp_path / "x.json")]
     monkeypatch.setattr(command, "profile", None)
     for commit, message in (("abc-dirty", "this one of abc-dirty"), (None, "give --commit")):
@@ -368,10 +370,13 @@ def test_records_of_profiles_name_a_commit_known_before_measuring(tmp_path, monk
     ("arguments", "message"),
     [
         ([], "give runs' folders or --pretrained NAME"),
-        (["--pretrained", "none"], "unknown parameters 'none'; allowed: base"),
-        (["--pretrained", "base", "base"], "tell them apart: base, base; rename one"),
-        (["--pretrained", "base", "--import", "no.such"], "no.such"),
-        (["--pretrained", "base", "--tasks", "0"], "tasks must be >= 1, got 0"),
+        (["--pretrained", "none"], "unknown agent 'none'; allowed: best-pstsy"),
+        (
+            ["--pretrained", "fast-base", "fast-base"],
+            "tell them apart: fast-base, fast-base; rename one",
+        ),
+        (["--pretrained", "fast-base", "--import", "no.such"], "no.such"),
+        (["--pretrained", "fast-base", "--tasks", "0"], "tasks must be >= 1, got 0"),
         (["--draw", "none.json"], "is no record"),
     ],
 )

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 
-class Failures(NamedTuple):
+class TaskReplay(NamedTuple):
     """L lists of K tasks each; list l holds tasks that were failed l + 1 times.
 
     At first the lists hold tasks that nobody has tried.
@@ -31,11 +31,11 @@ class Failures(NamedTuple):
     next: jax.Array
 
     @staticmethod
-    def untried(key: jax.Array, lists: int, capacity: int) -> "Failures":
+    def untried(key: jax.Array, lists: int, capacity: int) -> "TaskReplay":
         """Lists of tasks that nobody has tried yet; one list, unused, in place of none."""
         lists = max(lists, 1)  # checkpoints hold no empty arrays
         keys = jax.random.split(key, (lists, capacity))
-        return Failures(keys, jnp.zeros(lists, jnp.int32))
+        return TaskReplay(keys, jnp.zeros(lists, jnp.int32))
 
     def draw(self, key: jax.Array, counts: Sequence[int]) -> jax.Array:
         """Reset keys of tasks to play again: `counts[l]` from list l, each with equal chances."""
@@ -49,7 +49,7 @@ class Failures(NamedTuple):
 
     def remember(
         self, reset_keys: jax.Array, failed: jax.Array, counts: Sequence[int]
-    ) -> "Failures":
+    ) -> "TaskReplay":
         """The lists after an iteration: each task that failed is added to the next list.
 
         Args:
@@ -64,7 +64,7 @@ class Failures(NamedTuple):
             _put(*of_list) for of_list in zip(self.keys, self.next, played, fails, strict=True)
         ]
         keys, following = zip(*lists, strict=True)
-        return Failures(jnp.stack(keys), jnp.stack(following))
+        return TaskReplay(jnp.stack(keys), jnp.stack(following))
 
 
 def _put(

@@ -1,0 +1,63 @@
+"""Pytrees as flat tables of named NumPy arrays, the form in which files hold them."""
+
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Tree = TypeVar("Tree")
+Arrays = dict[str, np.ndarray]
+
+SEPARATOR = "/"
+
+
+def to_arrays(tree: Any) -> Arrays:
+    """Copies every leaf to a NumPy array, named by its path in `tree`; keys become their data."""
+    leaves, _ = jax.tree.flatten_with_path(tree)
+    # A copy: on a CPU the array could be a view of memory that is donated next.
+    return {_name(path): np.array(key_data(leaf)) for path, leaf in leaves}
+
+
+def from_arrays(arrays: Arrays, template: Tree) -> Tree:
+    """Inverts `to_arrays`.
+
+    Args:
+      arrays: one array for each leaf of the template.
+      template: a pytree of arrays or of `jax.ShapeDtypeStruct`.
+
+    Raises:
+      ValueError: a name, shape or dtype differs; the message names it.
+    """
+    leaves, structure = jax.tree.flatten_with_path(template)
+    names = [_name(path) for path, _ in leaves]
+    for name in sorted(set(names) ^ set(arrays)):
+        raise ValueError(f"{name} is {'missing' if name in names else 'not expected'}")
+    return structure.unflatten(
+        [_to_leaf(name, arrays[name], leaf) for name, (_, leaf) in zip(names, leaves, strict=True)]
+    )
+
+
+def is_key(x: Any) -> bool:
+    """Returns whether an array, or its shape, holds typed PRNG keys."""
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def key_data(x: jax.Array) -> jax.Array:
+    """Returns the integers of typed keys; other arrays unchanged."""
+    return jax.random.key_data(x) if is_key(x) else x
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=SEPARATOR)
+
+
+def _to_leaf(name: str, array: np.ndarray, template: Any) -> jax.Array:
+    wanted = jax.eval_shape(jax.random.key_data, template) if is_key(template) else template
+    if (array.dtype, array.shape) != (wanted.dtype, wanted.shape):
+        raise ValueError(
+            f"{name} is {array.dtype}{list(array.shape)}, not {wanted.dtype}{list(wanted.shape)}"
+        )
+    if is_key(template):
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(template))
+    return jnp.asarray(array)
