@@ -19,9 +19,6 @@ from benchmarks import (
     env_throughput,
     harness,
     peers,
-    scaling,
-    scaling_model,
-    tables,
     train_throughput,
 )
 from paths import ROOT
@@ -103,10 +100,7 @@ def test_copied_bytes_are_those_of_all_passes(timed):
 
 @pytest.mark.parametrize(
     ("module", "option"),
-    [
-        *((module, "--json") for module in (env_throughput, peers, scaling, train_throughput)),
-        (scaling_model, "--output"),
-    ],
+    [(module, "--json") for module in (env_throughput, peers, train_throughput)],
 )
 def test_what_uncommitted_code_would_measure_is_not_recorded(
     capsys, tmp_path, monkeypatch, module, option
@@ -115,7 +109,6 @@ def test_what_uncommitted_code_would_measure_is_not_recorded(
         raise AssertionError("began before the check")
 
     monkeypatch.setattr(harness, "measure", fail)
-    monkeypatch.setattr(scaling.subprocess, "run", fail)
     monkeypatch.setattr(harness, "use_devices", lambda number: None)
     monkeypatch.setattr(records, "machine", lambda: {"commit": "abc-dirty"})
     monkeypatch.setattr(sys, "argv", ["x", option, str(tmp_path / "x.json")])
@@ -136,48 +129,15 @@ def test_a_command_names_what_is_not_usual():
 
 
 def test_recorded_commands_can_be_given():
-    modules = {"scaling_model": scaling_model.Options}
     for path in (ROOT / "benchmarks" / "results").glob("*.json"):
         record = json.loads(path.read_text())
         if record["schema"] == harness.SCHEMA:
             name = record["benchmark"]
-            options = modules.get(name) or sys.modules[f"benchmarks.{name}"].Arguments
+            options = sys.modules[f"benchmarks.{name}"].Arguments
             words = shlex.split(record["command"])
             assert words[:3] == ["python", "-m", f"benchmarks.{name}"]
             tyro.cli(options, args=words[3:])
             assert re.fullmatch("[0-9a-f]{12}", record["machines"][0]["commit"])
-
-
-def test_speeds_are_a_table_of_several_records():
-    def record(commit, *speeds):
-        results = [
-            {"name": name, "num_envs": num_envs, "devices": devices, "steps_per_s": 1e6 * millions}
-            for name, num_envs, devices, millions in speeds
-        ]
-        return {"machines": [{"commit": commit}], "results": results}
-
-    one = record("a" * 12, ("base", 4096, 1, 1.25), ("base", 16, 1, 9), ("p", 8192, 1, 2))
-    two = record("b" * 12, ("p", 4096, 2, 3))
-    assert tables.speeds(one, two).splitlines() == [
-        "| M steps/s | base | p |",
-        "| --- | ---: | ---: |",
-        "| 1 device, 4,096 environments, commit `aaaaaaa` | 1.2 | – |",
-        "| 1 device, 8,192 environments, commit `aaaaaaa` | – | 2.0 |",
-        "| 2 devices, 4,096 environments, commit `bbbbbbb` | – | 3.0 |",
-    ]
-
-
-def test_the_pages_of_benchmarks_are_of_their_records():
-    pages = [ROOT / "README.md", *(ROOT / "benchmarks" / "results").glob("*.md")]
-    asked = " ".join(page.read_text() for page in pages)
-    for name in (
-        *("peers_2_devices/speeds", "peers,peers_2_devices/speeds", "scale/speed_up"),
-        *(
-            "env_throughput,env_throughput_2_devices,env_throughput_2_devices_xeon/speeds",
-            "scaling/points",
-        ),
-    ):
-        assert f"<!-- table: {name} -->" in asked
 
 
 def test_a_peer_that_is_not_installed_is_skipped_with_its_reason(monkeypatch):
@@ -206,8 +166,6 @@ def test_an_unknown_set_of_our_own_is_no_peer_to_skip():
     [
         (env_throughput, "--sets"),
         (peers, "--sets"),
-        (scaling, "--sets"),
-        (scaling_model, "--env"),
         (train_throughput, "--env"),
     ],
 )
@@ -237,17 +195,8 @@ def test_an_unknown_set_ends_in_one_line(capsys, monkeypatch, module, option):
             ("--num-envs", "3", "--devices", "2"),
             "num_envs must be multiples of devices=2, got 3",
         ),
-        (scaling, ("--num-envs", "4", "0"), "num_envs must be an integer >= 1, got 0"),
-        (scaling, ("--seeds", "1", "0"), "seeds must be an integer >= 1, got 0"),
-        (
-            scaling,
-            ("--episodes-per-iteration", "64", "9"),
-            "episodes must be multiples of minibatch_size=32, got 9",
-        ),
         (train_throughput, ("--repeats", "0"), "repeats must be an integer >= 1, got 0"),
         (train_throughput, ("--warm", "-1"), "warm must be an integer >= 0, got -1"),
-        (scaling_model, ("--latency", "-1"), "latency must be >= 0, got -1.0"),
-        (scaling_model, ("--bandwidth", "0"), "bandwidth must be > 0, got 0.0"),
     ],
 )
 def test_a_number_that_cannot_be_is_refused_before_measuring(
@@ -257,7 +206,6 @@ def test_a_number_that_cannot_be_is_refused_before_measuring(
         raise AssertionError("began before the check")
 
     monkeypatch.setattr(harness, "measure", fail)
-    monkeypatch.setattr(scaling.subprocess, "run", fail)
     monkeypatch.setattr(harness, "machine", fail)
     monkeypatch.setattr(sys, "argv", ["x", *arguments])
     with pytest.raises(SystemExit) as exit_info:
@@ -279,10 +227,3 @@ def test_more_devices_than_accelerators_are_refused(monkeypatch):
 
 def test_compiling_is_what_the_first_call_took_more():
     assert TIMING.compile_s == 9 - 2
-
-
-@pytest.mark.parametrize(("platform", "unit"), [("darwin", 1), ("linux", 1024)])
-def test_peak_memory_is_in_bytes(monkeypatch, platform, unit):
-    monkeypatch.setattr(sys, "platform", platform)
-    monkeypatch.setattr(scaling.resource, "getrusage", lambda who: SimpleNamespace(ru_maxrss=7))
-    assert scaling.peak_bytes() == 7 * unit

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import json
 import re
 import subprocess
 
@@ -13,7 +14,7 @@ from agents.experiments.protocol import PROTOCOLS, Protocol
 from agents.profiles import figures as profile_figures
 from agents.runs import machine
 from agents.runs.folder import Run, RunFolder, write_json
-from benchmarks import readme_tables, scaling
+from paths import ROOT
 
 
 def rows(seed, greedy, iterations=None):
@@ -222,7 +223,7 @@ def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
     assert figures.drawn_from(tmp_path / "none.png") is None
 
 
-@pytest.mark.parametrize("drawn_by", [figures, profile_figures, scaling])
+@pytest.mark.parametrize("drawn_by", [figures, profile_figures])
 def test_figures_are_out_of_date_where_the_code_that_draws_them_changed(monkeypatch, drawn_by):
     before = drawn_by.digest({})
     assert before == drawn_by.digest({}) != drawn_by.digest({"seed": 1})
@@ -238,8 +239,7 @@ def test_training_is_averaged_over_the_last_points_of_its_seed():
 
 
 def test_recorded_commands_are_those_of_the_protocols_and_machines():
-    folder = readme_tables.Arguments().results
-    found = readme_tables.read_records(folder).values()
+    found = [json.loads(path.read_text()) for path in (ROOT / "benchmarks/results").glob("*.json")]
     experiments = [record for record in found if record["schema"] == records.SCHEMA]
     assert len(experiments) >= 5
     for record in experiments:
@@ -249,83 +249,6 @@ def test_recorded_commands_are_those_of_the_protocols_and_machines():
             record["experiment"], names, devices
         )
         assert record["command"] == command
-
-
-def test_pages_and_figures_are_those_of_the_records():
-    found = readme_tables.read_records(readme_tables.Arguments().results)
-    assert not readme_tables.stale(readme_tables.ROOT, found)
-    page = readme_tables.Arguments().results / "fast_preset.md"
-    assert readme_tables.BLOCK.search(page.read_text())
-
-
-def test_pages_and_figures_are_redrawn_on_demand(example, tmp_path, capsys):
-    folder = tmp_path / "benchmarks" / "results"
-    write_json(folder / "mine.json", example)
-    block = "a\n<!-- table: {} -->\nold\n<!-- end -->\nb\n"
-    (tmp_path / "README.md").write_text(block.format("mine"))
-    (folder / "page.md").write_text(block.format("mine"))
-    check, write = (readme_tables.Arguments(root=tmp_path, write=write) for write in (False, True))
-    with pytest.raises(SystemExit):
-        readme_tables.main(check)
-    readme_tables.main(write)
-    for page in (tmp_path / "README.md", folder / "page.md"):
-        assert "PPO + ICM, paper" in page.read_text()
-        assert "old" not in page.read_text()
-    readme_tables.main(check)
-    example["algorithms"][0]["runs"][0]["curves"]["training"]["success"][0] = 0.5
-    write_json(folder / "mine.json", example)
-    capsys.readouterr()
-    with pytest.raises(SystemExit):
-        readme_tables.main(check)
-    assert "out of date: " + str(folder / "figures" / "mine.png") in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        ("<!-- table: absent -->\n<!-- end -->", "there is no record 'absent'; allowed: mine"),
-        ("<!-- table: mine,absent/x -->\n<!-- end -->", "there is no record 'absent'"),
-        ("<!-- table: mine/x -->\n<!-- end -->", "has no view 'x'; allowed: '', 'summary'"),
-        ("| a <!-- row: absent --> | 1 |", "there is no record 'absent'; allowed: mine"),
-        ("| a <!-- row: mine/7 --> | 1 |", "the record has no seed 7"),
-    ],
-)
-def test_what_no_record_makes_is_an_error(example, tmp_path, asked, message):
-    write_json(tmp_path / "benchmarks" / "results" / "mine.json", example)
-    page = tmp_path / "README.md"
-    page.write_text(f"{asked}\n")
-    with pytest.raises(SystemExit, match=rf"error: .*README.md: .*{re.escape(message)}") as stopped:
-        readme_tables.main(readme_tables.Arguments(root=tmp_path, write=True))
-    assert isinstance(stopped.value.code, str), "which ends the process with 1"
-    assert page.read_text() == f"{asked}\n"
-
-
-def test_a_block_may_be_another_view_of_a_record(example):
-    made = readme_tables.generate("<!-- table: a/summary -->\n<!-- end -->", {"a": example})
-    assert made.splitlines()[2:6] == [
-        "| agent | {P} |",
-        "| --- | ---: |",
-        "| PPO + ICM, paper | 2.0 |",
-        "| PPO + ICM | 55.6 [7.7, 100.0] |",
-    ]
-    example["sets"]["p"]["layout"] = [0, 1, 1]  # seed 0 solves the second of three tasks alone
-    assert tables.summary_markdown(example).endswith("| PPO + ICM | 55.6 (0.7 of 2) |")
-
-
-def test_rows_of_the_leaderboard_are_made_and_others_stay(example):
-    head, other = "| agent | base | {P} |\n|---|---|---|", "| by hand | 1 | 2 |"
-    own = ["| mine [1] <!-- row: a --> | old |", "| one <!-- row: a/0 --> |"]
-    made = readme_tables.generate("\n".join([head, *own, other]), {"a": example})
-    absent = " | ".join(["–"] * 6)
-    assert made.splitlines() == [
-        *head.splitlines(),
-        f"| mine [1] <!-- row: a --> | 100.0 | 55.6 | {absent} | 3 | 3,333 |",
-        f"| one <!-- row: a/0 --> | 100.0 | 33.3 | {absent} | 3 | 3,000 |",
-        other,
-    ]
-    example["algorithms"] *= 2
-    with pytest.raises(ValueError, match="a row of the leaderboard is of one algorithm"):
-        tables.leaderboard_cells(example)
 
 
 @pytest.mark.parametrize("experiment", PROTOCOLS)

@@ -1,6 +1,5 @@
 """Several devices and several processes: the same training as on one, or a clear refusal."""
 
-import dataclasses
 import json
 import os
 import re
@@ -20,7 +19,6 @@ from agents.parallel.sharding import Placement, Shards
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.metrics import read_metrics
 from agents.train import main
-from benchmarks import scaling_model
 from paths import ROOT
 from refusal import refused
 
@@ -192,28 +190,3 @@ def test_one_shard_is_no_work():
     assert Placement.of(None, Config(), 3) == Placement()
     assert processes.from_first(lambda: 3) == 3
     assert processes.agree(None) is None
-
-
-HLO = """
-%body (x: f32[3]) -> f32[3] {
-  %x = f32[3]{0} parameter(0)
-  ROOT %sum = f32[3]{0} all-reduce(%x), channel_id=1, to_apply=%add
-}
-
-ENTRY %main (x: f32[3]) -> f32[3] {
-  %all = (u8[2,5]{1,0}, s32[4]{0}) all-gather(%a, %b), dimensions={0}
-  ROOT %loop = f32[3]{0} while(%x), condition=%more, body=%body, backend_config={TRIPS}
-}
-"""
-
-
-def test_exchanges_are_counted_through_loops():
-    known = HLO.replace("TRIPS", '"known_trip_count":{"n":"7"}')
-    found = scaling_model.exchanges(known)
-    assert [dataclasses.astuple(entry) for entry in found] == [
-        ("all-gather", 26, 1),
-        ("all-reduce", 12, 7),
-    ]
-    assert scaling_model.exchange_seconds(found, 2, 1.0, 2.0) == 26 / 2 / 2 + 1 + 14 * (12 / 4 + 1)
-    with pytest.raises(ValueError, match="a loop of unknown length exchanges data"):
-        scaling_model.exchanges(HLO)

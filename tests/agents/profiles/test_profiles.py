@@ -29,7 +29,6 @@ from agents.profiles.mistakes import (
 from agents.profiles.oracle import LOST, Oracle, replayed
 from agents.profiles.tasks import STRENGTHS, kinds, points
 from agents.runs.folder import write_json
-from benchmarks import readme_tables
 from trap_tube_jax.controls import trap_and_exit_exchanged, trap_exchanged
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -332,17 +331,6 @@ def test_a_profile_holds_every_episode(tiny):
     # No plan of a {P} task is as short as the step limit of this policy.
     assert policy["mistakes"]["layout 1"]["task"] == []
     assert tiny["machines"][0]["commit"]
-
-
-def test_pages_hold_the_tables_of_a_profile(tiny, tmp_path):
-    folder = tmp_path / "benchmarks" / "results"
-    write_json(folder / "mine.json", tiny)
-    page = folder / "page.md"
-    page.write_text("<!-- table: mine -->\nold\n<!-- end -->\n")
-    readme_tables.main(readme_tables.Arguments(root=tmp_path, write=True))
-    assert tables.markdown(tiny) in page.read_text()
-    assert {each.name for each in (folder / "figures").iterdir()} == {"mine.png", "mine_mine.png"}
-    readme_tables.main(readme_tables.Arguments(root=tmp_path))
 
 
 def test_records_of_profiles_name_a_commit_known_before_measuring(tmp_path, monkeypatch, capsys):
