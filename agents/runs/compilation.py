@@ -1,58 +1,33 @@
-"""How programs are compiled: kept from one process to the next, or quickly."""
+"""JAX's persistent compilation cache for the command lines."""
 
 import os
-from collections.abc import Callable
-from concurrent import futures
+import tempfile
 from pathlib import Path
-from typing import ParamSpec, TypeVar
 
 import jax
 
-from agents.config import Config
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
-# Leaves out XLA's newer code generator for fused loops, and what LLVM takes longest for.
-QUICKLY: dict[str, bool | str] = {
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_llvm_disable_expensive_passes": True,
-}
-
-
-def default_folder() -> Path:
-    """The cache's place: under $XDG_CACHE_HOME, or under ~/.cache where that is unset."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "trap_tube_jax" / "jax"
-
 
 def enable_cache() -> None:
-    """Keeps compiled programs from one process to the next, in `default_folder()`.
+    """Keeps compiled programs from one process to the next, in `cache_folder()`.
 
-    JAX's own settings go before it: `JAX_COMPILATION_CACHE_DIR` for another folder,
-    `JAX_ENABLE_COMPILATION_CACHE=0` to compile everything anew.
+    JAX's own settings take precedence: `JAX_COMPILATION_CACHE_DIR` names another folder,
+    `JAX_ENABLE_COMPILATION_CACHE=0` compiles everything anew.
     """
-    if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue]
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
-    jax.config.update("jax_compilation_cache_dir", str(default_folder()))
-    # By default only what took over a second is kept; a run compiles many smaller programs.
+    jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+    # By default JAX keeps only what took over a second; a run compiles many smaller programs.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
-def compiled(lowered: jax.stages.Lowered, config: Config) -> jax.stages.Compiled:
-    """The program, compiled"""
-    return lowered.compile()
+def cache_folder() -> Path:
+    """Returns the cache's folder: in $XDG_CACHE_HOME, ~/.cache, or the temporary folder.
 
-
-def in_background(
-    function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
-) -> futures.Future[Result]:
-    """The result to come of a function that runs in a thread of its own.
-
-    XLA compiles without holding Python up.
+    The last one serves users without a home, as in some containers.
     """
-    worker = futures.ThreadPoolExecutor(1)
-    result = worker.submit(function, *args, **kwargs)
-    worker.shutdown(wait=False)
-    return result
+    base = os.environ.get("XDG_CACHE_HOME")
+    try:
+        parent = Path(base) if base else Path.home() / ".cache"
+    except RuntimeError:  # neither HOME nor an entry in the user database
+        parent = Path(tempfile.gettempdir()) / f"cache-{os.getuid()}"
+    return parent / "trap_tube_jax" / "jax"

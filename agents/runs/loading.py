@@ -1,9 +1,10 @@
-"""Trained policies from wherever they lie: a run, a file of parameters, the shipped ones."""
+"""Trained policies from a run, a file or the shipped agents."""
 
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from agents import pretrained
 from agents.acting import policy_files
@@ -11,79 +12,65 @@ from agents.acting.policy import Policy
 from agents.arrays import from_arrays
 from agents.networks.agent import PARTS, Agent
 from agents.runs.checkpoint import Checkpoints
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import CONFIG_FILE, Run, RunFolder
+from trap_tube_jax.imports import import_modules
 
-SEED = "seed "  # before its number, the name of a run's policy
-
-
-def load_policy(
-    source: str | Path, seed: int | None = None, iteration: int | None = None
-) -> Policy:
-    """One greedy policy of a source; see `agents.load`."""
-    found = {policy.name: policy for policy in load_policies(source, iteration)}
-    name = next(iter(found)) if seed is None else f"{SEED}{seed}"
-    if name not in found:
-        seeds = [each.removeprefix(SEED) for each in found if each.startswith(SEED)]
-        raise ValueError(f"{source} has no seed {seed}; allowed: {', '.join(seeds) or 'none'}")
-    return found[name]
+SEED = "seed "  # prefix of the names of a run's policies
 
 
-def load_policies(source: str | Path, iteration: int | None = None) -> list[Policy]:
-    """All policies of a source: of a run one per seed, else one.
+def load_policies(
+    source: str | Path, iteration: int | None = None, imports: tuple[str, ...] = ()
+) -> list[Policy]:
+    """Loads all greedy policies of a source: one per seed of a run, else one.
 
     Args:
-      source: a run's folder, a file of parameters, or the name of shipped parameters.
-      iteration: the checkpoint of a run to take; the newest if absent.
+      source: a run's folder, a file of parameters, or the name of a shipped agent.
+      iteration: checkpoint of a run; the newest if None.
+      imports: modules to import first, which register names of the settings. No other module is
+        imported, whatever the source says.
 
     Raises:
       ValueError: there is no such policy, or it cannot be read.
     """
+    import_modules(imports)
     path = Path(source)
-    if RunFolder(path).config.is_file():  # another folder does not hide shipped parameters
-        return load_run(path, iteration)
-    is_file = path.is_file()
-    if not is_file and str(source) not in pretrained.names():
-        try:
-            RunFolder.open(path)
-        except ValueError as error:
-            shipped = ", ".join(pretrained.names()) or "none"
-            raise ValueError(f"{error}; shipped parameters: {shipped}") from error
-    if iteration is not None:
-        raise ValueError(f"iteration names a checkpoint of a run: {source} is not a run")
-    return [policy_files.load_policy(path) if is_file else pretrained.load_shipped(str(source))]
+    if (path / CONFIG_FILE).is_file():
+        return load_run(path, iteration, imports)
+    if path.is_file() or str(source) in pretrained.names():
+        if iteration is not None:
+            raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
+        load = policy_files.load_policy if path.is_file() else pretrained.load_shipped
+        return [load(path if path.is_file() else str(source))]  # pyright: ignore[reportArgumentType]
+    known = sorted(entry.parent.name for entry in path.parent.glob(f"*/{CONFIG_FILE}"))
+    raise ValueError(
+        f"{source} is neither a run, a file nor a shipped agent; runs in {path.parent}: "
+        f"{', '.join(known) or 'none'}; shipped agents: {', '.join(pretrained.names())}"
+    )
 
 
-def load_run(path: Path, iteration: int | None = None) -> list[Policy]:
-    """The policies of a run, one per seed.
-
-    Args:
-      path: its folder.
-      iteration: the checkpoint to take; the newest if absent.
-
-    Raises:
-      ValueError: there is no run or no such checkpoint, or it cannot be read.
-    """
-    folder, run = RunFolder.open(path)
+def load_run(path: Path, iteration: int | None, imports: tuple[str, ...]) -> list[Policy]:
+    """Loads the policies of a run from one of its checkpoints; see `load_policies`."""
+    folder, run = RunFolder.open(path, imports)
+    with Checkpoints(folder.checkpoints) as checkpoints:
+        arrays, _ = checkpoints.load(iteration)
     keys = jax.random.split(jax.random.key(0), run.seeds)
     expected = {"params": jax.eval_shape(jax.vmap(Agent(run.config).init), keys)}
-    with Checkpoints(folder.checkpoints) as checkpoints:
-        arrays, record = checkpoints.load(iteration)
-        wanted = tuple(f"params/{part}/" for part in PARTS)
-        stored = {name: array for name, array in arrays.items() if name.startswith(wanted)}
-        try:
-            params = from_arrays(stored, expected)["params"]
-        except ValueError as error:
-            raise checkpoints.refuse_misfit(record, error) from error
+    wanted = tuple(f"params/{part}/" for part in PARTS)
+    stored = {name: array for name, array in arrays.items() if name.startswith(wanted)}
+    try:
+        params = from_arrays(stored, expected)["params"]
+    except ValueError as error:
+        raise ValueError(f"{folder.checkpoints} does not fit this version: {error}") from error
     return policies(run, params, arrays["iteration"])
 
 
-def policies(run: Run, params: Any, iterations: Any) -> list[Policy]:
-    """The policies of a run, one per seed.
+def policies(run: Run, params: Any, iterations: np.ndarray) -> list[Policy]:
+    """Splits the parameters [S, ...] of a run's seeds into one policy per seed.
 
     Args:
       run: the run.
-      params: the parameters [S, ...] of all seeds; those of a curiosity are left out.
-      iterations: i32[S], the iterations that they are after.
+      params: the parameters; those of a curiosity are left out.
+      iterations: i32[S], iterations trained.
     """
     params = {part: params[part] for part in PARTS}
     return [

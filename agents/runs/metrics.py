@@ -1,72 +1,94 @@
-"""The metrics of a run on the host: the CSV file, and when a seed first solved its tasks."""
+"""Files of numbers that a run appends to, and when its seeds were solved.
+
+`metrics.csv` has a row per seed and iteration, `evaluations.csv` a row per seed, evaluated
+iteration and task set.
+"""
 
 import csv
 import dataclasses
-import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from agents.config import Config
+from agents.runs.folder import write_text
 
-Row = Mapping[str, float | int]
+Row = Mapping[str, Any]
 
 
-class MetricsLog:
-    """A CSV file with a row per seed and iteration, on disk as soon as it is written."""
+class CsvLog:
+    """A CSV file that grows by rows, each on disk as soon as it is appended.
+
+    Attributes:
+      rows: all rows.
+    """
 
     def __init__(self, path: Path, *, last_iteration: int = 0):
-        """Opens the file, without the rows of any iteration after `last_iteration`.
+        """Opens the file and drops the rows after `last_iteration`.
 
         Args:
-          path: made at once, empty if there are no rows.
-          last_iteration: what training continues from; 0 starts anew.
+          path: the file; made at the first row if missing.
+          last_iteration: iteration from which training continues; 0 starts anew.
         """
         self._path = path
-        rows = [row for row in read_metrics(path) if row["iteration"] <= last_iteration]
+        kept = [row for row in read_rows(path) if row["iteration"] <= last_iteration]
         self.rows: list[Row] = []
-        self._columns: list[str] = []
-        draft = path.with_name(f".{path.name}.{os.getpid()}")
-        with draft.open("w", newline="") as file:
-            self._write(file, rows)
-        draft.replace(path)
+        if path.exists():
+            write_text(path, "")
+            self.append(kept)
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Adds the rows of one iteration."""
-        with self._path.open("a", newline="") as file:
-            self._write(file, rows)
+        """Appends rows of the columns of the first row.
 
-    def _write(self, file: Any, rows: Sequence[Row]) -> None:
-        writer = csv.writer(file, lineterminator="\n")
-        if rows and not self._columns:
-            self._columns = list(rows[0])
-            writer.writerow(self._columns)
-        writer.writerows([row.get(name, math.nan) for name in self._columns] for row in rows)
+        Raises:
+          ValueError: a row has other columns.
+          OSError: the file cannot be written.
+        """
+        if not rows:
+            return
         self.rows.extend(rows)
+        columns = list(self.rows[0])
+        with self._path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            if not file.tell():
+                writer.writeheader()
+            for row in rows:
+                if list(row) != columns:
+                    raise ValueError(f"{self._path} has columns {columns}, got {list(row)}")
+                writer.writerow(row)
 
 
-def read_metrics(path: Path) -> list[dict[str, float | int]]:
-    """The rows of a metrics file; none if it is missing. A torn last line is left out."""
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Reads the rows of a CSV file, numbers parsed; none if it is missing.
+
+    A torn last line, which a killed process leaves, is dropped.
+
+    Raises:
+      ValueError: the file has no column `iteration`.
+    """
     if not path.exists():
         return []
-    whole = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+    text = path.read_text(encoding="utf-8")
+    whole = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
+    reader = csv.DictReader(whole)
+    if whole and "iteration" not in (reader.fieldnames or ()):
+        raise ValueError(f"{path} has no header with a column 'iteration'; delete or restore it")
     return [
-        {name: _number(text) for name, text in row.items()}
-        for row in csv.DictReader(whole)
+        {name: _parse(text) for name, text in row.items()}
+        for row in reader
         if None not in row and None not in row.values()
     ]
 
 
 @dataclasses.dataclass(frozen=True)
 class FirstSolved:
-    """When the greedy policy first solved what it trains on.
+    """Cost until the greedy policy first solved the validation tasks of the training set.
 
     Attributes:
-      iteration: iterations done by then.
-      episodes: episodes played by then.
-      transitions: environment steps taken by then.
-      seconds: seconds of training by then, compilation excluded.
+      iteration: iterations.
+      episodes: episodes.
+      transitions: environment steps.
+      seconds: seconds of training, without compilation.
     """
 
     iteration: int
@@ -76,45 +98,41 @@ class FirstSolved:
 
     @classmethod
     def of(cls, row: Row) -> "FirstSolved":
-        """That of a row of metrics."""
-        return cls(
-            iteration=int(row["iteration"]),
-            episodes=int(row["episodes"]),
-            transitions=int(row["transitions"]),
-            seconds=round(float(row["seconds"]), 3),
-        )
+        """Reads the cost from a row of metrics."""
+        return cls(**{field.name: row[field.name] for field in dataclasses.fields(cls)})
 
 
 def first_solved(
     rows: Iterable[Row], seeds: Iterable[int], stop_when_solved: float
-) -> tuple[FirstSolved | None, ...]:
-    """When each seed first solved enough of what it trains on, if it has.
+) -> dict[int, FirstSolved]:
+    """Returns when each seed first solved enough validation tasks, for seeds that have.
 
     Args:
-      rows: of metrics, in order of time.
-      seeds: which seeds.
-      stop_when_solved: the share of the tasks that is enough; 0 stands for all of them.
+      rows: metrics, in order of time.
+      seeds: the seeds to look for.
+      stop_when_solved: fraction of the tasks that is enough; 0 stands for all of them.
     """
-    share = stop_when_solved or 1.0
     found: dict[int, Row] = {}
     for row in rows:
-        if row["evaluation"] >= share:
+        if row["evaluation"] >= (stop_when_solved or 1.0):
             found.setdefault(int(row["seed"]), row)
-    return tuple(FirstSolved.of(found[seed]) if seed in found else None for seed in seeds)
+    return {seed: FirstSolved.of(found[seed]) for seed in seeds if seed in found}
 
 
 def is_last(row: Row, config: Config) -> bool:
-    """Whether a seed trains no more after the iteration of this row."""
+    """Returns whether a seed trains no more after the iteration of this row."""
     if row["iteration"] >= config.iterations:
         return True
-    if config.stop_when_solved > 0 and row["evaluation"] >= config.stop_when_solved:
+    if 0 < config.stop_when_solved <= row["evaluation"]:
         return True
     limit = config.max_transitions
     return limit is not None and int(row["transitions"]) + config.longest_iteration > limit
 
 
-def _number(text: str) -> float | int:
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
+def _parse(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text

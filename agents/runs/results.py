@@ -1,85 +1,78 @@
-"""Any set of runs as one table of plain values."""
+"""Results of runs as one tidy table."""
 
-import itertools
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
-from agents.runs.folder import CONFIG_FILE, Run, RunFolder, is_done, read_json
-from agents.runs.metrics import Row, first_solved, read_metrics
+import pandas as pd
 
-COSTS = ("episodes", "transitions", "seconds")
+from agents.runs.folder import CONFIG_FILE, RunFolder, read_json
 
 
-def results(paths: str | Path | Iterable[str | Path]) -> list[dict[str, Any]]:
-    """One record per seed of all runs in folders, such as `pandas.DataFrame` takes.
-
-    A record holds `run`, the run's folder; `preset`; `seed`; every setting by its name; and
-
-        finished              whether the run is over
-        trained_iterations    done so far; likewise trained_episodes, trained_transitions and
-                              trained_seconds
-        success, evaluation   the share of tasks solved last, in training and by greedy play
-        solved_iterations     until greedy play first solved the training set (or the share
-                              `stop_when_solved` of it); likewise solved_episodes,
-                              solved_transitions and solved_seconds; None if it has not
-        percent_<set>         of each set's tasks, percent solved once training was over; None
-                              where training has gone on since
+def results(paths: str | Path | Iterable[str | Path]) -> pd.DataFrame:
+    """Returns the evaluations of all runs in folders, one row each.
 
     Args:
-      paths: a folder or several: of a run, or anything that holds runs, at any depth.
+      paths: one or several folders: of a run, or of runs at any depth.
 
     Returns:
-      The records, by folder and seed. What is not known yet is None.
+      A data frame with a row for each run, seed, evaluated iteration, purpose of the tasks
+      (validation or test) and task set. Columns: run, algorithm, preset, commit, the columns of
+      `evaluations.csv` (seed, iteration, purpose, task_set, tasks, solved, layouts, layouts_total,
+      length), and every setting.
 
     Raises:
-      ValueError: there is no run in one of the folders, or it cannot be read.
+      ValueError: a folder holds no run, or a file cannot be read.
     """
-    given = [paths] if isinstance(paths, str | Path) else paths
-    records = [record for path in given for record in _of_folder(Path(path))]
-    names = list(dict.fromkeys(itertools.chain.from_iterable(records)))
-    return [{name: record.get(name) for name in names} for record in records]
+    tables = [_of_run(run) for run in find_runs(paths)]
+    return pd.concat(tables, ignore_index=True)
 
 
-def _of_folder(path: Path) -> list[dict[str, Any]]:
-    configs = sorted(path.rglob(CONFIG_FILE))
-    runs = [file.parent for file in configs if not file.parent.name.startswith(".")]
-    if not runs:
-        raise ValueError(f"{path} holds no run")
-    return [record for run in runs for record in _of_run(*RunFolder.open(run))]
+def metrics(paths: str | Path | Iterable[str | Path]) -> pd.DataFrame:
+    """Returns the training metrics of all runs in folders, one row per seed and iteration.
+
+    Columns: run, algorithm, and those of `metrics.csv`. Arguments and errors as in `results`.
+    """
+    tables = []
+    for folder in find_runs(paths):
+        table, values = _read(folder.metrics), read_json(folder.config)
+        table.insert(0, "run", str(folder.path))
+        table.insert(1, "algorithm", values["algorithm"])
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
 
 
-def _of_run(folder: RunFolder, run: Run) -> list[dict[str, Any]]:
-    rows, evaluated = read_metrics(folder.metrics), read_json(folder.evaluation) or []
-    solved = first_solved(rows, run.seed_range, run.config.stop_when_solved)
-    finished, records = is_done(folder, run), []
-    for seed, first in zip(run.seed_range, solved, strict=True):
-        last: Row = next((row for row in reversed(rows) if row["seed"] == seed), {})
-        records.append(
-            {
-                "run": str(folder.path),
-                "preset": run.preset,
-                "seed": seed,
-                **run.config.to_dict(),
-                "finished": finished,
-                "trained_iterations": last.get("iteration", 0),
-                **{f"trained_{name}": last.get(name, 0) for name in COSTS},
-                **{name: last.get(name) for name in ("success", "evaluation")},
-                "solved_iterations": first and first.iteration,
-                **{f"solved_{name}": first and getattr(first, name) for name in COSTS},
-                **_percents(evaluated, seed, last.get("iteration", 0)),
-            }
-        )
-    return records
+def find_runs(paths: str | Path | Iterable[str | Path]) -> list[RunFolder]:
+    """Returns the runs in folders, sorted by path.
+
+    Raises:
+      ValueError: a folder holds no run.
+    """
+    found: list[RunFolder] = []
+    for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
+        configs = sorted(path.rglob(CONFIG_FILE))
+        if not configs:
+            raise ValueError(f"{path} holds no run")
+        found.extend(RunFolder(config.parent) for config in configs)
+    return found
 
 
-def _percents(
-    evaluated: list[dict[str, Any]], seed: int, iteration: float
-) -> dict[str, float | None]:
-    """Those of a seed's evaluation; None where training has gone on since."""
-    return {
-        f"percent_{score['set']}": score["percent"] if entry["iteration"] == iteration else None
-        for entry in evaluated
-        if entry["policy"] == f"seed {seed}"
-        for score in entry["sets"]
+def _of_run(folder: RunFolder) -> pd.DataFrame:
+    values = read_json(folder.config)  # plain values: no name in it is looked up or imported
+    machines = read_json(folder.provenance) if folder.provenance.exists() else []
+    table = _read(folder.evaluations)
+    settings = {name: str(v) if isinstance(v, list) else v for name, v in values["config"].items()}
+    first = {
+        "run": str(folder.path),
+        "algorithm": values["algorithm"],
+        "preset": values["preset"],
+        "commit": machines[-1]["commit"] if machines else None,
     }
+    for place, (name, value) in enumerate(first.items()):
+        table.insert(place, name, value)
+    return table.assign(**settings)
+
+
+def _read(path: Path) -> pd.DataFrame:
+    if not path.exists() or not path.stat().st_size:
+        return pd.DataFrame({"seed": [], "iteration": []})
+    return pd.read_csv(path)

@@ -1,332 +1,369 @@
-"""A run from its start or newest checkpoint to its results: training, saving, reporting."""
+"""A run from its start or newest checkpoint to its results.
+
+`train_run` is all that commands need. One process does one thing at a time: an iteration, then
+saving, then evaluation. No thread runs JAX in the background.
+"""
 
 import dataclasses
-import functools
+import os
 import time
-from collections.abc import Sequence
-from concurrent import futures
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator, own_and_paper_sets
-from agents.acting.policy import Policy
-from agents.arrays import from_arrays, to_arrays
-from agents.networks.agent import PARTS, num_parameters
+from agents.acting.evaluation import evaluate, own_and_paper_sets
+from agents.acting.policy_files import load_policy
+from agents.arrays import from_arrays
+from agents.networks.agent import num_parameters
 from agents.parallel import processes
-from agents.parallel.sharding import Placement
-from agents.ppo.learner import TrainState, make_train
-from agents.runs import report, report_page
-from agents.runs.checkpoint import Checkpoints
-from agents.runs.compilation import compiled, in_background
-from agents.runs.folder import Run, RunFolder, write_json
+from agents.parallel.devices import Placement
+from agents.ppo.learner import Learner, TrainState, make_train, memory_estimate
+from agents.runs import report
+from agents.runs.checkpoint import CheckpointError, Checkpoints
+from agents.runs.display import ProgressLine
+from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows, make_evaluator
+from agents.runs.folder import Run, RunFolder, read_json, write_json
 from agents.runs.loading import policies
-from agents.runs.metrics import MetricsLog, Row, read_metrics
-from agents.runs.programs import Programs
-from agents.runs.progress import Progress
-from agents.runs.stopping import Stopped, StopSignals
-from agents.runs.story import resume_command, story
-from agents.runs.tracking import Tracker
+from agents.runs.metrics import CsvLog, FirstSolved, Row, first_solved, is_last
+from agents.runs.provenance import provenance
+from agents.runs.stopping import DivergedError, Stopped, StopSignals
+from trap_tube_jax.scoring.tasks import evaluation_tasks
 
-POLL_SECONDS = 0.005
+Advance = Callable[[TrainState, np.ndarray], tuple[TrainState, dict[str, jax.Array]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """How a run is carried out; nothing here changes what it learns on one device.
+
+    Attributes:
+      checkpoint_every: iterations from one checkpoint to the next.
+      keep: number of newest checkpoints to keep.
+      devices: number of devices that share the episodes; see `Placement.of`.
+      evaluate_every: iterations from one greedy evaluation on all `sets` to the next, by which the
+        best parameters are kept; 0: never.
+      sets: short names of the sets to evaluate on; the paper's eight and the training set if None.
+      reported: test tasks per set in the final evaluation; the run's `eval_episodes` if None.
+      report: writes the learning curves, the report and a GIF at the end.
+    """
+
+    checkpoint_every: int = 10
+    keep: int = 3
+    devices: int | None = None
+    evaluate_every: int = 0
+    sets: tuple[str, ...] | None = None
+    reported: int | None = None
+    report: bool = True
+
+    def __post_init__(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+          ValueError: a number is too small.
+        """
+        smallest = {"checkpoint_every": 1, "keep": 1, "evaluate_every": 0, "reported": 1}
+        for name, low in smallest.items():
+            value = getattr(self, name)
+            if value is not None and value < low:
+                raise ValueError(f"{name} must be >= {low}, got {value}")
+        for name in self.sets or ():
+            tt.task_set(name)
+
+
+def train_run(
+    path: Path, run: Run, options: RunOptions | None = None, *, console: Console | None = None
+) -> None:
+    """Trains a run to its end from its newest checkpoint, evaluates it and writes its files.
+
+    Returns at once if the run is finished. Only one process may call it for a folder at a time.
+
+    Args:
+      path: the run's folder, made if missing.
+      run: what to train; of a stored run only `EXTENDABLE` settings may differ.
+      options: how to train.
+      console: where progress is shown; nowhere if None.
+
+    Raises:
+      ValueError: the run cannot be trained or continued, or it diverged (`DivergedError`).
+      OSError: a file cannot be written.
+      Stopped: on SIGINT or SIGTERM, after the current iteration has been saved.
+    """
+    options, console = options or RunOptions(), console or Console(quiet=True)
+    folder = RunFolder(path)
+    check_memory(run)
+    with folder.lock() if processes.is_first() else processes.nothing():
+        if processes.is_first():
+            if folder.config.is_file():
+                run.check_continues(RunFolder.open(path)[1])
+            else:
+                folder.create(run)
+        session = Session(folder, run, options, console)
+        with session.checkpoints or processes.nothing():
+            session.train()
+            session.finish()
 
 
 class Session:
-    """One process's part of a run: owns its state, its files and what is shown."""
+    """One process's part of a run: owns its state and its files."""
 
-    def __init__(
-        self,
-        folder: RunFolder,
-        run: Run,
-        console: Console,
-        *,
-        checkpoint_every: int,
-        keep: int,
-        placement: Placement,
-        tracker: Tracker | None = None,
-        options: Sequence[str] = (),
-    ):
-        """Builds training and takes up the newest checkpoint.
-
-        Args:
-          folder: the run's files.
-          run: what to train.
-          console: where to show it.
-          checkpoint_every: iterations from one checkpoint to the next.
-          keep: how many checkpoints to keep.
-          placement: the devices to train on; need not be that of the checkpoint.
-          tracker: evaluates on further sets during training; for a single process only.
-          options: command-line options to repeat when the run is continued.
+    def __init__(self, folder: RunFolder, run: Run, options: RunOptions, console: Console):
+        """Builds the learner and restores the newest checkpoint.
 
         Raises:
-          ValueError: the settings cannot be trained with, or the checkpoint is unusable.
+          ValueError: the settings cannot be trained with, or the checkpoint cannot be continued.
         """
-        self.folder, self.run, self.console = folder, run, console
-        self._every, self._tracker, self._placement = checkpoint_every, tracker, placement
-        self.resume_command = resume_command(folder, *options)
-        self._results: futures.Future[tuple[Evaluator, report_page.Pay]] | None = None
-        self._introduce()
-        self._train = make_train(run.config, shards=placement.episodes)
-        # Files are the first process's alone.
-        is_first = processes.is_first()
-        self._checkpoints = Checkpoints(folder.checkpoints, keep=keep) if is_first else None
+        self.folder, self.run, self.options, self.console = folder, run, options, console
+        self.placement = Placement.of(options.devices, run.config, run.seeds)
+        self.learner = make_train(run.config, axis=self.placement.axis)
+        self.sets = options.sets or own_and_paper_sets(run.config)
         keys = jax.vmap(jax.random.key)(np.array(run.seed_range, np.uint32))
-        init = jax.jit(jax.vmap(self._train.init))
+        init = jax.jit(jax.vmap(self.learner.init))
         self._shapes = jax.eval_shape(init, keys)
-        try:
-            stored = processes.from_first(self._stored)
-        except ValueError:
-            self.close()
-            raise
-        arrays, self._progress = stored or (None, Progress.start(run))
+        # The first process writes; all read.
+        is_first = processes.is_first()
+        self.checkpoints = Checkpoints(folder.checkpoints, keep=options.keep) if is_first else None
+        state, record = self._restore()
+        self.iteration: int = record["iteration"]
+        self.seconds: float = record["seconds"]
+        self.compile_seconds: float = record["compile_seconds"]
+        self.state = self.placement.put(init(keys) if state is None else state)
+        self.saved = self.iteration
+        self.metrics = CsvLog(folder.metrics, last_iteration=self.iteration) if is_first else None
+        self.evaluations = (
+            CsvLog(folder.evaluations, last_iteration=self.iteration) if is_first else None
+        )
+        self._last = {int(row["seed"]): row for row in record["last"]}
+        self._tracker = None
+        if options.evaluate_every and self.evaluations is not None:
+            self._tracker = PeriodicEvaluator(folder, run, self.sets, options.evaluate_every)
+            self._tracker.resume(self.evaluations.rows)
 
-        def first() -> TrainState:
-            if arrays is not None:
-                return placement.put(from_arrays(arrays, self._shapes))
-            return placement.put(compiled(init.lower(keys), run.config)(keys))
+    @property
+    def active(self) -> np.ndarray:
+        """bool[S]: seeds that train on."""
+        config, last = self.run.config, self._last
+        over = [seed in last and is_last(last[seed], config) for seed in self.run.seed_range]
+        return ~np.array(over)
 
-        # Meanwhile the programs of an iteration are traced.
-        self._first = in_background(first)
-        self.saved = self._progress.iteration
-        self._log = MetricsLog(folder.metrics, last_iteration=self.saved) if is_first else None
-        if tracker is not None and self._log is not None:
-            tracker.resume(self._log.rows, self.saved)
+    @property
+    def solved(self) -> dict[int, FirstSolved]:
+        """When each solved seed was first solved, as far as `metrics.csv` tells."""
+        rows = self.metrics.rows if self.metrics is not None else ()
+        return first_solved(rows, self.run.seed_range, self.run.config.stop_when_solved)
 
-    def close(self) -> None:
-        """Ends whatever works in the background."""
-        if self._checkpoints is not None:
-            self._checkpoints.close()
-
-    def train(self, stop: StopSignals, *, then_finish: bool = False) -> None:
-        """Trains until every seed is solved, or has come to the limit of iterations or steps.
-
-        Args:
-          stop: tells when to stop early.
-          then_finish: `finish` will follow; what it needs compiles from the second iteration on.
+    def train(self) -> None:
+        """Trains until every seed has reached a limit.
 
         Raises:
           Stopped: on request; everything is saved.
-          KeyboardInterrupt: on a second request; the current iteration is lost.
+          DivergedError: a loss or a parameter is not finite; the last checkpoint stays.
         """
-        if not self._progress.active.any():
+        if not self.active.any():
             return
+        self._note_provenance()
+        count = num_parameters(self._shapes.params) // self.run.seeds
+        self._say(
+            f"{self.folder.path}: {tt.task_set(self.run.config.env_id).id}, curiosity "
+            f"{self.run.config.curiosity}, seed {', '.join(map(str, self.run.seed_range))}, "
+            f"{count:,} parameters, on {self.placement}. Compiling ..."
+        )
         advance = self._compile()
-        live = report.LiveReport(self.console, self.run.config.iterations, self.run.seeds)
-        with stop, live:
-            while self._progress.active.any():
+        stop = StopSignals(lambda: self._say("Finishing this iteration; Ctrl-C again stops now."))
+        with stop, ProgressLine(self.console, self.run.config.iterations) as progress:
+            while self.active.any():
                 rows = self._iterate(advance)
-                num_solved = sum(first is not None for first in self._progress.solved)
-                live.update(rows, num_solved, ready_at=advance.ready_at)
-                if then_finish and self._log is not None and self._results is None:
-                    self._prepare_results()
-                # A signal may arrive at any time: what counts is what all agreed on here.
+                progress.update(rows)
+                # A signal may reach any process: all have to agree on it.
                 request = processes.agree(stop.received)
-                is_over = not self._progress.active.any()
-                if is_over or request or self._progress.iteration % self._every == 0:
+                due = self.iteration % self.options.checkpoint_every == 0
+                if due or request or not self.active.any():
                     self._save()
                 if request:
                     raise Stopped(request)
 
     def finish(self) -> None:
-        """Evaluates on all task sets, writes the results and says what they show."""
-        run, folder = self.run, self.folder
-        state = self._local_state()
-        if self._log is None:
+        """Evaluates the final policies, or the best ones, and writes the results."""
+        state = self.placement.local(self.state)
+        if self.evaluations is None or self.metrics is None:
             return
-        self.console.print("Evaluating on all task sets ...")
-        evaluator, pay = self._ready() if self._results is None else self._results.result()
-        trained = self._policies(state)
-        played = {policy.name: evaluator(policy.params) for policy in trained}
-        results = {name: evaluator.scores(outcome) for name, outcome in played.items()}
-        write_json(folder.evaluation, report.results_json(trained, results))
-        self._summarize(state, self._log)
-        env = tt.task_set(run.config.env_id)
-        folder.animation.unlink(missing_ok=True)
-        report.save_first_solved(folder.animation, evaluator, played.values(), env.short)
-        solved = dict(zip(run.seed_range, self._progress.solved, strict=True))
-        above, below = story(
-            folder, run, results.values(), list(solved.values()), self.resume_command
-        )
-        report_page.save(
-            folder.page,
-            title=folder.path.name,
-            sentences=[*above, *below],
-            settings={"preset": run.preset, **run.config.to_dict()},
-            scores=results,
-            curves=folder.curves,
-            evaluator=evaluator,
-            played=played[trained[0].name],
-            pay=functools.partial(pay, jax.tree.map(lambda x: x[0], state)),
-        )
-        self._say(above)
-        for name, result in results.items():
-            table = report.evaluation_table(result, f"{folder.path.name}, {name}")
-            self.console.print(table.to_rich())
-        self.console.print(report.FEW_LAYOUTS)
-        self.console.print(report.summary_table(solved, env.id).to_rich())
-        self._say_where()
-        self._say(below)
+        final = policies(self.run, state.params, np.asarray(state.iteration))
+        shown = {}
+        for seed, policy in zip(self.run.seed_range, final, strict=True):
+            best = self.folder.best(seed)
+            shown[seed] = load_policy(best) if self._tracker and best.is_file() else policy
+        tested = {
+            (row["seed"], row["iteration"])
+            for row in self.evaluations.rows
+            if row["purpose"] == "test"
+        }
+        missing = [s for s, policy in shown.items() if (s, policy.iteration) not in tested]
+        if not missing and (self.folder.page.exists() or not self.options.report):
+            return
+        self._say("Evaluating ...")
+        tasks = self.options.reported or self.run.config.eval_episodes
+        evaluator = make_evaluator(self.run, self.sets, tasks, "test")
+        played = {seed: evaluator(policy.params) for seed, policy in shown.items()}
+        for seed in missing:
+            scores = evaluator.scores(played[seed])
+            self.evaluations.append(evaluation_rows(scores, shown[seed], seed, "test"))
+        if self.options.report:
+            first = jax.tree.map(lambda x: x[0], state)
+            report.write(self.folder, self.run, self.learner, first, evaluator, played)
 
-    def summarize(self) -> None:
-        """Writes the summary and the learning curves."""
-        state = self._local_state()
-        if self._log is not None:
-            self._summarize(state, self._log)
+    def _restore(self) -> tuple[TrainState | None, dict[str, Any]]:
+        """Returns the state of the newest checkpoint, if there is one, and its record.
 
-    def _stored(self) -> tuple[Any, Progress] | None:
-        """The arrays of the newest checkpoint, and how far it had come."""
-        if self._checkpoints is None or not self._checkpoints.iterations:
-            return None
-        state, record = self._checkpoints.restore(self._shapes)
-        rows = read_metrics(self.folder.metrics)
-        progress = Progress.resumed(record, self.run, rows)
-        progress.check(self.run, np.asarray(state.iteration))
-        return to_arrays(state), progress
+        Raises:
+          ValueError: the checkpoint is unusable, or of other settings.
+        """
+        nothing = {"iteration": 0, "seconds": 0.0, "compile_seconds": 0.0, "last": []}
+        processes.barrier()  # the first process may be making the folder
+        if not self.folder.checkpoints.is_dir():
+            return None, nothing
+        with Checkpoints(self.folder.checkpoints) as checkpoints:
+            if not checkpoints.iterations:
+                return None, nothing
+            arrays, record = checkpoints.load()
+        try:
+            self.run.check_continues(Run.from_dict(record["run"]))
+            state = from_arrays(arrays, self._shapes)
+        except (KeyError, ValueError) as error:
+            raise CheckpointError(
+                f"checkpoint {record['iteration']} in {self.folder.checkpoints} cannot be "
+                f"continued: {error}"
+            ) from error
+        if record["iteration"] > self.run.config.iterations:
+            raise ValueError(
+                f"iterations must be at least {record['iteration']}, which are done, got "
+                f"{self.run.config.iterations}"
+            )
+        return state, record
 
-    @functools.cached_property
-    def _state(self) -> TrainState:
-        """The first state, which later ones replace."""
-        return self._first.result()
-
-    def _compile(self) -> Programs:
-        count = num_parameters(self._shapes.params) // self.run.seeds
-        iteration = self._progress.iteration
-        begin = f"from iteration {iteration}" if iteration else "from the start"
-        self._say([f"{count:,} parameters, {begin}. Compiling one iteration of training ..."])
-        active = np.ones(self.run.seeds, bool)
-        return Programs(self._train, self._placement, self._shapes, active)
-
-    def _prepare_results(self) -> None:
-        """Compiles in the background what `finish` needs."""
-        self._results = in_background(self._ready)
-
-    def _ready(self) -> tuple[Evaluator, report_page.Pay]:
-        """What plays the tasks of all sets, and what the curiosity pays for it, compiled."""
-        config = self.run.config
-        sets = own_and_paper_sets(config)
-        evaluator = Evaluator.of_sets(config, sets, config.eval_episodes)
-        state = jax.eval_shape(self._train.init, jax.random.key(0))
-        evaluator.compile({part: state.params[part] for part in PARTS})
-        return evaluator, report_page.compile_pay(config, state, evaluator)
-
-    def _iterate(self, advance: Programs) -> list[Row]:
-        progress, active = self._progress, self._progress.active
+    def _compile(self) -> Advance:
+        """Compiles one iteration and the evaluation after it, for all seeds, ahead of time."""
         started = time.perf_counter()
-        self._state, metrics = advance(self._state, active)
-        _wait(metrics)
-        host = {name: np.asarray(values) for name, values in metrics.items()}
-        compiling = max(0.0, advance.ready_at - started)  # of the first iteration alone
-        taken = time.perf_counter() - started - compiling
-        steps = host.pop("steps")
-        iteration, seconds = progress.iteration + 1, progress.seconds + taken
+        advance = self.placement.shard(make_advance(self.learner))
+        compiled = jax.jit(advance, donate_argnums=0).lower(self.state, self.active).compile()
+        self.compile_seconds += time.perf_counter() - started
+        return compiled
+
+    def _iterate(self, advance: Advance) -> list[Row]:
+        """Advances the active seeds by one iteration; returns and logs their rows of metrics."""
+        active, started = self.active, time.perf_counter()
+        self.state, metrics = advance(self.state, active)
+        host = {name: np.asarray(values) for name, values in sorted(metrics.items())}
+        taken = time.perf_counter() - started
+        self.iteration, self.seconds = self.iteration + 1, self.seconds + taken
+        steps, finite = host.pop("steps"), host.pop("is_finite")
         rows: list[Row] = [
             {
                 "seed": seed,
-                "iteration": iteration,
-                **{name: values[index] for name, values in host.items()},
+                "iteration": self.iteration,
+                **{name: values[index].item() for name, values in host.items()},
                 "transitions_per_second": round(float(steps[index]) / taken, 1),
-                "seconds": round(seconds, 3),
+                "seconds": round(self.seconds, 3),
             }
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        progress = progress._replace(
-            iteration=iteration,
-            seconds=seconds,
-            compile_seconds=progress.compile_seconds + compiling,
-        ).after(self.run, rows)
-        changes = zip(self.run.seed_range, self._progress.solved, progress.solved, strict=True)
-        rows = self._track(rows, just_solved={seed for seed, old, new in changes if old != new})
-        if self._log is not None:
-            self._log.append(rows)
-        self._progress = progress
+        if not finite[active].all():
+            raise DivergedError(
+                f"training diverged in iteration {self.iteration}: a loss or a parameter is not "
+                f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
+            )
+        if self.metrics is not None:
+            self.metrics.append(rows)
+        self._last |= {int(row["seed"]): row for row in rows}
+        self._track(active)
         return rows
 
-    def _track(self, rows: list[Row], just_solved: set[int]) -> list[Row]:
-        """The rows of an iteration with what the tracker adds to them.
-
-        A seed is evaluated when it would be if it were trained alone.
-        """
-        tracker = self._tracker
-        if tracker is None:
-            return rows
-        by_seed = {int(row["seed"]): row for row in rows}
-        due = set(by_seed) if tracker.is_due(int(rows[0]["iteration"])) else just_solved
-        policies = self._policies(self._local_state()) if due else []
-        found = {
-            seed: tracker.evaluate(seed, policy)
-            for seed, policy in zip(self.run.seed_range, policies, strict=bool(due))
-            if seed in due
-        }
-        return [{**row, **found.get(seed, tracker.skip())} for seed, row in by_seed.items()]
+    def _track(self, active: np.ndarray) -> None:
+        """Evaluates the active seeds on all sets where that is due."""
+        due = self.options.evaluate_every and self.iteration % self.options.evaluate_every == 0
+        if not due and (self.active == active).all():
+            return
+        state = self.placement.local(self.state)
+        if self._tracker is None or self.evaluations is None:
+            return
+        found = policies(self.run, state.params, np.asarray(state.iteration))
+        for index, seed in enumerate(self.run.seed_range):
+            if active[index] and (due or not self.active[index]):
+                self.evaluations.append(self._tracker.evaluate(seed, found[index]))
 
     def _save(self) -> None:
-        record = {**self._progress.to_dict(), "run": self.run.to_dict(), "version": tt.__version__}
-        state = self._local_state()
-        if self._checkpoints is not None:
-            self._checkpoints.save(self._progress.iteration, state, record)
-            if self._tracker is not None:
-                self._tracker.forget(self._checkpoints.iterations[0])
-        self.saved = self._progress.iteration
+        state = self.placement.local(self.state)
+        if self.checkpoints is not None:
+            record = {
+                "run": self.run.to_dict(),
+                "seconds": self.seconds,
+                "compile_seconds": self.compile_seconds,
+                "last": list(self._last.values()),
+            }
+            self.checkpoints.save(self.iteration, state, record)
+        self.saved = self.iteration
 
-    def _local_state(self) -> TrainState:
-        """The whole state on one device; every process has to call it."""
-        return self._placement.local(self._state)
+    def _note_provenance(self) -> None:
+        """Adds this machine and commit to those that have trained the run."""
+        if self.metrics is None:
+            return
+        path = self.folder.provenance
+        known = read_json(path) if path.exists() else []
+        here = {**provenance(), "devices": str(self.placement)}
+        if here not in known:
+            write_json(path, [*known, here])
 
-    def _policies(self, state: TrainState) -> list[Policy]:
-        return policies(self.run, state.params, np.asarray(state.iteration))
+    def _say(self, line: str) -> None:
+        self.console.print(line, soft_wrap=True, highlight=False, markup=False)
 
-    def _summarize(self, state: TrainState, log: MetricsLog) -> None:
-        seeds = zip(self.run.seed_range, state.episodes, self._progress.solved, strict=True)
-        summary = {
-            "env_id": self.run.config.env_id,
-            "iterations": self._progress.iteration,
-            "training_seconds": round(self._progress.seconds, 3),
-            "compile_seconds": round(self._progress.compile_seconds, 3),
-            "seeds": [
-                {
-                    "seed": seed,
-                    "episodes": int(episodes),
-                    "first_solved": first and dataclasses.asdict(first),
-                }
-                for seed, episodes, first in seeds
-            ],
+
+def make_advance(learner: Learner) -> Advance:
+    """Returns a function that trains all active seeds for one iteration and evaluates them.
+
+    It maps states [S, ...] and bool[S] to the next states and metrics [S]; seeds that are not
+    active stay as they are.
+    """
+    config = learner.config
+    tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")
+
+    def one_seed(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        after, metrics = learner.iterate(state)
+        outcome = evaluate(learner.agent, after.params, learner.env, tasks)
+        return after, {
+            **metrics,
+            "evaluation": jnp.mean(outcome.solved.astype(jnp.float32)),
+            "episodes": after.episodes,
+            "transitions": after.transitions,
+            "steps": after.transitions - state.transitions,
         }
-        write_json(self.folder.summary, summary)
-        report.save_curves(log.rows, self.folder.curves, self.folder.path.name)
 
-    def _introduce(self) -> None:
-        run = self.run
-        seeds = ", ".join(map(str, run.seed_range))
-        self._say(
-            [
-                f"{self.folder.path}: preset {run.preset}, {tt.task_set(run.config.env_id).id}, "
-                f"curiosity {run.config.curiosity}, seed {seeds}, on {self._placement}"
-            ]
+    def advance(states: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
+        if len(active) == 1:  # a run whose only seed is not active is over
+            after, metrics = one_seed(jax.tree.map(lambda x: x[0], states))
+            return jax.tree.map(lambda x: x[None], (after, metrics))
+        after, metrics = jax.vmap(one_seed)(states)
+        keep = jax.vmap(jnp.where)
+        return jax.tree.map(lambda new, old: keep(active, new, old), after, states), metrics
+
+    return advance
+
+
+def check_memory(run: Run) -> None:
+    """Refuses a run whose arrays would not fit in this machine's memory.
+
+    Raises:
+      ValueError: they would not; the message names both sizes.
+    """
+    need = run.seeds * memory_estimate(run.config)
+    have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if need > have:
+        raise ValueError(
+            f"the run needs about {need / 1e9:.1f} GB of memory, this machine has "
+            f"{have / 1e9:.1f} GB: lower --seeds ({run.seeds}) or --episodes-per-iteration "
+            f"({run.config.episodes_per_iteration})"
         )
-
-    def _say(self, lines: Sequence[str]) -> None:
-        for line in lines:
-            self.console.print(line, soft_wrap=True, highlight=False)
-
-    def _say_where(self) -> None:
-        folder = self.folder
-        files = {
-            "settings": folder.config,
-            "metrics": folder.metrics,
-            "checkpoints": folder.checkpoints,
-            "learning curves": folder.curves,
-            "evaluation": folder.evaluation,
-            "summary": folder.summary,
-            "report": folder.page,
-        }
-        self._say([f"{name:>15}: {path}" for name, path in files.items()])
-
-
-def _wait(arrays: Any) -> None:
-    """Blocks until the arrays are there, but lets signals through."""
-    while not all(x.is_ready() for x in jax.tree.leaves(arrays)):
-        time.sleep(POLL_SECONDS)

@@ -1,17 +1,16 @@
 """Stopping a run by Ctrl-C or SIGTERM."""
 
 import signal
+import threading
 from collections.abc import Callable
 from typing import Any, Self
 
-AGAIN = "press Ctrl-C again to stop at once"
 
-
-class Stopped(Exception):  # noqa: N818  it is no error
+class Stopped(Exception):  # noqa: N818  not an error
     """Training was asked to stop and has saved.
 
     Attributes:
-      signal: the number of the signal, which another process may have received.
+      signal: number of the signal.
     """
 
     def __init__(self, number: int):
@@ -19,28 +18,35 @@ class Stopped(Exception):  # noqa: N818  it is no error
         self.signal = number
 
 
+class DivergedError(ValueError):
+    """A loss or a parameter is not finite."""
+
+
 class StopSignals:
-    """Turns the first Ctrl-C or SIGTERM into a request, and the second into an exception."""
+    """Turns the first Ctrl-C or SIGTERM into a request and the second into KeyboardInterrupt.
+
+    A context manager. In a thread other than the main one, which receives no signals, nothing
+    changes.
+
+    Attributes:
+      received: number of the first signal, or None.
+    """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-    def __init__(self, on_request: Callable[[], None]):
+    def __init__(self, on_request: Callable[[], None] = lambda: None):
         self.received: int | None = None
         self._on_request = on_request
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        self._previous = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {n: signal.signal(n, self._handle) for n in self.SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
-
-    def end_process(self) -> None:
-        """Lets further signals end the process at once, as they do by default."""
-        for number in self.SIGNALS:
-            signal.signal(number, signal.SIG_DFL)
 
     def _handle(self, number: int, frame: Any) -> None:
         del frame

@@ -1,0 +1,92 @@
+"""Greedy evaluation on several task sets as training goes, and the best parameters."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from agents.acting.evaluation import Evaluator
+from agents.acting.policy import Policy
+from agents.acting.policy_files import save_policy
+from agents.runs.folder import Run, RunFolder
+from agents.runs.metrics import Row
+from trap_tube_jax.registry import task_set
+from trap_tube_jax.scoring.scores import Score
+from trap_tube_jax.scoring.tasks import Purpose, evaluation_tasks
+
+
+class PeriodicEvaluator:
+    """Evaluates the seeds of a run every so many iterations and keeps the best parameters.
+
+    Parameters are the best if they solve the highest mean fraction of the validation tasks over
+    all sets; base, a single task, counts only where it is trained on.
+    """
+
+    def __init__(self, folder: RunFolder, run: Run, sets: Sequence[str], every: int):
+        """Draws the tasks.
+
+        Args:
+          folder: the run's files.
+          run: what is trained.
+          sets: short names of the task sets.
+          every: iterations from one evaluation to the next.
+        """
+        self._folder, self._every = folder, every
+        trained_on_base = task_set(run.config.env_id).short == "base"
+        self._ranked = [name for name in sets if name != "base" or trained_on_base] or list(sets)
+        self._evaluator = make_evaluator(run, sets, run.config.eval_episodes, "validation")
+        self._best: dict[int, float] = {}
+
+    def resume(self, rows: Sequence[Row]) -> None:
+        """Continues after the validation rows of `evaluations.csv`."""
+        scores: dict[tuple[int, int], list[float]] = {}
+        for row in rows:
+            if row["purpose"] == "validation" and row["task_set"] in self._ranked:
+                key = (row["seed"], row["iteration"])
+                scores.setdefault(key, []).append(row["solved"] / row["tasks"])
+        for (seed, _), shares in scores.items():
+            self._best[seed] = max(self._best.get(seed, -1.0), float(np.mean(shares)))
+
+    def is_due(self, iteration: int) -> bool:
+        """Returns whether this iteration is evaluated."""
+        return iteration % self._every == 0
+
+    def evaluate(self, seed: int, policy: Policy) -> list[Row]:
+        """Plays with the policy of one seed; returns its rows of `evaluations.csv`."""
+        scores = self._evaluator.scores(self._evaluator(policy.params))
+        rows = evaluation_rows(scores, policy, seed, "validation")
+        shares = [row["solved"] / row["tasks"] for row in rows if row["task_set"] in self._ranked]
+        if float(np.mean(shares)) > self._best.get(seed, -1.0):
+            self._best[seed] = float(np.mean(shares))
+            save_policy(self._folder.best(seed), policy)
+        return rows
+
+
+def make_evaluator(run: Run, sets: Sequence[str], tasks: int, purpose: Purpose) -> Evaluator:
+    """Prepares greedy play on fixed tasks of several sets."""
+    features = run.config.num_features
+    drawn = {name: evaluation_tasks(name, tasks, features, purpose) for name in sets}
+    return Evaluator(run.config, drawn)
+
+
+def evaluation_rows(
+    scores: Sequence[Score], policy: Policy, seed: int, purpose: Purpose
+) -> list[Row]:
+    """Returns a row of `evaluations.csv` for each score of a policy.
+
+    `solved` counts tasks. Where a set has few layouts, `layouts` of `layouts_total` are solved in
+    more than half of their draws. `length` is the mean number of steps of solved episodes.
+    """
+    return [
+        {
+            "seed": seed,
+            "iteration": policy.iteration,
+            "purpose": purpose,
+            "task_set": score.set,
+            "tasks": score.tasks,
+            "solved": score.solved,
+            "layouts": score.layouts.solved if score.layouts else "",
+            "layouts_total": score.layouts.total if score.layouts else "",
+            "length": "" if score.mean_steps is None else round(score.mean_steps, 4),
+        }
+        for score in scores
+    ]

@@ -1,0 +1,58 @@
+"""Hardware, versions and commit that a result was computed with."""
+
+import importlib.metadata
+import os
+import pathlib
+import platform
+import subprocess
+from typing import Any
+
+import jax
+
+ROOT = pathlib.Path(__file__).parents[2]
+VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
+# Code that decides results; records and texts may change between two of them.
+CODE = ("agents/*.py", "benchmarks/*.py", "trap_tube_jax/*.py", "pyproject.toml")
+
+
+def provenance() -> dict[str, Any]:
+    """Returns hardware, versions and commit as plain values."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return {
+        "processor": _processor(),
+        "cores": len(affinity(0)) if affinity else os.cpu_count(),
+        "device": jax.devices()[0].device_kind,
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in VERSIONED},
+        "commit": commit(),
+    }
+
+
+def commit() -> str | None:
+    """Returns the commit of the code, with "-dirty" where the code has changed since.
+
+    None without git, or where the code is not a checkout of its own.
+    """
+    try:
+        if pathlib.Path(_git("rev-parse", "--show-toplevel")).resolve() != ROOT.resolve():
+            return None
+        changes = _git("status", "--porcelain", "--", *CODE)
+        return _git("rev-parse", "--short=12", "HEAD") + ("-dirty" if changes else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _processor() -> str:
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
