@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from agents.experiments.records import check_clean
 from agents.runs.folder import write_json
-from agents.runs.machine import machine
+from agents.runs.provenance import provenance as machine
 from trap_tube_jax.checks import check_integer
 
 SCHEMA = "trap-tube-jax benchmark 1"

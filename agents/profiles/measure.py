@@ -30,7 +30,7 @@ from agents.experiments.records import Record
 from agents.profiles.mistakes import SUBGOALS, Push, Turns, first_push, subgoals, turns
 from agents.profiles.oracle import Oracle, replayed
 from agents.profiles.tasks import ALL_LAYOUTS, BASE, PAIRS, PARTS, STRENGTHS, SWAPS, kinds, points
-from agents.runs.machine import machine
+from agents.runs.provenance import provenance as machine
 from trap_tube_jax.solver import solve_batch
 from trap_tube_jax.state import State
 
