@@ -1,9 +1,10 @@
 """Modules of your own, imported for the names that they register."""
 
+import contextlib
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 
@@ -40,3 +41,18 @@ def registering_file() -> str:
     module = sys._getframe(2).f_globals
     file = module.get("__file__")
     return os.path.realpath(file) if file else str(module.get("__name__"))
+
+
+@contextlib.contextmanager
+def needs_extra(extra: str) -> Iterator[None]:
+    """Names the extra that installs what an import inside the `with` block misses.
+
+    Raises:
+      ImportError: an import failed.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(
+            f"this needs an optional library: pip install 'trap-tube-jax[{extra}]' ({error})"
+        ) from error
