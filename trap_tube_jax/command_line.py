@@ -1,29 +1,46 @@
-"""What the command lines share."""
+"""Shared parts of the command lines."""
 
+import argparse
 import contextlib
+import io
+import os
 import sys
 from collections.abc import Iterator
-from typing import Annotated
 
-import tyro
 
-# An option without a value.
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-
-# --import MODULE, as often as there are modules; `imports.import_modules` takes them.
-Imports = Annotated[
-    tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import", metavar="MODULE")
-]
+def prepare_terminal() -> None:
+    """Lets stdout and stderr print "?" for characters that their encoding lacks."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 @contextlib.contextmanager
 def plain_errors() -> Iterator[None]:
-    """Ends the process with status 2 and one line, in place of a traceback.
+    """Prepares the terminal, and ends the process with one line in place of a traceback.
 
-    For what the user gave: a ValueError, or an OSError such as a folder that cannot be written.
+    The exit code is 2 for a ValueError or a missing library, 1 for an OSError such as a full
+    disk. Code 1 without a line stands for a closed pipe, as in `command | head -1`.
     """
+    prepare_terminal()
     try:
         yield
-    except (ValueError, OSError) as error:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python warns at exit
+        raise SystemExit(1) from None
+    except (ValueError, ImportError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
+        raise SystemExit(1 if isinstance(error, OSError) else 2) from error
+
+
+def add_import_option(parser: argparse.ArgumentParser) -> None:
+    """Adds `--import MODULE` as `imports`, a list for `import_modules`."""
+    parser.add_argument(
+        "--import",
+        dest="imports",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="import a module of your own first, for the task sets that it registers; repeatable",
+    )

@@ -1,90 +1,22 @@
-"""A contact sheet of the eight task sets, and solved episodes as GIFs.
+"""Draws a contact sheet of the eight task sets, and solved episodes as GIFs.
 
-On the command line, `python -m trap_tube_jax.gallery --out figures --gifs`.
+On the command line: `python -m trap_tube_jax.gallery --output figures --gifs`.
 """
 
-import dataclasses
+import argparse
 import pathlib
 from collections.abc import Sequence
 
 import jax
 import numpy as np
-import tyro
-from PIL import Image, ImageDraw, ImageFont
 
-from trap_tube_jax.checks import check_integer, check_seed
-from trap_tube_jax.command_line import Flag, plain_errors
-from trap_tube_jax.objects import BOARD_SIZE, NUM_OBJECTS, OBJECT_NAMES
-from trap_tube_jax.observation import visible_objects
-from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
-from trap_tube_jax.rendering import episode_frames, render, render_object, save_gif
+from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.registry import make
+from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.solver import solve
 from trap_tube_jax.state import State
-from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
 
-CHANGES: dict[Transfer, str] = {
-    perceptual: "layout",
-    structural: "colours",
-    symbolic: "what is the tool",
-}
 SOLVED_SETS = ("base", "p", "st", "sy", "pstsy")
-DRAWS = 64  # tasks among which the distinct ones of a panel are looked for
-BACKGROUND, TEXT, FAINT_TEXT = "#ffffff", "#1f2328", "#656d76"
-
-
-@dataclasses.dataclass(frozen=True)
-class Arguments:
-    """Draws the eight task sets.
-
-    Attributes:
-      out: the folder for gallery.png and the GIFs; made if missing.
-      tasks: different tasks per set, at least 2; fewer where a set has fewer.
-      cell_size: pixels per cell and side of the contact sheet, at least 8.
-      seed: which tasks are drawn, 0 to 2**32 - 1.
-      gifs: also writes a solved episode of base, p, st, sy and pstsy each.
-    """
-
-    out: pathlib.Path = pathlib.Path(".")
-    tasks: int = 4
-    cell_size: int = 16
-    seed: int = 0
-    gifs: Flag = False
-
-
-def contact_sheet(
-    ids: Sequence[str] = tuple(entry.id for entry in PAPER_TASK_SETS),
-    *,
-    tasks: int = 4,
-    cell_size: int = 16,
-    seed: int = 0,
-) -> Image.Image:
-    """Task sets with some of their tasks each, and a legend of the objects.
-
-    Args:
-      ids: the task sets, at least one; the paper's eight if absent.
-      tasks: the most tasks per set, at least 2. They all differ; there are fewer where 64
-        draws hold fewer. The base has one: the legend takes the place of the others.
-      cell_size: pixels per cell and side, at least 8.
-      seed: which tasks are drawn, 0 to 2**32 - 1.
-
-    Raises:
-      ValueError: naming the value and what is allowed.
-    """
-    tasks = check_integer("tasks", tasks, 2)
-    cell_size = check_integer("cell_size", cell_size, 8)
-    seed = check_seed(seed)
-    if isinstance(ids, str) or not ids:
-        raise ValueError(f"ids must name at least one task set, as in ('base', 'p'), got {ids!r}")
-    panels = [_panel(task_set(name), tasks, cell_size, seed) for name in ids]
-    columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
-    margin = 2 * cell_size
-    width, height = (length + margin for length in panels[0].size)
-    sheet = Image.new("RGB", (columns * width + margin, rows * height + margin), BACKGROUND)
-    for index, panel in enumerate(panels):
-        row, column = divmod(index, columns)
-        sheet.paste(panel, (margin + column * width, margin + row * height))
-    return sheet
 
 
 def solved_episode(state: State, cell_size: int = 20) -> np.ndarray:
@@ -103,72 +35,40 @@ def solved_episode(state: State, cell_size: int = 20) -> np.ndarray:
     return episode_frames(state, plan.actions, cell_size)
 
 
-def main(arguments: Arguments) -> None:
-    """Writes the pictures and says where."""
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "gallery.png"
-    sheet = contact_sheet(tasks=arguments.tasks, cell_size=arguments.cell_size, seed=arguments.seed)
-    sheet.save(path, optimize=True)
-    print(path)
-    for short in SOLVED_SETS if arguments.gifs else ():
-        path = arguments.out / f"solved_{short}.gif"
-        state, _ = make(short).reset(jax.random.key(arguments.seed))
-        save_gif(solved_episode(state), path, fps=4)
-        print(path)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line; `arguments` are those of the process if absent."""
+    parser = argparse.ArgumentParser(
+        prog="python -m trap_tube_jax.gallery",
+        description="Draw the eight task sets.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--output", type=pathlib.Path, default=".", help="folder of gallery.png and the GIFs")
+    add("--tasks", type=int, default=4, help="different tasks per set, at least 2")
+    add("--cell-size", type=int, default=16, help="pixels per cell and side, at least 8")
+    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1")
+    add("--gifs", action="store_true", help="solve a task each of base, p, st, sy and pstsy")
+    options = parser.parse_args(arguments)
+    with plain_errors():
+        for path in _save(options):
+            print(path)
 
 
-def _panel(entry: TaskSet, tasks: int, cell_size: int, seed: int) -> Image.Image:
-    """A title and a row of tasks; for a set with one task, that and the legend."""
-    tile, gap, header = BOARD_SIZE * cell_size, cell_size // 2, 3 * cell_size
-    width = tasks * (tile + gap) - gap
-    panel = Image.new("RGB", (width, header + tile), BACKGROUND)
-    draw = ImageDraw.Draw(panel)
-    changes = ", ".join(CHANGES.get(transfer, "own") for transfer in entry.transfers)
-    subtitle = f"changes: {changes}" if changes else "the task to learn from"
-    draw.text((0, 0), entry.id, TEXT, _font(cell_size * 1.25))
-    draw.text((0, cell_size * 1.55), f"{entry.label}   {subtitle}", FAINT_TEXT, _font(cell_size))
-    pictures = _distinct_tasks(entry, tasks, cell_size, seed)
-    for index, picture in enumerate(pictures):
-        panel.paste(Image.fromarray(picture), (index * (tile + gap), header))
-    if len(pictures) == 1:
-        _draw_legend(draw, panel, (tile + 2 * gap, header), (width - tile - 2 * gap, tile))
-    return panel
+def _save(options: argparse.Namespace) -> list[pathlib.Path]:
+    """Writes the pictures and returns their paths."""
+    from trap_tube_jax.contact_sheet import contact_sheet  # noqa: PLC0415  needs pillow
 
-
-def _distinct_tasks(entry: TaskSet, tasks: int, cell_size: int, seed: int) -> np.ndarray:
-    """u8[K, 12 s, 12 s, 3]: the first K <= `tasks` different tasks among `DRAWS`."""
-    keys = jax.random.split(jax.random.key(seed), DRAWS)
-    states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
-    # Not the observations: the symbolic swap leaves the colours where they were.
-    looks = [
-        jax.vmap(visible_objects)(states).reshape(DRAWS, -1),
-        states.palette.reshape(DRAWS, -1),
-    ]
-    _, first = np.unique(np.concatenate(looks, axis=1), axis=0, return_index=True)
-    first = np.sort(first)[:tasks]
-    chosen = jax.tree.map(lambda x: x[first], states)
-    return np.asarray(jax.vmap(lambda state: render(state, cell_size))(chosen))
-
-
-def _draw_legend(
-    draw: ImageDraw.ImageDraw, panel: Image.Image, corner: tuple[int, int], size: tuple[int, int]
-) -> None:
-    """The eight objects in two columns of four, into the box at `corner` of `size`."""
-    column_width, row_height = size[0] // 2, size[1] // 4
-    swatch = round(0.7 * row_height)
-    for code in range(NUM_OBJECTS):
-        column, row = divmod(code, 4)
-        x = corner[0] + column * column_width
-        y = corner[1] + row * row_height + (row_height - swatch) // 2
-        panel.paste(Image.fromarray(render_object(code, swatch)), (x, y))
-        middle = (x + 1.3 * swatch, y + swatch / 2)
-        draw.text(middle, OBJECT_NAMES[code], TEXT, _font(swatch / 2), anchor="lm")
-
-
-def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)
+    folder = options.output
+    folder.mkdir(parents=True, exist_ok=True)
+    sheet = contact_sheet(tasks=options.tasks, cell_size=options.cell_size, seed=options.seed)
+    sheet.save(folder / "gallery.png", optimize=True)
+    paths = [folder / "gallery.png"]
+    for short in SOLVED_SETS if options.gifs else ():
+        state, _ = make(short).reset(jax.random.key(options.seed))
+        paths.append(folder / f"solved_{short}.gif")
+        save_gif(solved_episode(state), paths[-1], fps=4)
+    return paths
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(tyro.cli(Arguments))
+    main()

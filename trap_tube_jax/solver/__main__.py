@@ -1,21 +1,17 @@
-"""The solver's command line: python -m trap_tube_jax.solver --help."""
+"""The solver's command line: `python -m trap_tube_jax.solver --help`."""
 
-import dataclasses
+import argparse
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
-import tyro
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
-from rich.table import Table
 
 from trap_tube_jax.checks import check_seed
-from trap_tube_jax.command_line import Flag, Imports, plain_errors
+from trap_tube_jax.command_line import add_import_option, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
@@ -25,146 +21,132 @@ from trap_tube_jax.solver.distance import Distances, distances
 from trap_tube_jax.solver.search import Plan, replay, solve
 from trap_tube_jax.solver.survey import QUANTILES, Survey, survey
 from trap_tube_jax.state import State
+from trap_tube_jax.tables import markdown_table
 
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Exact shortest plans of the trap-tube tasks.
-
-    Without --show and --distances: the figures of whole task sets, as a table and as a
-    histogram. Sets that differ in colours only have the same figures.
-
-    Attributes:
-      sets: ids or short names of task sets.
-      tasks: tasks to solve per set.
-      graphs: of how many of them to count the distinct reachable states (a second each).
-      seed: the seed of the tasks, 0 to 2**32 - 1.
-      show: id of a set: the plan of its task with this seed, as text and GIF instead.
-      distances: id of a set: the distances to the goal in its task with this seed, as
-        PNG instead.
-      output: the file to write; shortest_plans.png, plan.gif or distances.png if absent.
-      json: whether to print JSON in place of a table or text.
-      imports: modules of your own to import first, for the sets that they register.
-    """
-
-    sets: tuple[str, ...] = ("base", "sy", "p", "psy")
-    tasks: int = 1000
-    graphs: int = 5
-    seed: int = 0
-    show: str | None = None
-    distances: str | None = None
-    output: Path | None = None
-    json: Flag = False
-    imports: Imports = ()
+DESCRIPTION = """Find exact shortest plans of the trap-tube tasks. Without --show and --distances,
+print statistics of whole task sets and draw a histogram. Sets that differ in colours alone have
+the same statistics."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if absent."""
-    options = tyro.cli(Options, args=arguments, prog="python -m trap_tube_jax.solver")
+    options = _parser().parse_args(arguments)
     with plain_errors():
         import_modules(options.imports)
-        if options.show is not None and options.distances is not None:
-            raise ValueError("--show and --distances exclude each other; allowed: one of them")
         if options.show is not None:
-            _show(options, options.show)
+            _show(options)
         elif options.distances is not None:
-            _distances(options, options.distances)
+            _distances(options)
         else:
             _survey(options)
 
 
-def _survey(options: Options) -> None:
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m trap_tube_jax.solver",
+        description=DESCRIPTION,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--sets", nargs="+", default=["base", "sy", "p", "psy"], metavar="SET", help="task sets")
+    add("--tasks", type=int, default=1000, help="tasks to solve per set")
+    add("--graphs", type=int, default=5, help="tasks whose reachable states are counted")
+    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1")
+    modes = parser.add_mutually_exclusive_group()
+    modes.add_argument("--show", metavar="SET", help="plan one task, as text and GIF")
+    modes.add_argument("--distances", metavar="SET", help="draw distances to the goal in one task")
+    add("--output", type=Path, help="file to write, shortest_plans.png, plan.gif or distances.png")
+    add("--format", choices=("text", "json"), default="text", help="format of what is printed")
+    add_import_option(parser)
+    return parser
+
+
+def _survey(options: argparse.Namespace) -> None:
     from trap_tube_jax.solver.pictures import save_histogram  # noqa: PLC0415  matplotlib is slow
 
-    if not options.sets:
-        raise ValueError("--sets must name at least one task set, such as base")
     sets = [task_set(name) for name in options.sets]
     graphs = min(options.graphs, options.tasks)
-    messages = Console(stderr=True)
-    columns = [*Progress.get_default_columns(), MofNCompleteColumn()]
     surveys = []
-    with Progress(*columns, console=messages, transient=True) as progress:
-        for entry in sets:
-            bar = progress.add_task(entry.label, total=options.tasks + graphs)
-            surveys.append(
-                survey(
-                    entry,
-                    tasks=options.tasks,
-                    graphs=graphs,
-                    seed=options.seed,
-                    advance=lambda count, bar=bar: progress.advance(bar, count),
-                )
-            )
-    if options.json:
-        print(json.dumps([entry.summary() for entry in surveys], indent=2))
-    else:
-        Console().print(_table(surveys))
+    for entry in sets:
+        print(f"solving {options.tasks:,} tasks of {entry.label}", file=sys.stderr)
+        surveys.append(survey(entry, tasks=options.tasks, graphs=graphs, seed=options.seed))
     path = options.output or Path("shortest_plans.png")
     save_histogram(surveys, path)
-    messages.print(f"histogram: {path}")
+    summaries = [entry.summary() for entry in surveys]
+    _print(options, summaries, _table(surveys))
+    print(f"histogram: {path}", file=sys.stderr)
 
 
-def _table(surveys: Sequence[Survey]) -> Table:
-    table = Table(title="Shortest plans, in steps", box=SIMPLE_HEAD, padding=(0, 0, 0, 1))
-    table.add_column("set")
-    headers = ["tasks", "solvable", "mean", *(f"{q} %" for q in QUANTILES), "longest", "states"]
-    for header in headers:
-        table.add_column(header, justify="right")
+def _show(options: argparse.Namespace) -> None:
+    state = _task(options.show, options.seed)
+    plan = solve(state)
+    path = options.output or Path("plan.gif")
+    save_gif(episode_frames(state, plan.actions, cell_size=32), path, fps=4)
+    report = {
+        "id": task_set(options.show).id,
+        "seed": options.seed,
+        "solvable": bool(plan.solvable),
+        "length": int(plan.length),
+        "actions": plan.actions.tolist(),
+    }
+    boards = (
+        f"{_caption(plan, time)}\n{render_ascii(at)}\n"
+        for time, at in enumerate(replay(state, plan))
+    )
+    _print(options, report, "\n".join(boards))
+    print(f"animation: {path}", file=sys.stderr)
+
+
+def _distances(options: argparse.Namespace) -> None:
+    from trap_tube_jax.solver.pictures import save_distances  # noqa: PLC0415  matplotlib is slow
+
+    state = _task(options.distances, options.seed)
+    plan, found = solve(state), distances(state)
+    path = options.output or Path("distances.png")
+    save_distances(state, plan, found, path)
+    report = {
+        "id": task_set(options.distances).id,
+        "seed": options.seed,
+        "length": int(plan.length),
+        **_counts(found),
+    }
+    _print(options, report, _distances_line(plan, found))
+    print(f"picture: {path}", file=sys.stderr)
+
+
+def _print(options: argparse.Namespace, report: Any, text: str) -> None:
+    print(json.dumps(report, indent=2) if options.format == "json" else text)
+
+
+def _table(surveys: Sequence[Survey]) -> str:
+    quantiles = (f"{quantile} %" for quantile in QUANTILES)
+    rows = [["set", "tasks", "solvable", "mean", *quantiles, "longest", "1,000 states"]]
     for entry in surveys:
         summary = entry.summary()
-        table.add_row(
-            entry.task_set.label,
-            str(summary["tasks"]),
-            f"{100 * summary['solvable']:.2f} %",
-            _number(summary["mean"], 1),
-            *(_number(value, 0) for value in summary["quantiles"].values()),
-            _number(summary["longest"], 0),
-            _number(summary["reachable"]["mean"], 0, unit=1000),
+        rows.append(
+            [
+                entry.task_set.label,
+                str(summary["tasks"]),
+                f"{100 * summary['solvable']:.2f} %",
+                _number(summary["mean"], 1),
+                *(_number(value, 0) for value in summary["quantiles"].values()),
+                _number(summary["longest"], 0),
+                _number(summary["reachable"]["mean"], 0, unit=1000),
+            ]
         )
     count = len(surveys[0].reachable)
-    table.caption = f"states: thousand distinct reachable states, mean of the first {count} tasks"
-    return table
+    return (
+        f"Steps of the shortest plans\n\n{markdown_table(rows)}\n\n"
+        f"1,000 states: distinct reachable states, mean of the first {count} tasks"
+    )
 
 
 def _number(value: float | None, digits: int, unit: int = 1) -> str:
     return "-" if value is None else f"{value / unit:,.{digits}f}"
 
 
-def _show(options: Options, name: str) -> None:
-    state = _task(name, options.seed)
-    plan = solve(state)
-    if options.json:
-        print(_plan_json(options, name, plan))
-    else:
-        for time, at in enumerate(replay(state, plan)):
-            print(f"{_caption(plan, time)}\n{render_ascii(at)}\n")
-    path = options.output or Path("plan.gif")
-    save_gif(episode_frames(state, plan.actions, cell_size=32), path, fps=4)
-    print(f"animation: {path}", file=sys.stderr)
-
-
-def _distances(options: Options, name: str) -> None:
-    from trap_tube_jax.solver.pictures import save_distances  # noqa: PLC0415
-
-    state = _task(name, options.seed)
-    plan, found = solve(state), distances(state)
-    report = {
-        "id": task_set(name).id,
-        "seed": options.seed,
-        "length": int(plan.length),
-        **_counts(found),
-    }
-    if options.json:
-        print(json.dumps(report, indent=2))
-    else:
-        print(_distances_line(plan, found))
-    path = options.output or Path("distances.png")
-    save_distances(state, plan, found, path)
-    print(f"picture: {path}", file=sys.stderr)
-
-
 def _counts(found: Distances) -> dict[str, int]:
-    """The states that can be reached, those with a way to the goal, and the longest way."""
+    """Counts reachable states and those with a way to the goal, and measures the longest way."""
     return {
         "reachable": found.num_reachable,
         "solvable": int(np.count_nonzero(found.to_goal >= 0)),
@@ -193,17 +175,6 @@ def _caption(plan: Plan, time: int) -> str:
 
 def _outcome(plan: Plan) -> str:
     return f"{plan.length} steps" if plan.solvable else "unsolvable"
-
-
-def _plan_json(options: Options, name: str, plan: Plan) -> str:
-    report = {
-        "id": task_set(name).id,
-        "seed": options.seed,
-        "solvable": bool(plan.solvable),
-        "length": int(plan.length),
-        "actions": plan.actions.tolist(),
-    }
-    return json.dumps(report, indent=2)
 
 
 if __name__ == "__main__":

@@ -4,16 +4,19 @@ import os
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 
+from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.rendering import render
 from trap_tube_jax.solver.distance import Distances
 from trap_tube_jax.solver.search import Plan, replay
 from trap_tube_jax.solver.survey import Survey
 from trap_tube_jax.state import State
+
+with needs_extra("pictures"):
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
 
 CELL_SIZE = 32  # pixels
 MOMENTS = 4  # pictures of distances along a plan

@@ -1,6 +1,6 @@
-"""How hard a task set is: the shortest plans and the graphs of many of its tasks.
+"""The difficulty of a task set: shortest plans and graphs of many of its tasks.
 
-Source: environment.md, "Task sets", has the figures of the paper's eight.
+Source: environment.md, "Task sets", has the statistics of the paper's eight.
 """
 
 import dataclasses
@@ -17,12 +17,11 @@ from trap_tube_jax.solver.search import solve_batch, take
 from trap_tube_jax.state import State
 
 QUANTILES = (5, 25, 50, 75, 95)
-TASKS_PER_CALL = 100  # between updates of the progress
 
 
 @dataclasses.dataclass(frozen=True)
 class Survey:
-    """What was found on tasks drawn from a set.
+    """Shortest plans and graph sizes of tasks drawn from a set.
 
     Attributes:
       task_set: the set.
@@ -38,11 +37,11 @@ class Survey:
 
     @property
     def solved_length(self) -> np.ndarray:
-        """i32[S]: the shortest plans of the solvable tasks."""
+        """The lengths i32[S] of the solvable tasks' shortest plans."""
         return self.length[self.length >= 0]
 
     def summary(self) -> dict[str, Any]:
-        """The figures as plain numbers, None where there is nothing to average."""
+        """Returns statistics as plain numbers, None where there is nothing to average."""
         solved = self.solved_length
         quantiles = np.percentile(solved, QUANTILES) if len(solved) else [None] * len(QUANTILES)
         return {
@@ -62,44 +61,29 @@ class Survey:
         }
 
 
-def survey(
-    task_set: TaskSet,
-    *,
-    tasks: int,
-    graphs: int,
-    seed: int = 0,
-    advance: Callable[[int], None] = lambda count: None,
-) -> Survey:
+def survey(task_set: TaskSet, *, tasks: int, graphs: int, seed: int = 0) -> Survey:
     """Solves `tasks` tasks of a set and explores the whole graph of the first `graphs`.
 
     Args:
       task_set: the set; its id is registered.
       tasks: how many to draw, at least 1.
-      graphs: of how many to count the reachable states, 0 to `tasks`, a second each.
+      graphs: number of tasks whose reachable states are counted, 0 to `tasks`, a second each.
       seed: 0 to 2**32 - 1; the tasks are those of the keys
         `jax.random.split(jax.random.key(seed), tasks)`.
-      advance: called with the number of tasks and graphs done since its last call.
 
     Raises:
-      ValueError: naming the number and what is allowed.
+      ValueError: a number is out of range; the message names the range.
     """
     tasks = check_integer("tasks", tasks)
     graphs = check_integer("graphs", graphs, 0, tasks)
     seed = check_seed(seed)
     states = draw_tasks(task_set, tasks, seed)
-    lengths = []
-    for start in range(0, tasks, TASKS_PER_CALL):
-        lengths.append(solve_batch(take(states, slice(start, start + TASKS_PER_CALL))).length)
-        advance(len(lengths[-1]))
-    reachable = []
-    for index in range(graphs):
-        reachable.append(count_reachable(take(states, index)))
-        advance(1)
-    return Survey(task_set, seed, np.concatenate(lengths), np.array(reachable, np.int32))
+    reachable = [count_reachable(take(states, index)) for index in range(graphs)]
+    return Survey(task_set, seed, solve_batch(states).length, np.array(reachable, np.int32))
 
 
 def draw_tasks(task_set: TaskSet, tasks: int, seed: int) -> State:
-    """First states of tasks of a set, with a leading axis, as NumPy arrays."""
+    """Draws the first states of tasks of a set, with a leading axis, as NumPy arrays."""
     env = make(task_set.id)
     keys = jax.random.split(jax.random.key(seed), tasks)
     return jax.device_get(jax.jit(jax.vmap(lambda key: env.reset(key)[0]))(keys))

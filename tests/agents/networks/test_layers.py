@@ -20,7 +20,7 @@ MAY_IMPORT = {
 # Lower rooms never import higher ones. Modules of a package itself are rooms of their own. The
 # environment's rooms are those of CONTRIBUTING.md, and so are the agents'.
 ENVIRONMENT = (
-    ("_version", "checks", "imports", "command_line"),
+    ("_version", "checks", "imports", "command_line", "tables"),
     ("objects", "geometry", "prng"),
     ("state", "positions"),
     ("dynamics", "layouts", "transfers", "graded", "observation"),
@@ -28,7 +28,7 @@ ENVIRONMENT = (
     ("controls", "registry"),
     ("rendering", "solver"),
     ("scoring",),
-    ("adapters", "gallery", "play"),
+    ("adapters", "contact_sheet", "gallery", "play"),
 )
 AGENTS = (
     ("registry",),

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
+from refusal import refused
 from trap_tube_jax.solver.__main__ import _caption, _distances_line, main
 from trap_tube_jax.solver.survey import Survey, survey
 
@@ -30,20 +31,17 @@ def test_survey_refuses(options, message):
 
 
 def test_survey_takes_every_task_of_the_seed_once(monkeypatch):
-    """Numbers stand for the tasks, and for what is found in them."""
+    """Numbers stand for the tasks, and for their plans and graphs."""
     for name, replacement in {
-        "TASKS_PER_CALL": 2,
         "draw_tasks": lambda entry, tasks, seed: 10 * seed + np.arange(tasks),
         "solve_batch": lambda tasks: SimpleNamespace(length=tasks),
         "count_reachable": lambda task: task,
     }.items():
         monkeypatch.setattr(f"trap_tube_jax.solver.survey.{name}", replacement)
-    done = []
-    found = survey(tt.task_set("p"), tasks=5, graphs=3, seed=4, advance=done.append)
+    found = survey(tt.task_set("p"), tasks=5, graphs=3, seed=4)
     assert found.length.tolist() == [40, 41, 42, 43, 44]
     assert found.reachable.tolist() == [40, 41, 42]
     assert found.seed == 4
-    assert done == [2, 2, 1, 1, 1, 1]
 
 
 def test_the_figures_of_a_survey():
@@ -65,12 +63,12 @@ def test_the_figures_of_a_survey():
 def test_command_line_surveys_task_sets(tmp_path, capsys):
     picture = tmp_path / "histogram.png"
     arguments = ["--tasks", "12", "--graphs", "0", "--output", str(picture), "--sets"]
-    main([*arguments, "sy", "--json"])
+    main([*arguments, "sy", "--format", "json"])
     (found,) = json.loads(capsys.readouterr().out)
     assert (found["id"], found["tasks"], found["solvable"]) == ("SymbolicTrapTube-v0", 12, 1)
     assert 8 <= found["mean"] <= found["longest"] <= 16
     main([*arguments, "base"])
-    assert "100.00 %  11.0   11" in capsys.readouterr().out
+    assert "| base |    12 | 100.00 % | 11.0 |  11 |" in capsys.readouterr().out
     with Image.open(picture) as image:
         assert image.format == "PNG"
 
@@ -80,7 +78,7 @@ def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypa
         monkeypatch.setitem(sys.modules, module, None)
     animation = tmp_path / "plan.gif"
     arguments = ["--show", "SymbolicTrapTube-v0", "--seed", "3", "--output", str(animation)]
-    main([*arguments, "--json"])
+    main([*arguments, "--format", "json"])
     plan = json.loads(capsys.readouterr().out)
     state, _ = tt.make("sy").reset(jax.random.key(3))
     assert plan["actions"] == tt.solve(state).actions.tolist()
@@ -90,6 +88,17 @@ def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypa
     assert tt.render_ascii(state) in text
     with Image.open(animation) as image:
         assert image.format == "GIF"
+
+
+def test_command_lines_write_before_they_print(tmp_path, monkeypatch):
+    def print_nothing(*words, **options):
+        raise BrokenPipeError
+
+    monkeypatch.setattr("builtins.print", print_nothing)
+    monkeypatch.setattr("os.dup2", lambda *files: None)
+    with pytest.raises(SystemExit):
+        main(["--show", "base", "--output", str(tmp_path / "plan.gif")])
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.gif"]
 
 
 @pytest.mark.slow
@@ -130,19 +139,17 @@ def test_the_command_line_says_that_no_state_leads_to_the_goal():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--show", "p", "--distances", "p"], "exclude each other"),
+        (["--show", "p", "--distances", "p"], "not allowed with argument --show"),
         (["--show", "nowhere"], "unknown task set 'nowhere'"),
         (["--tasks", "0"], "tasks must be an integer >= 1"),
         (["--seed", str(2**32)], "seed must be an integer >= 0 and <= 4294967295"),
         (["--show", "base", "--seed", "-1"], "seed must be an integer >= 0"),
-        (["--sets"], "--sets must name at least one task set"),
+        (["--sets"], "--sets: expected at least one argument"),
+        (["--format", "csv"], "choose from"),
     ],
 )
 def test_command_line_refuses(arguments, message, capsys):
-    with pytest.raises(SystemExit) as exit_info:
-        main(arguments)
-    assert exit_info.value.code == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, main, *arguments)
 
 
 def test_runs_as_a_module_without_warnings():

@@ -1,0 +1,61 @@
+"""Errors in a line, and words that any terminal can show."""
+
+import io
+import subprocess
+import sys
+
+import pytest
+
+from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.imports import needs_extra
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ValueError("no such set"), 2),
+        (ImportError("no such library"), 2),
+        (PermissionError("no such folder"), 1),
+    ],
+)
+def test_commands_end_with_one_line(error, code, capsys):
+    with pytest.raises(SystemExit, match=str(code)), plain_errors():
+        raise error
+    assert capsys.readouterr().err == f"error: {error}\n"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252", "cp437", "cp932", "utf-8"])
+def test_any_terminal_shows_the_characters_that_it_knows(encoding, monkeypatch):
+    output = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", output)
+    with plain_errors():
+        print("{Sy} 3–4 %, Größe →")
+    shown = output.buffer.getvalue().decode(encoding)
+    assert shown.startswith("{Sy} 3")
+    assert (
+        shown.count("?") == {"ascii": 4, "cp1252": 1, "cp437": 2, "cp932": 3, "utf-8": 0}[encoding]
+    )
+
+
+def test_a_closed_pipe_ends_a_command_in_silence():
+    lines = "with plain_errors():\n    for number in range(100_000): print(number)"
+    program = f"from trap_tube_jax.command_line import plain_errors\n{lines}"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == b"0\n"
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
+
+
+def test_a_missing_library_is_named_with_its_extra():
+    with (
+        pytest.raises(
+            ImportError, match=r"'trap-tube-jax\[pictures\]' \(No module named 'nonesuch"
+        ),
+        needs_extra("pictures"),
+    ):
+        import nonesuch  # pyright: ignore[reportMissingImports]  # noqa: F401, PLC0415
