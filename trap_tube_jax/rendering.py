@@ -2,7 +2,7 @@
 
 The agent sees plain colours (`trap_tube_jax.observation`), which may collide under the
 structural transfer. A picture therefore marks every object with a sign in black or
-white, whichever stands out from the object's colour:
+white, the one with more contrast to the object's colour:
 
     trap: a cross            exit: a ring            ground: nothing
     tube1, tube2: hatching that rises to the right, to the left
@@ -10,7 +10,6 @@ white, whichever stands out from the object's colour:
 """
 
 import functools
-import itertools
 import os
 from typing import Any
 
@@ -21,6 +20,7 @@ import numpy as np
 from trap_tube_jax.checks import check_integer
 from trap_tube_jax.dynamics import holds_tool, step
 from trap_tube_jax.geometry import unit_vector
+from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import (
     AGENT,
     BASE_COLORS,
@@ -46,8 +46,8 @@ GRID_OPACITY = 0.22
 TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
 TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
-MAX_FPS = 50  # browsers slow down GIFs with shorter frames
-LONGEST_FRAME = 655.35  # seconds, what a GIF can hold
+FPS_RANGE = (0.1, 50)  # browsers slow down GIFs with shorter frames
+LONGEST_HOLD = 100  # seconds; a GIF shows no picture longer than 655
 
 
 def render(
@@ -57,19 +57,18 @@ def render(
     grid: bool = True,
     grasp: jax.Array | int | None = None,
 ) -> jax.Array:
-    """The board as an RGB picture. Pure, jit- and vmap-able.
+    """Draws the board as an RGB picture. Pure; jit and vmap it.
 
-    One feature channel is shown as grey, two as red and green, of three and more the
-    first three as red, green and blue. Cells below 7 pixels carry no signs and no hand,
-    below 4 no lines: one pixel per cell is the observation itself, in RGB.
+    One feature channel is shown as grey, two as red and green, three or more as red, green and
+    blue by the first three. Cells below 7 pixels have no signs and no hand, cells below 4 no
+    lines. With one pixel per cell the picture is the observation in RGB.
 
     Args:
       state: one unbatched state.
       cell_size: s >= 1, pixels per cell and side.
       grid: whether to draw lines between the cells.
-      grasp: i32[], a direction (0 up, 1 down, 2 left, 3 right) to draw the agent's hand
-        in: a disc where it holds the tool, a ring where it is empty. None and any other
-        number draw no hand.
+      grasp: i32[], direction of the agent's hand (0 up, 1 down, 2 left, 3 right). A hand that
+        holds the tool is a disc, an empty one a ring. None and other numbers draw no hand.
 
     Returns:
       u8[12 s, 12 s, 3].
@@ -82,7 +81,7 @@ def render(
 
 
 def rgb(features: jax.Array) -> jax.Array:
-    """The colours u8[..., 3] in which `render` shows features u8[..., N]."""
+    """Returns the colours u8[..., 3] in which `render` shows features u8[..., N]."""
     num_features = features.shape[-1]
     if num_features == 1:
         return jnp.repeat(features, 3, axis=-1)
@@ -92,7 +91,7 @@ def rgb(features: jax.Array) -> jax.Array:
 
 
 def render_object(code: int, cell_size: int = 32) -> np.ndarray:
-    """An object in its base colour with its sign, for legends. Host side.
+    """Draws an object in its base colour with its sign, for legends. Host side.
 
     Args:
       code: the object's code, 0 to 7.
@@ -102,7 +101,7 @@ def render_object(code: int, cell_size: int = 32) -> np.ndarray:
       u8[s, s, 3].
 
     Raises:
-      ValueError: naming the value and what is allowed.
+      ValueError: `code` or `cell_size` is out of range.
     """
     cell_size = check_integer("cell_size", cell_size)
     if code not in range(NUM_OBJECTS):
@@ -113,10 +112,10 @@ def render_object(code: int, cell_size: int = 32) -> np.ndarray:
 
 
 def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarray:
-    """The pictures of an episode: u8[T + 1, 12 s, 12 s, 3]. Host side.
+    """Draws an episode as u8[T + 1, 12 s, 12 s, 3]. Host side.
 
-    Each shows the board before an action, with the hand in that action's grasp
-    direction; the last shows where the actions lead, without a hand.
+    A frame shows the board before an action, with the hand in the action's grasp direction. The
+    last frame shows the final board without a hand.
 
     Args:
       state: one unbatched state, unfinished.
@@ -125,7 +124,7 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
       cell_size: s >= 1, pixels per cell and side.
 
     Raises:
-      ValueError: naming the argument and what is allowed.
+      ValueError: `actions` or `cell_size` is invalid; the message says what is allowed.
     """
     cell_size = check_integer("cell_size", cell_size)
     actions = np.asarray(actions)
@@ -152,74 +151,41 @@ def save_gif(
     """Writes an endlessly looping GIF. Host side.
 
     Args:
-      frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1.
+      frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1. Pictures of at most
+        256 colours are stored exactly.
       path: the file to write.
-      fps: frames per second, over 0 and at most 50.
-      hold: seconds by which the last frame stays longer. Equal frames in a row become one, as
-        long as they together. No frame may last longer than 655.35.
+      fps: frames per second, 0.1 to 50.
+      hold: seconds by which the last frame stays longer, 0 to 100.
 
     Raises:
-      ValueError: naming the value and what is allowed.
+      ValueError: an argument is invalid; the message says what is allowed.
+      ImportError: pillow is not installed.
     """
-    if isinstance(frames, str | os.PathLike):
-        raise ValueError(f"save_gif takes (frames, path), in this order; got {frames!r} as frames")
     pictures = np.asarray(frames)
-    if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[-1] != 3:
+    shape = pictures.shape
+    if pictures.dtype != np.uint8 or len(shape) != 4 or not shape[0] or shape[-1] != 3:
         raise ValueError(
-            f"frames must be uint8[T, height, width, 3], got {pictures.dtype}{list(pictures.shape)}"
+            f"frames must be uint8[T, height, width, 3], T >= 1, got {pictures.dtype}{list(shape)}"
         )
-    if not len(pictures):
-        raise ValueError("frames must hold at least one picture, got none")
-    if not 0 < fps <= MAX_FPS:
-        raise ValueError(f"fps must be over 0 and at most {MAX_FPS}, got {fps}")
-    if not 0 <= hold < np.inf:
-        raise ValueError(f"hold must be a number of seconds >= 0, got {hold}")
-    images = _indexed(pictures)
-    durations = [round(1000 / fps)] * len(images)
+    if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
+        raise ValueError(f"fps must be from {FPS_RANGE[0]} to {FPS_RANGE[1]}, got {fps}")
+    if not 0 <= hold <= LONGEST_HOLD:
+        raise ValueError(f"hold must be from 0 to {LONGEST_HOLD} seconds, got {hold}")
+    with needs_extra("pictures"):
+        from PIL import Image  # noqa: PLC0415  importing the environment must stay light
+
+    durations = [round(1000 / fps)] * len(pictures)
     durations[-1] += round(1000 * hold)
-    longest = _longest_shown(images, durations)
-    if longest > 1000 * LONGEST_FRAME:
-        raise ValueError(
-            f"a frame of a GIF lasts at most {LONGEST_FRAME} s, got {longest / 1000} s: 1 / fps "
-            "for each of the equal frames in a row, and hold for the last"
-        )
-    first, *rest = images
+    first, *rest = map(Image.fromarray, pictures)
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
     first.save(path, format="GIF", duration=durations, loop=0, **options)
-
-
-def _longest_shown(images: list[Any], durations: list[int]) -> int:
-    """The longest duration of a picture: Pillow joins equal ones in a row."""
-    shown = itertools.groupby(
-        zip(images, durations, strict=True), key=lambda pair: pair[0].convert("RGB").tobytes()
-    )
-    return max(sum(duration for _, duration in pairs) for _, pairs in shown)
-
-
-def _indexed(pictures: np.ndarray) -> list[Any]:
-    """Pillow images of at most 256 colours: the exact ones where they are no more."""
-    from PIL import Image  # noqa: PLC0415  importing the environment must stay light
-
-    red, green, blue = np.moveaxis(pictures.astype(np.uint32), -1, 0)
-    packed = red << 16 | green << 8 | blue
-    colors = np.unique(packed)
-    if len(colors) > 256:
-        # Dithering would speckle plain colours and double the size of the file.
-        return [Image.fromarray(each).quantize(dither=Image.Dither.NONE) for each in pictures]
-    palette = np.stack([colors >> 16, colors >> 8 & 255, colors & 255], axis=-1)
-    images = []
-    for indices in np.searchsorted(colors, packed).astype(np.uint8):
-        image = Image.fromarray(indices).convert("P")
-        image.putpalette(palette.astype(np.uint8).tobytes())
-        images.append(image)
-    return images
 
 
 @functools.partial(jax.jit, static_argnames="cell_size")
 def _episode_frames(state: State, actions: jax.Array, *, cell_size: int) -> jax.Array:
     actions = jnp.pad(actions, ((0, 1), (0, 0)), constant_values=NO_DIRECTION)
     is_padding = jnp.all(actions == NO_DIRECTION, axis=1)
-    # Of padding in a row, which moves nothing, only the first is drawn.
+    # Padding moves nothing: of several in a row the first is drawn, the others copy its picture.
     is_drawn = ~is_padding | jnp.pad(~is_padding[:-1], (1, 0), constant_values=True)
 
     def body(carry: tuple[State, jax.Array], at: tuple[jax.Array, jax.Array]) -> Any:
@@ -253,23 +219,23 @@ def _render(
 
 
 def _enlarge(cells: jax.Array, cell_size: int) -> jax.Array:
-    """[12 s, 12 s, ...]: every cell of [12, 12, ...] repeated s times down and across."""
+    """Repeats every cell of [12, 12, ...] s times down and across."""
     return jnp.repeat(jnp.repeat(cells, cell_size, axis=0), cell_size, axis=1)
 
 
 def _arrange(tiles: np.ndarray, objects: jax.Array) -> jax.Array:
-    """[12 s, 12 s]: of tiles [8, s, s], the one of each cell's object u8[12, 12]."""
+    """Returns [12 s, 12 s]: for each cell's object u8[12, 12] its tile of [8, s, s]."""
     size = BOARD_SIZE * tiles.shape[-1]
     return jnp.asarray(tiles)[objects].transpose(0, 2, 1, 3).reshape(size, size)
 
 
 def _ink(color: Any) -> Any:
-    """f32[h, w, 1]: black or white, whichever stands out from f32[h, w, 3]."""
+    """Returns black or white f32[h, w, 1], the one with more contrast to f32[h, w, 3]."""
     return (color @ LUMA.astype(np.float32) < 128)[..., None] * np.float32(255)
 
 
 def _blend(image: Any, ink: Any, opacity: Any) -> Any:
-    """f32[h, w, 3]: `ink` over `image`, with opacity f32[h, w] from 0 to 1."""
+    """Lays `ink` over `image` f32[h, w, 3] with opacity f32[h, w] from 0 to 1."""
     return image + (ink - image) * opacity[..., None]
 
 
@@ -283,7 +249,7 @@ def _to_pixels(image: Any) -> jax.Array:
 
 @functools.cache
 def _signs(cell_size: int) -> np.ndarray:
-    """f32[8, s, s]: how far each object's sign covers each pixel of its cell, 0 to 1."""
+    """Returns f32[8, s, s]: each object's sign as the covered part of each pixel, 0 to 1."""
     y, x = _offsets((0.5, 0.5), 1, cell_size)
     distance = np.full((NUM_OBJECTS, cell_size, cell_size), np.inf, np.float32)
     if cell_size >= SMALLEST_SIGN:
@@ -303,7 +269,7 @@ def _cross(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _hatching(across: np.ndarray) -> np.ndarray:
-    """Two diagonals per cell, which meet those of the neighbouring cells."""
+    """Draws two diagonals per cell, which meet the diagonals of neighbouring cells."""
     return abs(2 * across % 1 - 0.5) / np.sqrt(8) - 0.035
 
 
@@ -320,7 +286,7 @@ def _face(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _tool_bar(state: State, cell_size: int) -> jax.Array:
-    """f32[12 s, 12 s]: a bar with round ends along the tool; a single cell is vertical."""
+    """Draws a bar f32[12 s, 12 s] with round ends along the tool; a single cell is vertical."""
     along = jnp.where(state.tool_extent[1] > 1, np.array([0, 1]), np.array([1, 0]))
     half = (state.tool_extent - 1) / 2 + TOOL_BAR_OVERHANG * along
     y, x = _offsets(state.tool + state.tool_extent / 2, BOARD_SIZE, cell_size)
@@ -340,21 +306,21 @@ def _draw_hand(image: jax.Array, state: State, grasp: jax.Array, cell_size: int)
 
 
 def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:
-    """f32[n s, 1] and f32[1, n s]: how far every pixel lies below and right of `center`.
+    """Returns each pixel's offset below and right of `center`, as f32[n s, 1] and f32[1, n s].
 
-    Both `center`, (y, x), and the result are in units of a cell.
+    `center`, (y, x), and the offsets are in units of a cell.
     """
     along = (np.arange(num_cells * cell_size, dtype=np.float32) + 0.5) / cell_size
     return (along - center[0])[:, None], (along - center[1])[None, :]
 
 
 def _coverage(distance: Any, cell_size: int) -> Any:
-    """The part of each pixel that lies inside the shape, 0 to 1, as f32."""
+    """Returns the part of each pixel inside the shape, 0 to 1, as f32."""
     return (0.5 - distance * cell_size).clip(0, 1)
 
 
 def _grid_lines(cell_size: int) -> np.ndarray:
-    """f32[12 s, 12 s]: 1 on the lines around the cells, 0 elsewhere."""
+    """Returns f32[12 s, 12 s]: 1 on the lines around the cells, 0 elsewhere."""
     width = max(1, cell_size // 32)
     pixels = np.arange(BOARD_SIZE * cell_size)
     on_line = (pixels % cell_size < width) | (pixels >= len(pixels) - width)

@@ -220,14 +220,12 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
     [
         (np.zeros((2, 4, 4, 3), np.float32), {}, "got float32"),
         (np.zeros((4, 4, 3), np.uint8), {}, r"got uint8\[4, 4, 3\]"),
-        (np.zeros((0, 4, 4, 3), np.uint8), {}, "at least one"),
-        (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 0}, "at most 50, got 0"),
-        ("a.gif", {}, r"takes \(frames, path\), in this order; got 'a.gif'"),
-        (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 51}, "at most 50, got 51"),
-        (np.zeros((1, 4, 4, 3), np.uint8), {"hold": -1}, "got -1"),
+        (np.zeros((0, 4, 4, 3), np.uint8), {}, r"T >= 1, got uint8\[0, 4, 4, 3\]"),
+        ("a.gif", {}, r"frames must be uint8\[T, height, width, 3\]"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 0}, "from 0.1 to 50, got 0"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"fps": 51}, "from 0.1 to 50, got 51"),
+        (np.zeros((1, 4, 4, 3), np.uint8), {"hold": -1}, "from 0 to 100 seconds, got -1"),
         (np.zeros((1, 4, 4, 3), np.uint8), {"hold": np.inf}, "got inf"),
-        (np.zeros((66, 4, 4, 3), np.uint8), {"fps": 0.1}, "at most 655.35 s, got 661.0 s"),
-        (np.zeros((1, 4, 4, 3), np.uint8), {"hold": 700}, "at most 655.35 s"),
     ],
 )
 def test_gif_refuses(frames, options, message, tmp_path):

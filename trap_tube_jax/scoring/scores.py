@@ -4,23 +4,22 @@ Source: protocol.md, "What is reported".
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np
 
-NORMAL_QUANTILE_95 = 1.959963984540054
+from trap_tube_jax.tables import markdown_table
 
 
 @dataclasses.dataclass(frozen=True)
 class Optimality:
-    """How the solved episodes compare with shortest plans.
+    """A comparison of solved episodes with shortest plans.
 
     Attributes:
-      solvable: tasks that some plan within the step limit solves.
-      percent_of_solvable: of those, percent solved; None if there are none.
-      mean: mean of shortest length / steps taken over solved tasks; None if there are none.
-      worst: the smallest of these ratios.
+      solvable: number of tasks that some plan within the step limit solves.
+      percent_of_solvable: percent of the solvable tasks that are solved; None without any.
+      mean: mean of shortest length / steps taken over solved tasks; None without any.
+      worst: smallest of these ratios; None without any.
     """
 
     solvable: int
@@ -32,7 +31,7 @@ class Optimality:
     def of(
         cls, solved: np.ndarray, length: np.ndarray, shortest: np.ndarray, max_steps: int
     ) -> "Optimality":
-        """Compares bool[B] and i32[B] with shortest lengths i32[B], -1 where unsolvable."""
+        """Compares outcomes bool[B] and lengths i32[B] with shortest plans i32[B], -1 for none."""
         solvable = (shortest >= 0) & (shortest <= max_steps)
         ratio = shortest[solved] / np.maximum(length[solved], 1)
         return cls(
@@ -45,11 +44,11 @@ class Optimality:
 
 @dataclasses.dataclass(frozen=True)
 class Layouts:
-    """The layouts of a set that has few of them, whatever their colours.
+    """Success by layout, colours aside, in a set of few layouts.
 
     Attributes:
-      solved: how many are solved in more than half of their draws.
-      total: how many the draws hold.
+      solved: number of layouts that are solved in more than half of their draws.
+      total: number of layouts among the draws.
     """
 
     solved: int
@@ -67,19 +66,19 @@ class Layouts:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Play on the fixed tasks of one set.
+    """The score on the fixed tasks of one set.
 
     Attributes:
       set: the set's short name.
-      label: its name in the paper's notation.
-      tasks: how many tasks were tried.
-      solved: how many were solved.
+      label: the set's name in the paper's notation.
+      tasks: number of tasks played.
+      solved: number of tasks solved.
       percent: 100 solved / tasks.
       interval: 95 % Wilson interval of the percentage over the set's tasks; None where the
         set has few layouts, so that its draws are no sample of many tasks.
       mean_steps: mean steps of the solved episodes; None without any.
-      layouts: the layouts solved, where the set has few.
-      optimality: the comparison with shortest plans, if one was made.
+      layouts: the layouts solved; None unless the set has few.
+      optimality: the comparison with shortest plans; None unless requested.
     """
 
     set: str
@@ -103,15 +102,15 @@ class Score:
         layout: np.ndarray | None = None,
         optimality: Optimality | None = None,
     ) -> "Score":
-        """The score of outcomes bool[B] and lengths i32[B].
+        """Computes the score of outcomes bool[B] and lengths i32[B].
 
         Args:
           name: the set's short name.
-          label: its name in the paper's notation.
+          label: the set's name in the paper's notation.
           solved: bool[B].
           length: i32[B], steps taken.
-          layout: i32[B], the layout of each task, where the set has few; None elsewhere.
-          optimality: the comparison with shortest plans, if one was made.
+          layout: i32[B], the layout of each task; None unless the set has few.
+          optimality: the comparison with shortest plans, if requested.
         """
         count, tasks = int(np.sum(solved)), len(solved)
         low, high = wilson_interval(count, tasks)
@@ -130,12 +129,12 @@ class Score:
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """What an agent reaches under the benchmark's protocol. Print it for a table in Markdown.
+    """The scores of an agent under the benchmark's protocol. Printed, they are a Markdown table.
 
     Attributes:
-      protocol: the version of the fixed tasks.
-      version: that of this package.
-      seed: of the draws of the agent's actions; None where it made its own.
+      protocol: version of the fixed tasks.
+      version: version of this package.
+      seed: seed of the agent's actions; None for an agent in plain Python.
       sets: the score of every set.
     """
 
@@ -145,7 +144,7 @@ class Scores:
     sets: tuple[Score, ...]
 
     def __getitem__(self, name: str) -> Score:
-        """The score of the set with this short name.
+        """Returns the score of the set with this short name.
 
         Raises:
           ValueError: the set was not scored.
@@ -156,7 +155,7 @@ class Scores:
         return by_name[name]
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it as plain values, for JSON; `sets` is a list of records."""
+        """Returns plain values for JSON; `sets` is a list of records."""
         return {**dataclasses.asdict(self), "sets": list(map(dataclasses.asdict, self.sets))}
 
     def __str__(self) -> str:
@@ -164,14 +163,8 @@ class Scores:
         if any(score.optimality for score in self.sets):
             heads += ["of solvable %", "optimality"]
         rows = [heads, *(_cells(score)[: len(heads)] for score in self.sets)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        rows.insert(1, ["-" * widths[0], *["-" * (width - 1) + ":" for width in widths[1:]]])
-        lines = [
-            " | ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
-            for row in rows
-        ]
         end = f"Protocol {self.protocol}, trap-tube-jax {self.version}."
-        return "\n".join([*(f"| {line} |" for line in lines), "", end])
+        return f"{markdown_table(rows)}\n\n{end}"
 
 
 def _cells(score: Score) -> list[str]:
@@ -194,18 +187,12 @@ def _number(value: float | None, form: str) -> str:
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """The 95 % score interval of a probability (Wilson, 1927).
-
-      (p + z^2 / 2n ± z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n),  p = successes / n.
+    """Returns the 95 % score interval of a probability (Wilson, 1927).
 
     Raises:
       ValueError: there is no trial, or not 0 <= successes <= trials.
     """
-    if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"need 0 <= successes <= trials >= 1, got {successes} and {trials}")
-    z2 = NORMAL_QUANTILE_95**2
-    share = successes / trials
-    center = share + z2 / (2 * trials)
-    margin = math.sqrt(z2 * (share * (1 - share) / trials + z2 / (4 * trials**2)))
-    scale = 1 + z2 / trials
-    return max(0.0, (center - margin) / scale), min(1.0, (center + margin) / scale)
+    from scipy.stats import binomtest  # noqa: PLC0415  importing the environment must stay light
+
+    low, high = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    return float(low), float(high)

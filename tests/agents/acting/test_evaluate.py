@@ -383,7 +383,7 @@ def test_wilson_interval(successes, trials, low, high):
 
 @pytest.mark.parametrize(("successes", "trials"), [(1, 0), (-1, 5), (6, 5)])
 def test_wilson_interval_refuses(successes, trials):
-    with pytest.raises(ValueError, match=rf"got {successes} and {trials}"):
+    with pytest.raises(ValueError, match=r"\b(k|n)\b"):
         wilson_interval(successes, trials)
 
 
