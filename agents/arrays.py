@@ -59,5 +59,12 @@ def _to_leaf(name: str, array: np.ndarray, template: Any) -> jax.Array:
             f"{name} is {array.dtype}{list(array.shape)}, not {wanted.dtype}{list(wanted.shape)}"
         )
     if is_key(template):
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(template))
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=_key_impl(template))
     return jnp.asarray(array)
+
+
+def _key_impl(template: Any) -> Any:
+    """Returns the implementation of keys, also of their shapes, which JAX tells in a trace."""
+    found: list[Any] = []
+    jax.eval_shape(lambda key: found.append(jax.random.key_impl(key)), template)
+    return found[0]

@@ -1,5 +1,6 @@
 """Progress of a run on one line of a terminal, and its results in a few."""
 
+import shlex
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Self
@@ -109,10 +110,14 @@ def summary(
     lines.append(f"Report with curves and episodes to step through: {folder.page}")
     if folder.animation.exists():
         lines.append(f"A solved episode: {folder.animation}")
-    lines.append(f"Train longer: {resume_command(folder)} --iterations {2 * run.config.iterations}")
+    config = run.config
+    if config.stop_when_solved and len(solved) == run.seeds:
+        lines.append("Next, learn all transfers: python -m agents.train --preset best")
+    elif not config.lr_decay_fraction and not config.intrinsic_coef_init:
+        lines.append(f"Train longer: {resume_command(folder)} --iterations {2 * config.iterations}")
     return lines
 
 
 def resume_command(folder: RunFolder) -> str:
     """Returns the command that continues a run."""
-    return f"python -m agents.train --resume {folder.path}"
+    return f"python -m agents.train --resume {shlex.quote(str(folder.path))}"

@@ -139,6 +139,8 @@ class Session:
             CsvLog(folder.evaluations, last_iteration=self.iteration) if is_first else None
         )
         self._last = {int(row["seed"]): row for row in record["last"]}
+        if self.metrics is not None and len(self.metrics.rows) < self.iteration:
+            self._say(f"{folder.metrics} has lost rows; learning curves lack these iterations.")
         self._tracker = None
         if options.evaluate_every and self.evaluations is not None:
             self._tracker = PeriodicEvaluator(folder, run, self.sets, options.evaluate_every)
@@ -238,6 +240,13 @@ class Session:
                 f"checkpoint {record['iteration']} in {self.folder.checkpoints} cannot be "
                 f"continued: {error}"
             ) from error
+        for row in record["last"]:
+            if row["iteration"] < record["iteration"] and not is_last(row, self.run.config):
+                raise ValueError(
+                    f"seed {row['seed']} stopped after iteration {row['iteration']} of "
+                    f"{record['iteration']}, and would train on with these limits; give the "
+                    "former ones, or begin a new run"
+                )
         if record["iteration"] > self.run.config.iterations:
             raise ValueError(
                 f"iterations must be at least {record['iteration']}, which are done, got "

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 import trap_tube_jax as tt
 from agents import make_train
@@ -22,7 +21,6 @@ from agents.acting.evaluation import Evaluation, Evaluator
 from agents.config import Config
 from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
-from agents.runs import report, report_page
 from trap_tube_jax.dynamics import step
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.registry import PAPER_TASK_SETS
@@ -203,152 +201,6 @@ def test_each_set_has_its_own_limit_where_the_settings_leave_it(grey_play, own_t
         Evaluator(config, {"mine": tasks["one"]})
 
 
-@pytest.mark.parametrize("is_terminal", [True, False])
-def test_progress_is_a_table_on_a_terminal_and_lines_elsewhere(is_terminal):
-    """A table as wide as the terminal allows; a line with all metrics for each iteration."""
-    file = io.StringIO()
-    console = Console(file=file, force_terminal=is_terminal, width=60)
-    with report.LiveReport(console, total_iterations=5, num_seeds=2) as live:
-        for iteration in (1, 2):
-            row = dict.fromkeys((name for _, name, _ in report.LIVE_COLUMNS), 0.5)
-            live.update([row | {"iteration": iteration, "episodes": 7000 + iteration}] * 2, 1)
-    text = file.getvalue()
-    assert "7,001" in text
-    assert "1/2 solved" in text
-    assert "left at most" in text
-    assert ("iteration 2 of 5" in text) == is_terminal
-    assert ("entropy" in text) != is_terminal
-
-
-def test_compiling_does_not_count_in_what_is_left(monkeypatch):
-    now = iter([0.0, 0.0, 100.0])
-    monkeypatch.setattr(report, "time", SimpleNamespace(perf_counter=lambda: next(now)))
-    file = io.StringIO()
-    row = dict.fromkeys((name for _, name, _ in report.LIVE_COLUMNS), 0.5)
-    with report.LiveReport(Console(file=file), total_iterations=5, num_seeds=1) as live:
-        live.update([row | {"iteration": 1}], 0, ready_at=98.0)
-    assert "0:08 left at most" in file.getvalue()
-
-
-def test_solved_episode_becomes_a_gif(grey_play, tmp_path):
-    evaluator, _, played = grey_play
-    path = tmp_path / "solved.gif"
-    assert report.save_first_solved(path, evaluator, [played], prefer="base") == "mine"
-    with Image.open(path) as picture:
-        index = int(np.argmax(played["mine"].solved))
-        assert getattr(picture, "n_frames", 1) == played["mine"].length[index] + 1
-
-
-def test_no_solved_episode_leaves_no_gif(grey_play, tmp_path):
-    evaluator, _, played = grey_play
-    unsolved = {"base": played["base"]}
-    assert report.save_first_solved(tmp_path / "x.gif", evaluator, [unsolved], "base") is None
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.fixture(scope="module")
-def page(grey_play, tmp_path_factory):
-    """The page of a run, and the data that its script reads."""
-    evaluator, _, played = grey_play
-    folder = tmp_path_factory.mktemp("page")
-    Image.new("RGB", (4, 4)).save(folder / "curves.png")
-    path = folder / "report.html"
-    report_page.save(
-        path,
-        title="<mine>",
-        sentences=["It does not transfer."],
-        settings={"hidden": 4},
-        scores={"seed 0": evaluator.scores(played)},
-        curves=folder / "curves.png",
-        evaluator=evaluator,
-        played=played,
-        pay=lambda tasks, counts: jnp.broadcast_to(jnp.arange(50.0), (len(counts), 50)),
-    )
-    start, end = '<script type="application/json" id="data">', "</script>"
-    return path, json.loads(path.read_text().partition(start)[2].partition(end)[0])
-
-
-def test_a_page_needs_no_network_and_holds_the_settings(page):
-    text = page[0].read_text()
-    assert "<h1>&lt;mine&gt;</h1>" in text
-    assert "<td>hidden</td><td>4</td>" in text
-    assert "<td>{P} (p)</td><td>2</td>" in text
-    assert not re.search(r"https?:|(src|href)=\"(?!data:)", text)
-
-
-def test_a_page_shows_solved_and_unsolved_episodes(grey_play, page):
-    outcome, data = grey_play[2]["mine"], page[1]
-    solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
-    mine = [each for each in data["episodes"] if each["title"].startswith("mine")]
-    assert [each["title"] for each in mine] == [
-        f"mine, task {solved}: solved",
-        f"mine, task {unsolved}: not solved",
-    ]
-    for index, each in zip((solved, unsolved), mine, strict=True):
-        length = outcome.length[index]
-        assert len(each["frames"]) == length + 1
-        assert len(each["actions"]) == length
-        np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
-        assert each["novelty"] == list(range(length))
-        for number in each["frames"]:
-            with Image.open(io.BytesIO(base64.b64decode(data["pictures"][number]))) as picture:
-                assert picture.size == (192, 192)
-
-
-def test_a_page_shows_shortest_plans(grey_play, page):
-    """From the same board as the episode, and with as many steps as are needed."""
-    for each in page[1]["episodes"]:
-        steps = {"base": 11, "mine": 1}.get(each["title"].partition(",")[0])
-        plan = each["plan"]
-        assert len(plan["frames"]) == len(plan["actions"]) + 1
-        if steps is not None:
-            assert len(plan["actions"]) == steps
-        name, _, number = each["title"].partition(":")[0].partition(", task ")
-        name = {"{P}": "p"}.get(name, name)
-        state = jax.tree.map(lambda x, i=int(number): x[i], grey_play[0].tasks[name])
-        first = DIRECTION_NAMES.index(plan["actions"][0].split()[1].rstrip(","))
-        shown = report_page._png(np.asarray(tt.render(state, 16, grasp=first)).tobytes())
-        assert page[1]["pictures"][plan["frames"][0]] == base64.b64encode(shown).decode()
-
-
-def test_a_page_shows_what_the_curiosity_pays():
-    """Counts of this play alone: the same task twice, then once, beside one that does not count."""
-    config = Config(**TINY, curiosity="counts")
-    trained = jax.jit(make_train(config).init)(jax.random.key(0))
-    evaluator = Evaluator.of_sets(config, ["base"], 1)
-    pay = report_page.compile_pay(config, trained, evaluator)
-    tasks = stack([tt.base_state()] * 2)
-    both, one = (np.asarray(pay(trained, tasks, np.array([True, x]))) for x in (True, False))
-    outcome = evaluator(trained.params)["base"]
-
-    state, advance = tt.base_state(), jax.jit(step)
-    seen = [np.asarray(tt.observe(state)).tobytes()]
-    for action in outcome.action[0, : outcome.length[0]]:
-        state = advance(state, action)
-        seen.append(np.asarray(tt.observe(state)).tobytes())
-    expected = np.array([seen[1:].count(board) ** -0.5 for board in seen[1:]])
-    np.testing.assert_allclose(both, [expected / 2**0.5] * 2, rtol=1e-6)
-    np.testing.assert_allclose(one, [expected, 0 * expected], rtol=1e-6)
-
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)}")
-def test_a_browser_shows_a_page(page, tmp_path):
-    """The page's script has run: it has filled in the episodes and the boards."""
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}"]
-    command = [str(BROWSER), *options, "--dump-dom", page[0].as_uri()]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    for each in page[1]["episodes"]:
-        assert f">{html.escape(each['title'])}</option>" in shown
-    assert re.search(r'<img id="board" [^>]*src="data:image/png', shown)
-    assert "The agent: step 0 of " in shown
-    assert "The shortest plan: step 0 of 11; next: grasp " in shown
-
-
 def test_optimality_compares_with_shortest_plans():
     found = Optimality.of(
         solved=np.array([True, True, False, False, False]),
@@ -401,22 +253,6 @@ def test_few_layouts_are_counted_and_have_no_interval():
     assert (score.percent, score.interval, score.layouts) == (60.0, None, Layouts(1, 2))
     assert str(score.layouts) == "1 of 2"
     assert Score.of("p", "{P}", solved, np.full(5, 9)).layouts is None
-
-
-def test_a_narrow_terminal_shows_tables_whole():
-    solved, length = np.arange(1000) < 999, np.full(1000, 33)
-    compared, layout = Optimality(999, 100.0, 0.9876, 0.1234), np.arange(1000) % 5
-    scores = [
-        Score.of("stsy", "{St, Sy}", solved, length, layout=layout),
-        Score.of("pstsy", "{P, St, Sy}", solved, length, optimality=compared),
-    ]
-    console = Console(record=True, width=80)
-    for table in (report.evaluation_table(scores, "x"), report.optimality_table(scores, "x")):
-        console.print(table.to_rich())
-    lines = [line.split() for line in console.export_text().splitlines()]
-    assert ["{St,", "Sy}", "(stsy)", "1000", "99.9", "5", "of", "5", "–", "33.0"] in lines
-    assert ["{P,", "St,", "Sy}", "(pstsy)", "1000", "99.9", "–", "99.4–100.0", "33.0"] in lines
-    assert ["{P,", "St,", "Sy}", "(pstsy)", "100.0", "0.988", "0.123"] in lines
 
 
 def test_refusals():

@@ -138,7 +138,9 @@ def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch)
         play = make_play(params, initial)
     for env_id in ("base", "st"):
         # Several episodes of each layout, which meet again what the others have met before.
-        keys = jnp.repeat(jax.random.split(jax.random.key(1), 3), CONFIG.episodes_per_iteration // 3)
+        keys = jnp.repeat(
+            jax.random.split(jax.random.key(1), 3), CONFIG.episodes_per_iteration // 3
+        )
         layouts, _ = jax.jit(jax.vmap(tt.make(env_id).reset))(keys)
         jax.effects_barrier()
         counts.clear()

@@ -1,0 +1,131 @@
+"""The folder of a run: its settings, what may change in them, and its one writer."""
+
+import json
+import multiprocessing
+
+import pytest
+
+from agents.config import Config
+from agents.runs.folder import Run, RunFolder, check_name, read_json, write_json
+from refusal import assert_refused
+
+
+def test_a_run_is_the_same_after_json():
+    run = Run(Config.preset("best"), "best", 5, 2, "mine", ("my_module",))
+    assert Run.from_dict(json.loads(json.dumps(run.to_dict()))) == run
+    assert Run(Config(curiosity="none")).algorithm == "ppo"
+    assert Run(Config(curiosity="icm")).algorithm == "ppo+icm"
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"preset": "slow"}, ["unknown preset 'slow'", "paper, fast, best"]),
+        ({"seed": -1}, ["seed must be an integer in [0, 2147483647]", "-1"]),
+        ({"seed": 1.0}, ["seed must be an integer", "1.0"]),
+        ({"seeds": 0}, ["seeds must be an integer in [1, ", "0"]),
+        ({"seeds": 10**9}, ["seeds must be an integer", "1000000000"]),
+        ({"seed": 2**31 - 1, "seeds": 2}, ["seeds must be at most 2147483647", "2147483648"]),
+    ],
+)
+def test_impossible_runs_are_refused(values, words):
+    assert_refused(words, Run, Config(), **values)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ({}, {"iterations": 999, "stop_when_solved": 0.5}, None),
+        ({}, {"max_transitions": 10**6}, None),
+        ({}, {"hidden": 8}, ["hidden=64, not 8", "iterations, max_transitions, stop_when_solved"]),
+        ({"lr_decay_fraction": 0.5}, {"iterations": 999}, ["iterations=250, not 999", "schedules"]),
+        ({"intrinsic_coef_init": 3.0}, {"iterations": 999}, ["iterations=250", "schedules span"]),
+    ],
+)
+def test_only_the_end_of_a_run_may_change(before, after, words):
+    old, new = Run(Config(**before)), Run(Config(**before, **after))
+    if words is None:
+        new.check_continues(old)
+    else:
+        assert_refused(words, new.check_continues, old)
+
+
+def test_a_folder_holds_one_run(tmp_path):
+    folder, run = RunFolder(tmp_path / "x"), Run(Config(hidden=8))
+    with folder.lock():
+        folder.create(run)
+        folder.metrics.touch()
+    assert RunFolder.open(tmp_path / "x")[1] == run
+    assert_refused(["holds a run", "--resume"], RunFolder(tmp_path / "x").create, run)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").touch()
+    assert_refused(["is taken, and holds no run"], RunFolder(tmp_path / "other").check_free)
+    assert_refused(["none holds no run; runs in", "x"], RunFolder.open, tmp_path / "none")
+
+
+def test_a_new_folder_without_results_is_removed_and_no_other(tmp_path):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").touch()
+    for name in ("new", "other"):
+        with pytest.raises(ValueError, match=r"is taken|broken"):
+            _fail_after_creation(RunFolder(tmp_path / name))
+    assert not (tmp_path / "new").exists()
+    assert (tmp_path / "other" / "mine.txt").exists()
+
+
+def _fail_after_creation(folder):
+    with folder.lock():
+        folder.create(Run(Config()))
+        raise ValueError("broken")
+
+
+def _hold(path, held, release):
+    with RunFolder(path).lock():
+        held.set()
+        release.wait(60)
+
+
+def test_a_second_writer_is_refused_and_named_the_first(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    held, release = context.Event(), context.Event()
+    process = context.Process(target=_hold, args=(tmp_path / "x", held, release))
+    process.start()
+    assert held.wait(60)
+    words = [f"{tmp_path}/x is being written by process {process.pid} on "]
+    assert_refused(words, RunFolder(tmp_path / "x").lock().__enter__)
+    release.set()
+    process.join()
+    with RunFolder(tmp_path / "x").lock():
+        pass
+
+
+def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
+    (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
+    monkeypatch.chdir(tmp_path)
+    values = {"version": "0", **Run(Config(), imports=("evil",)).to_dict()}
+    values["config"]["curiosity"] = "evil-curiosity"
+    write_json(tmp_path / "x" / "config.json", values)
+    assert_refused(
+        ["unknown curiosity 'evil-curiosity'", "--import evil"], RunFolder.open, tmp_path / "x"
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", '{"config": 3}', '{"version": "0", "config": {"hidden": "x"}}']
+)
+def test_damaged_settings_are_named(tmp_path, text):
+    (tmp_path / "config.json").write_text(text)
+    assert_refused([str(tmp_path / "config.json")], RunFolder.open, tmp_path)
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path):
+    write_json(tmp_path / "new" / "x.json", {"a": [1, 2]})
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "new" / "x.json", {"a": object()})
+    assert read_json(tmp_path / "new" / "x.json") == {"a": [1, 2]}
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.json"]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", ".hidden"])
+def test_names_are_plain(name):
+    assert_refused(["a folder's name without a path", repr(name)], check_name, name)

@@ -1,0 +1,200 @@
+"""What a reader of a run sees: curves, a GIF, the page, and lines on the terminal."""
+
+import base64
+import html
+import io
+import json
+import math
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+import trap_tube_jax as tt
+from agents import make_train
+from agents.acting.evaluation import Evaluator
+from agents.runs import display, report
+from agents.runs.folder import Run, RunFolder
+from agents.runs.metrics import CsvLog, FirstSolved
+from small_runs import small_config
+from trap_tube_jax.objects import DIRECTION_NAMES
+from trap_tube_jax.scoring.tasks import evaluation_tasks
+
+# The food next to the agent, on each side in turn: whichever way the first move of a policy
+# leads, it solves one of them.
+FOOD_CELLS = [(8, 1), (10, 1), (9, 0), (9, 2)]
+CONFIG = small_config(curiosity="counts", stop_when_solved=0.0)
+
+
+def row(iteration, **values):
+    counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 1.0}
+    shares = {"success": 0.25, "evaluation": 0.5, "loss": math.nan, "policy_loss": math.nan}
+    rate = {"transitions_per_second": 6000.0, "intrinsic_reward": 0.1}
+    return {"seed": 0, "iteration": iteration, **counts, **shares, **rate, **values}
+
+
+@pytest.fixture(scope="module")
+def played():
+    """An untrained policy on base, {P} and a set of known outcome, and what trained it."""
+    base = tt.base_state()
+    near = [base.replace(food=jnp.array(cell, jnp.int32)) for cell in FOOD_CELLS]
+    tasks = {name: evaluation_tasks(name, 2) for name in ("base", "p")}
+    tasks["mine"] = jax.tree.map(lambda *x: jnp.stack(x), *near)
+    learner = make_train(CONFIG)
+    state = jax.jit(learner.init)(jax.random.key(0))
+    evaluator = Evaluator(CONFIG, tasks)
+    return learner, state, evaluator, evaluator(state.params)
+
+
+@pytest.fixture(scope="module")
+def page(played, tmp_path_factory):
+    """The folder of a report, and the data that the page's script reads."""
+    learner, state, evaluator, outcome = played
+    folder = RunFolder(tmp_path_factory.mktemp("runs") / "<mine>")
+    folder.path.mkdir()
+    CsvLog(folder.metrics).append([row(1), row(2, policy_loss=0.5)])
+    report.write(folder, Run(CONFIG, "fast"), learner, state, evaluator, {0: outcome})
+    start, end = '<script type="application/json" id="data">', "</script>"
+    return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
+
+
+def test_a_page_needs_no_network_and_holds_the_settings(page):
+    text = page[0].page.read_text()
+    assert "<h1>&lt;mine&gt;</h1>" in text
+    assert "<td>hidden</td><td>4</td>" in text
+    assert "<td>{P}</td><td>2</td>" in text
+    assert not re.search(r"https?:|(src|href)=\"(?!data:)", text)
+    assert "NaN" not in text
+
+
+def test_a_page_shows_solved_and_unsolved_episodes(played, page):
+    outcome, data = played[3]["mine"], page[1]
+    solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
+    mine = [each for each in data["episodes"] if each["title"].startswith("mine")]
+    assert [each["title"] for each in mine] == [
+        f"mine, task {solved}: solved",
+        f"mine, task {unsolved}: not solved",
+    ]
+    for index, each in zip((solved, unsolved), mine, strict=True):
+        length = outcome.length[index]
+        assert len(each["agent"]["frames"]) == length + 1
+        assert len(each["agent"]["actions"]) == len(each["rewards"]) == length
+        np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
+        for number in each["agent"]["frames"]:
+            with Image.open(io.BytesIO(base64.b64decode(data["pictures"][number]))) as picture:
+                assert picture.size == (192, 192)
+
+
+def test_a_page_shows_shortest_plans(played, page):
+    """From the same board as the episode, and with as many steps as are needed."""
+    for each in page[1]["episodes"]:
+        name, _, number = each["title"].partition(":")[0].partition(", task ")
+        steps = {"base": 11, "mine": 1}.get(name)
+        plan = each["plan"]
+        assert len(plan["frames"]) == len(plan["actions"]) + 1
+        if steps is not None:
+            assert len(plan["actions"]) == steps
+        tasks = played[2].tasks[{"{P}": "p"}.get(name, name)]
+        state = jax.tree.map(lambda x, i=int(number): x[i], tasks)
+        first = DIRECTION_NAMES.index(plan["actions"][0].split()[1].rstrip(","))
+        shown = report._png(np.asarray(tt.render(state, 16, grasp=first)).tobytes())
+        assert page[1]["pictures"][plan["frames"][0]] == base64.b64encode(shown).decode()
+
+
+def test_the_intrinsic_reward_is_that_of_the_shown_episodes_alone(played):
+    """Counts: two equal episodes halve the squared bonus of one."""
+    learner, state, evaluator, _ = played
+    one = jax.tree.map(lambda x: x[:1], evaluator.tasks["base"])
+    two = jax.tree.map(lambda x: jnp.concatenate([x, x]), one)
+    alone, both = (report._intrinsic_reward(learner, state, x, 6) for x in (one, two))
+    np.testing.assert_allclose(both[:, 0] * 2**0.5, alone[:, 0], rtol=1e-6)
+    assert alone.sum() > 0
+
+
+def test_a_solved_episode_becomes_a_gif(played, tmp_path):
+    _, _, evaluator, outcome = played
+    path = tmp_path / "solved.gif"
+    assert report.save_first_solved(path, evaluator, [outcome], prefer="base") == "mine"
+    with Image.open(path) as picture:
+        index = int(np.argmax(outcome["mine"].solved))
+        assert getattr(picture, "n_frames", 1) == outcome["mine"].length[index] + 1
+    unsolved = {"base": outcome["base"]}
+    assert report.save_first_solved(tmp_path / "x.gif", evaluator, [unsolved], "base") is None
+    assert not (tmp_path / "x.gif").exists()
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)}")
+def test_a_browser_shows_a_page(page, tmp_path):
+    """The page's script has run: it has filled in the episodes and the boards."""
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}"]
+    command = [str(BROWSER), *options, "--dump-dom", page[0].page.as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    for each in page[1]["episodes"]:
+        assert f">{html.escape(each['title'])}</option>" in shown
+    assert re.search(r'<img id="board" [^>]*src="data:image/png', shown)
+    assert "The agent: step 0 of " in shown
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is_terminal):
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=is_terminal, width=100)
+    with display.ProgressLine(console, 5) as progress:
+        for iteration in (1, 2):
+            rows = [row(iteration), row(iteration, seed=1, success=0.75)]
+            progress.update(rows)
+    text = file.getvalue()
+    assert "16 episodes, 50.0% solved, 50.0% greedily, 12,000 steps/s" in text
+    assert ("iteration 2: " in text) != is_terminal
+    assert ("2/5" in text) == is_terminal
+
+
+def scored(name, tasks, solved, **values):
+    empty = {"layouts": "", "layouts_total": "", "length": ""}
+    return {"seed": 0, "task_set": name, "tasks": tasks, "solved": solved, **empty, **values}
+
+
+def test_the_table_fits_a_terminal():
+    rows = [
+        scored("stsy", 1000, 999, layouts=5, layouts_total=5, length=33.0),
+        scored("pstsy", 1000, 999, length=33.0),
+        scored("p", 10, 0),
+    ]
+    lines = display.evaluation_table(rows).splitlines()
+    assert max(map(len, lines)) <= 80
+    cells = [re.split(r"\s{2,}", line) for line in lines]
+    assert cells[1] == ["{St, Sy} (stsy)", "1000", "99.9", "–", "5 of 5", "33.0"]
+    assert cells[2] == ["{P, St, Sy} (pstsy)", "1000", "99.9", "99.4–100.0", "–", "33.0"]
+    assert cells[3] == ["{P} (p)", "10", "0.0", "0.0–27.8", "–", "–"]
+    mean = display.evaluation_table([scored("p", 10, 10), scored("p", 10, 5)]).splitlines()[1]
+    assert re.split(r"\s{2,}", mean) == ["{P} (p)", "10", "75.0", "–", "–", "–"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "solved", "expected"),
+    [
+        ({"stop_when_solved": 1.0}, {0: FirstSolved(2, 4321, 9, 1.0)}, "--preset best"),
+        ({"stop_when_solved": 1.0}, {}, "--resume 'a b' --iterations 14"),
+        ({"lr_decay_fraction": 0.5}, {}, ": a b/report.html"),
+    ],
+)
+def test_a_run_ends_with_facts_and_what_to_do_next(settings, solved, expected):
+    run = Run(small_config(iterations=7, **settings))
+    rows = [scored("base", 1, 1), scored("p", 10, 5), scored("st", 10, 0)]
+    lines = display.summary(RunFolder(Path("a b")), run, rows, solved)
+    assert ("after 4,321 episodes" in lines[0]) == bool(solved)
+    assert "100.0 % of its test tasks" in lines[0]
+    assert lines[1] == "Other task sets: 25.0 % on average."
+    assert lines[-1].endswith(expected)

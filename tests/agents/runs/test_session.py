@@ -1,0 +1,218 @@
+"""Runs from Python: what they write, how they continue, and how they end badly."""
+
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+import agents
+from agents.acting.policy_files import load_policy
+from agents.ppo.learner import Learner
+from agents.runs import session
+from agents.runs.checkpoint import Checkpoints
+from agents.runs.folder import Run, RunFolder
+from agents.runs.loading import load_policies
+from agents.runs.metrics import read_rows
+from agents.runs.results import metrics, results
+from agents.runs.session import RunOptions, train_run
+from agents.runs.stopping import DivergedError, Stopped
+from small_runs import final_state, small_config, untimed
+from trap_tube_jax.scoring.tasks import ALL_SETS
+
+ITERATIONS = 6
+TRACKED = RunOptions(
+    checkpoint_every=2, evaluate_every=2, sets=("base", "p"), reported=3, report=False
+)
+PLAIN = RunOptions(checkpoint_every=2, sets=("base",), report=False)
+
+
+def small_run(iterations=ITERATIONS, **values):
+    return Run(small_config(iterations=iterations), "fast", **values)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that nothing interrupts, evaluated as it goes. Not to be changed."""
+    path = tmp_path_factory.mktemp("runs") / "whole"
+    train_run(path, small_run(), TRACKED)
+    return path
+
+
+@pytest.fixture
+def copy(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "copy")
+
+
+def test_a_run_leaves_its_rows(whole):
+    rows = untimed(whole)
+    assert [row["iteration"] for row in rows] == [str(n + 1) for n in range(ITERATIONS)]
+    assert [row["episodes"] for row in rows] == [str(8 * n + 8) for n in range(ITERATIONS)]
+    found = [
+        (row["iteration"], row["purpose"], row["task_set"], row["tasks"])
+        for row in read_rows(whole / "evaluations.csv")
+    ]
+    validation = [
+        (n, "validation", name, tasks) for n in (2, 4, 6) for name, tasks in (("base", 1), ("p", 2))
+    ]
+    best = load_policy(RunFolder(whole).best(0)).iteration
+    assert found == [*validation, (best, "test", "base", 1), (best, "test", "p", 3)]
+
+
+def test_results_are_a_tidy_table(whole):
+    table = results(whole.parent)
+    assert list(table["task_set"]) == ["base", "p"] * 4
+    assert set(table["algorithm"]) == {"ppo+effects"}
+    assert set(table["hidden"]) == {4}
+    assert set(table["run"]) == {str(whole)}
+    assert list(metrics([whole])["iteration"]) == list(range(1, ITERATIONS + 1))
+    with pytest.raises(ValueError, match="holds no run"):
+        results(whole / "checkpoints")
+
+
+@pytest.mark.parametrize("iteration", [1, 4])
+def test_stopped_runs_continue_to_the_same_bits(whole, tmp_path, monkeypatch, iteration):
+    """Stopped between and at checkpoints; the rows and the best parameters are the same, too."""
+    path, advance = tmp_path / "stopped", session.Session._iterate
+
+    def stop(self, program):
+        rows = advance(self, program)
+        return rows if self.iteration != iteration else _raise(Stopped(2))
+
+    monkeypatch.setattr(session.Session, "_iterate", stop)
+    with pytest.raises(Stopped):  # as a kill would: the iteration is not saved
+        train_run(path, small_run(), TRACKED)
+    monkeypatch.undo()
+    train_run(path, small_run(), TRACKED)
+    assert final_state(path) == final_state(whole)
+    assert untimed(path) == untimed(whole)
+    names = ("config.json", "evaluations.csv", "best-seed0.safetensors")
+    for name in names:
+        assert (path / name).read_bytes() == (whole / name).read_bytes()
+
+
+def _raise(error):
+    raise error
+
+
+def test_a_request_saves_and_stops(tmp_path, monkeypatch):
+    monkeypatch.setattr(session.processes, "agree", lambda number: 2)
+    with pytest.raises(Stopped):
+        train_run(tmp_path / "x", small_run(), PLAIN)
+    assert final_state(tmp_path / "x")[0] == 1
+
+
+def test_a_finished_run_returns_at_once(copy, monkeypatch):
+    monkeypatch.setattr(session, "make_evaluator", None)
+    before = (copy / "evaluations.csv").read_bytes()
+    train_run(copy, small_run(), TRACKED)
+    assert (copy / "evaluations.csv").read_bytes() == before
+
+
+def test_a_finished_run_is_extended(copy):
+    train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
+    assert final_state(copy)[0] == ITERATIONS + 1
+    tested = [row for row in read_rows(copy / "evaluations.csv") if row["purpose"] == "test"]
+    assert len(tested) in (2, 4)  # as the best parameters are the old ones or new ones
+    with pytest.raises(ValueError, match="iterations must be at least 7, which are done, got 6"):
+        train_run(copy, small_run(), TRACKED)
+
+
+def test_seeds_side_by_side_are_those_trained_alone(tmp_path):
+    train_run(tmp_path / "two", small_run(iterations=3, seeds=2), PLAIN)
+    train_run(tmp_path / "one", small_run(iterations=3, seed=1), PLAIN)
+    both = [row for row in untimed(tmp_path / "two") if row["seed"] == "1"]
+    for row, alone in zip(both, untimed(tmp_path / "one"), strict=True):
+        for name, value in alone.items():
+            np.testing.assert_allclose(float(row[name]), float(value), rtol=1e-4, atol=1e-6)
+    names = [policy.name for policy in load_policies(tmp_path / "two")]
+    assert names == ["seed 0", "seed 1"]
+    assert agents.load(tmp_path / "two", seed=1).name == "seed 1"
+    with pytest.raises(ValueError, match="has no seed 7; allowed: 0, 1"):
+        agents.load(tmp_path / "two", seed=7)
+
+
+def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
+    iterate = Learner.iterate
+
+    def diverge(self, state):
+        after, metrics = iterate(self, state)
+        return after, {**metrics, "is_finite": (after.iteration < 3).astype(np.float32)}
+
+    monkeypatch.setattr(Learner, "iterate", diverge)
+    with pytest.raises(DivergedError, match=r"iteration 3: .* try a learning_rate below 0.002"):
+        train_run(tmp_path / "x", small_run(), PLAIN)
+    assert final_state(tmp_path / "x")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("discount", lambda v: v["config"].update(discount=0.5), "discount=0.5"),
+        ("seed", lambda v: v.update(seed=3), "seed=3"),
+    ],
+)
+def test_settings_changed_on_disk_are_noticed(copy, name, change, message):
+    path = copy / "config.json"
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+    with pytest.raises(ValueError, match=f"the run has {message}"):
+        train_run(copy, small_run(iterations=9), TRACKED)
+    values.pop("version")
+    with pytest.raises(ValueError, match=rf"checkpoint 6 .* the run has {name}="):
+        train_run(copy, Run.from_dict(values), TRACKED)
+
+
+def test_metrics_deleted_between_stop_and_resume_cost_the_curve_alone(copy):
+    (copy / "metrics.csv").unlink()
+    train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
+    assert [row["iteration"] for row in untimed(copy)] == [str(ITERATIONS + 1)]
+
+
+def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch):
+    def full(self, *args):
+        raise OSError("cannot write checkpoint 2: no space")
+
+    monkeypatch.setattr(Checkpoints, "save", full)
+    with pytest.raises(OSError, match="no space"):
+        train_run(tmp_path / "x", small_run(), PLAIN)
+    monkeypatch.undo()
+    train_run(tmp_path / "x", small_run(), PLAIN)
+    assert final_state(tmp_path / "x")[0] == ITERATIONS
+
+
+def test_what_memory_cannot_hold_is_refused_before_it_is_asked_for(tmp_path):
+    config = small_config(episodes_per_iteration=10**6, minibatch_size=10**6)
+    run = Run(config, seeds=60_000)
+    with pytest.raises(ValueError, match=r"needs about .* GB of memory, this machine has"):
+        train_run(tmp_path / "x", run, PLAIN)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"keep": 0}, "keep must be >= 1, got 0"),
+        ({"checkpoint_every": 0}, "checkpoint_every must be >= 1, got 0"),
+        ({"evaluate_every": -1}, "evaluate_every must be >= 0, got -1"),
+        ({"sets": ("q",)}, "unknown task set 'q'"),
+    ],
+)
+def test_impossible_options_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        RunOptions(**values)
+
+
+def test_without_evaluation_the_final_policy_is_tested_on_all_sets(tmp_path):
+    train_run(tmp_path / "x", small_run(iterations=1), RunOptions(report=False))
+    rows = read_rows(tmp_path / "x" / "evaluations.csv")
+    assert [row["task_set"] for row in rows] == list(ALL_SETS)
+    assert {(row["purpose"], row["iteration"]) for row in rows} == {("test", 1)}
+    assert not list((tmp_path / "x").glob("*.safetensors"))
+    policy = agents.load(tmp_path / "x")
+    agents.save(tmp_path / "mine.safetensors", policy)
+    again = agents.load(tmp_path / "mine.safetensors")
+    assert (again.name, again.config) == ("mine", policy.config)
+    jax.tree.map(np.testing.assert_array_equal, again.params, policy.params)

@@ -1,0 +1,79 @@
+"""Training so small that it takes a second, and the processes and files of its runs."""
+
+import csv
+import os
+import subprocess
+import sys
+
+from agents.config import Config
+from agents.runs.checkpoint import Checkpoints, digest
+from paths import ROOT
+
+SETTINGS = {
+    "episodes_per_iteration": 8,
+    "minibatch_size": 4,
+    "epochs": 1,
+    "max_steps": 6,
+    "encode_chunk_size": 8,
+    "filters": (2, 2),
+    "hidden": 4,
+    "embedding": 2,
+    "eval_episodes": 2,
+}
+TIMING_COLUMNS = ("seconds", "transitions_per_second")  # of the metrics; differ each time
+
+
+def small_config(**settings):
+    """Returns the preset `fast` at its smallest, which solves nothing."""
+    return Config.preset("fast", **{**SETTINGS, **settings})
+
+
+def options():
+    """Returns the settings as options of a command line."""
+    given = []
+    for name, value in SETTINGS.items():
+        values = value if isinstance(value, tuple) else (value,)
+        given += [f"--{name.replace('_', '-')}", *map(str, values)]
+    return given
+
+
+def start(module, *arguments, **environment):
+    """Starts a process of a command line, warnings being errors."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", module, *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu", **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(module, *arguments, **environment):
+    """Runs a command line to its end, and returns its output."""
+    process = start(module, *arguments, **environment)
+    output, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert not errors
+    return output
+
+
+def read_iterations(process, count):
+    """Reads the output up to the line of the count-th iteration, or to its end."""
+    while count and (line := process.stdout.readline()):
+        count -= line.startswith("iteration ")
+
+
+def untimed(folder):
+    """Returns the metrics of a run without the columns of time."""
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    return [{k: v for k, v in row.items() if k not in TIMING_COLUMNS} for row in rows]
+
+
+def final_state(folder):
+    """Returns the iteration and the digest of the newest checkpoint."""
+    with Checkpoints(folder / "checkpoints") as checkpoints:
+        arrays, record = checkpoints.load()
+    return record["iteration"], digest(arrays)
