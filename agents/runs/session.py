@@ -77,7 +77,12 @@ class RunOptions:
 
 
 def train_run(
-    path: Path, run: Run, options: RunOptions | None = None, *, console: Console | None = None
+    path: Path,
+    run: Run,
+    options: RunOptions | None = None,
+    *,
+    console: Console | None = None,
+    stop_file: Path | None = None,
 ) -> None:
     """Trains a run to its end from its newest checkpoint, evaluates it and writes its files.
 
@@ -88,6 +93,8 @@ def train_run(
       run: what to train; of a stored run only `EXTENDABLE` settings may differ.
       options: how to train.
       console: where progress is shown; nowhere if None.
+      stop_file: training stops as by SIGTERM once this file exists, which reaches threads and
+        other hosts.
 
     Raises:
       ValueError: the run cannot be trained or continued, or it diverged (`DivergedError`).
@@ -103,7 +110,7 @@ def train_run(
                 run.check_continues(RunFolder.open(path)[1])
             else:
                 folder.create(run)
-        session = Session(folder, run, options, console)
+        session = Session(folder, run, options, console, stop_file)
         with session.checkpoints or processes.nothing():
             session.train()
             session.finish()
@@ -112,13 +119,21 @@ def train_run(
 class Session:
     """One process's part of a run: owns its state and its files."""
 
-    def __init__(self, folder: RunFolder, run: Run, options: RunOptions, console: Console):
+    def __init__(
+        self,
+        folder: RunFolder,
+        run: Run,
+        options: RunOptions,
+        console: Console,
+        stop_file: Path | None = None,
+    ):
         """Builds the learner and restores the newest checkpoint.
 
         Raises:
           ValueError: the settings cannot be trained with, or the checkpoint cannot be continued.
         """
         self.folder, self.run, self.options, self.console = folder, run, options, console
+        self.stop_file = stop_file
         self.placement = Placement.of(options.devices, run.config, run.seeds)
         self.learner = make_train(run.config, axis=self.placement.axis)
         self.sets = options.sets or own_and_paper_sets(run.config)
@@ -176,13 +191,15 @@ class Session:
             f"{count:,} parameters, on {self.placement}. Compiling ..."
         )
         advance = self._compile()
-        stop = StopSignals(lambda: self._say("Finishing this iteration; Ctrl-C again stops now."))
+        stop = StopSignals(
+            lambda: self._say("Finishing this iteration; Ctrl-C again stops now."), self.stop_file
+        )
         with stop, ProgressLine(self.console, self.run.config.iterations) as progress:
             while self.active.any():
                 rows = self._iterate(advance)
                 progress.update(rows)
                 # A signal may reach any process: all have to agree on it.
-                request = processes.agree(stop.received)
+                request = processes.agree(stop.request())
                 due = self.iteration % self.options.checkpoint_every == 0
                 if due or request or not self.active.any():
                     self._save()

@@ -3,6 +3,7 @@
 import signal
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Self
 
 
@@ -34,9 +35,9 @@ class StopSignals:
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-    def __init__(self, on_request: Callable[[], None] = lambda: None):
+    def __init__(self, on_request: Callable[[], None] = lambda: None, file: Path | None = None):
         self.received: int | None = None
-        self._on_request = on_request
+        self._on_request, self._file = on_request, file
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -47,6 +48,11 @@ class StopSignals:
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+
+    def request(self) -> int | None:
+        """Returns the number of the first signal; SIGTERM's if `file` exists; else None."""
+        asked = self._file is not None and self._file.exists()
+        return self.received or (int(signal.SIGTERM) if asked else None)
 
     def _handle(self, number: int, frame: Any) -> None:
         del frame
