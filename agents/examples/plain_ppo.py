@@ -1,0 +1,250 @@
+"""Recurrent PPO with an intrinsic curiosity module in one file, to read from top to bottom.
+
+Network, rewards, losses and settings are those of preset `paper`, computed in the plainest way:
+by Flax's own layers, with every observation encoded wherever it occurs. `agents.ppo` computes the
+same losses, and `python -m benchmarks.learner_peers` compares the two in speed. To train:
+
+    python -m agents.examples.plain_ppo --help
+
+An episode has T steps, and step t leads from observation t to observation t + 1. B episodes are an
+iteration. The GRU has H units. Source: Schulman et al. (2017); Pathak et al. (2017); agent.md.
+"""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+import tyro
+
+import trap_tube_jax as tt
+from agents import Config
+from agents.examples.near_food import NEAR_FOOD
+
+Batch = tuple["Episode", jax.Array, jax.Array]  # [B, ...]; advantage and value target f32[B, T]
+he_normal = nn.initializers.he_normal()
+dense = functools.partial(nn.Dense, kernel_init=he_normal)
+conv = functools.partial(nn.Conv, kernel_init=he_normal)
+
+
+class Episode(NamedTuple):
+    """An episode, played under the parameters before the update."""
+
+    observation: jax.Array  # u8[T + 1, 12, 12, N]
+    action: jax.Array  # i32[T, 2], grasp and move
+    reward: jax.Array  # f32[T], extrinsic
+    mask: jax.Array  # f32[T], 1 until the episode ends, 0 afterwards
+    log_prob: jax.Array  # f32[T], of the action
+    value: jax.Array  # f32[T]
+
+
+class TrainState(NamedTuple):
+    """The state of training."""
+
+    params: Any
+    opt_state: Any
+    variance: jax.Array  # f32[2], moving averages, of extrinsic and intrinsic reward
+    iteration: jax.Array  # i32[]
+    key: jax.Array
+
+
+class Encoder(nn.Module):
+    """The paper's encoder: u8[..., 12, 12, N] to f32[..., filters[1]]."""
+
+    filters: tuple[int, int]
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """Convolves the features, scaled to [-1, 1], and the coordinates of each cell."""
+        row, column = jnp.indices(observation.shape[-3:-1]) / (observation.shape[-2] - 1)
+        coordinates = 2 * jnp.stack([column, row, jnp.hypot(row, column) / 2**0.5], axis=-1) - 1
+        coordinates = jnp.broadcast_to(coordinates, (*observation.shape[:-1], 3))
+        x = jnp.concatenate([observation / 127.5 - 1, coordinates], axis=-1)
+        for features in self.filters:
+            x = nn.swish(conv(features, (2, 2))(x))
+        for _ in range(2):
+            x = nn.max_pool(x, (2, 2), strides=(2, 2))
+            y = conv(x.shape[-1], (3, 3))(nn.swish(x))
+            x = x + conv(x.shape[-1], (3, 3))(nn.swish(y))
+        return jnp.max(x, axis=(-3, -2))
+
+
+class Network(nn.Module):
+    """Policy, value, and the forward and inverse model of the curiosity, over encoder and GRU."""
+
+    encoder: nn.Module
+    hidden: int
+    embedding: int
+
+    def setup(self) -> None:
+        """Declares the layers."""
+        embed = functools.partial(nn.Embed, 4, self.embedding, embedding_init=he_normal)
+        self.grasp, self.move, self.reward = embed(), embed(), dense(self.embedding)
+        self.initial = self.param("initial", nn.initializers.zeros, (self.hidden,))
+        self.gru = nn.GRUCell(self.hidden, kernel_init=he_normal, recurrent_kernel_init=he_normal)
+        self.unroll: Any = nn.RNN(self.gru)
+        self.policy, self.critic = nn.DenseGeneral((2, 4)), nn.Dense(1)
+        self.mix, self.forward = dense(self.hidden), nn.Dense(self.hidden)
+        self.inverse = nn.Sequential([dense(self.hidden), nn.swish, nn.DenseGeneral((2, 4))])
+
+    def embed(self, action: jax.Array) -> jax.Array:
+        """Returns the embeddings of grasp and move, concatenated."""
+        return jnp.concatenate([self.grasp(action[..., 0]), self.move(action[..., 1])], axis=-1)
+
+    def inputs(self, observation: jax.Array, action: jax.Array, reward: jax.Array) -> jax.Array:
+        """Returns the GRU's input f32[..., H]; action and reward are those of the step before."""
+        parts = [self.encoder(observation), self.embed(action), nn.swish(self.reward(reward))]
+        return nn.swish(self.mix(jnp.concatenate(parts, axis=-1)))
+
+    def act(self, state: jax.Array, *inputs: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Advances the GRU by one step; returns its state f32[H], logits f32[2, 4] and value."""
+        state, output = self.gru(state, self.inputs(*inputs))
+        return state, self.policy(output), self.critic(output)[..., 0]
+
+    def __call__(self, episode: Episode) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Returns the policy's logits, value, forward error f32[T, H] and the inverse logits."""
+        action = jnp.pad(episode.action, ((1, 0), (0, 0)))
+        reward = jnp.pad(episode.reward, (1, 0))[:, None]
+        inputs = self.inputs(episode.observation, action, reward)
+        both = jnp.stack([inputs[:-1], inputs[1:]])
+        here, later = self.unroll(both, initial_carry=jnp.stack([self.initial] * 2))
+        predicted = here + self.forward(jnp.concatenate([here, self.embed(episode.action)], -1))
+        inferred = self.inverse(jnp.concatenate([here, later], -1))
+        return self.policy(here), self.critic(here)[..., 0], (predicted - later) ** 2, inferred
+
+
+def log_prob(logits: jax.Array, action: jax.Array) -> jax.Array:
+    """Returns log p(grasp) + log p(move), f32[...]."""
+    return -optax.softmax_cross_entropy_with_integer_labels(logits, action).sum(axis=-1)
+
+
+def discounted_sum(x: jax.Array, discount: float) -> jax.Array:
+    """Returns y_t, the sum of discount^(s - t) x_s over s >= t, f32[B, T]."""
+    return x @ jnp.tril(jax.scipy.linalg.toeplitz(discount ** jnp.arange(x.shape[1])))
+
+
+@dataclasses.dataclass(frozen=True)
+class PlainPPO:
+    """Training as pure functions; an iteration is `collect`, then an `update` per minibatch."""
+
+    config: Config
+    env: Any
+    network: Any
+    optimizer: optax.GradientTransformation
+
+    def init(self, key: jax.Array) -> TrainState:
+        """Draws the parameters."""
+        params_key, key = jax.random.split(key)
+        observation = jnp.zeros((2, *self.env.observation_spec.shape), jnp.uint8)
+        episode = Episode(observation, jnp.zeros((1, 2), jnp.int32), *jnp.zeros((4, 1)))
+        params = self.network.init(params_key, episode)
+        return TrainState(params, self.optimizer.init(params), jnp.zeros(2), jnp.int32(0), key)
+
+    def collect(self, state: TrainState) -> tuple[TrainState, Batch, jax.Array]:
+        """Plays the episodes of an iteration, and draws its minibatches i32[updates, size]."""
+        play_key, order_key, key = jax.random.split(state.key, 3)
+        count, epochs = self.config.episodes_per_iteration, self.config.epochs
+        episode = jax.vmap(self.play, (None, 0))(state.params, jax.random.split(play_key, count))
+        variance, batch = self.prepare(state, episode)
+        orders = [jax.random.permutation(k, count) for k in jax.random.split(order_key, epochs)]
+        minibatches = jnp.concatenate(orders).reshape(-1, self.config.minibatch_size)
+        return TrainState(*state[:2], variance, state.iteration + 1, key), batch, minibatches
+
+    def play(self, params: Any, key: jax.Array) -> Episode:
+        """Plays an episode."""
+        reset_key, key = jax.random.split(key)
+        state, timestep = self.env.reset(reset_key)
+
+        def step(carry: Any, key: jax.Array) -> Any:
+            state, mask, inputs = carry
+            hidden, logits, value = self.network.apply(params, *inputs, method="act")
+            action = jax.random.categorical(key, logits).astype(jnp.int32)
+            state, timestep = self.env.step(state, action)
+            reward = mask * timestep.reward
+            record = (inputs[1], action, reward, mask, log_prob(logits, action), value)
+            inputs = (hidden, timestep.observation, action, reward[None])
+            return (state, mask * (1.0 - timestep.done), inputs), record
+
+        start, nothing = params["params"]["initial"], (jnp.zeros(2, jnp.int32), jnp.zeros(1))
+        first = (state, jnp.ones(()), (start, timestep.observation, *nothing))
+        keys = jax.random.split(key, self.env.max_steps)
+        (_, _, inputs), record = jax.lax.scan(step, first, keys)
+        return Episode(jnp.concatenate([record[0], inputs[1][None]]), *record[1:])
+
+    def prepare(self, state: TrainState, episode: Episode) -> tuple[jax.Array, Batch]:
+        """Adds both rewards, estimates advantages; returns the rewards' variances and a batch."""
+        config, mask = self.config, episode.mask
+        error = jax.vmap(self.network.apply, (None, 0))(state.params, episode)[2]
+        rewards = jnp.stack([episode.reward, mask * jnp.sum(error, axis=-1)])
+        keep = jnp.where(state.iteration > 0, config.reward_ema_decay, 0.0)
+        fresh = jnp.var(rewards, axis=(1, 2), where=mask > 0)
+        variance = keep * state.variance + (1 - keep) * fresh
+        scale = jnp.array([1, config.intrinsic_coef]) / jnp.where(variance > 0, variance, 1) ** 0.5
+        reward = jnp.tensordot(scale, rewards, axes=1)
+        # As in the published baseline, the last step's own value follows it.
+        following = jnp.concatenate([episode.value[:, 1:], episode.value[:, -1:]], axis=1)
+        delta = mask * (reward + config.discount * following - episode.value)
+        advantage = discounted_sum(delta, config.discount * config.gae_lambda)
+        advantage = mask * jax.nn.standardize(advantage, (0, 1), epsilon=1e-8, where=mask > 0)
+        return variance, (episode, advantage, discounted_sum(reward, config.discount))
+
+    def update(self, state: TrainState, batch: Batch, places: jax.Array) -> tuple[TrainState, Any]:
+        """Takes a gradient step on the episodes at `places`; returns the terms of the loss, too."""
+        minibatch = jax.tree.map(lambda x: x[places], batch)
+        gradient, terms = jax.grad(self.loss, has_aux=True)(state.params, minibatch)
+        updates, opt_state = self.optimizer.update(gradient, state.opt_state)
+        params = optax.apply_updates(state.params, updates)
+        return TrainState(params, opt_state, *state[2:]), terms
+
+    def loss(self, params: Any, batch: Batch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Returns the loss f32[] and its terms, in whose means padding counts as zeros."""
+        config, (episode, advantage, target) = self.config, batch
+        logits, value, error, inferred = jax.vmap(self.network.apply, (None, 0))(params, episode)
+        entropy = optax.softmax_cross_entropy(logits, jax.nn.softmax(logits)).sum(axis=-1)
+        ratio = jnp.exp(log_prob(logits, episode.action) - episode.log_prob)
+        clipped = jnp.clip(ratio, 1 - config.clip_eps, 1 + config.clip_eps)
+        terms = {
+            "policy_loss": -jnp.minimum(ratio * advantage, clipped * advantage),
+            "value_loss": config.value_coef * jnp.square(value - target),
+            "entropy_loss": -config.entropy_coef * entropy,
+            "forward_loss": config.curiosity_coef * jnp.mean(error, axis=-1),
+            "inverse_loss": -config.curiosity_coef * log_prob(inferred, episode.action),
+        }
+        terms = {name: jnp.mean(episode.mask * term) for name, term in terms.items()}
+        return sum(terms.values(), jnp.zeros(())), terms
+
+
+def make_train(config: Config, env: Any = None, encoder: nn.Module | None = None) -> PlainPPO:
+    """Returns training, by default in the config's environment with the paper's encoder."""
+    env = env or tt.make(config.env_id, max_steps=config.max_steps)
+    network = Network(encoder or Encoder(config.filters), config.hidden, config.embedding)
+    adam = optax.adam(config.learning_rate, eps=config.adam_epsilon)
+    clip = optax.clip_by_global_norm(config.max_gradient_norm)
+    return PlainPPO(config, env, network, optax.chain(clip, adam))
+
+
+def main(env: str = NEAR_FOOD.short, iterations: int = 10) -> float:
+    """Trains with 64 episodes and 20 gradient steps an iteration; returns the last success.
+
+    Args:
+      env: task set, by id or short name; by default one that is learned within a minute.
+      iterations: number of iterations.
+    """
+    small = {"episodes_per_iteration": 64, "minibatch_size": 16, "epochs": 5}
+    learner = make_train(Config.preset("paper", env_id=env, **small))
+    collect, update = jax.jit(learner.collect), jax.jit(learner.update)
+    state, success = learner.init(jax.random.key(0)), 0.0
+    for iteration in range(1, iterations + 1):
+        state, batch, minibatches = collect(state)
+        for places in minibatches:
+            state, _ = update(state, batch, places)
+        success = float(batch[0].reward.sum(axis=1).mean())
+        print(f"iteration {iteration}: {success:.0%} of the episodes solved")
+    return success
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,109 @@
+"""The plain program computes the losses of `agents.ppo`, and learns."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import pytest
+
+from agents import Config, make_train
+from agents.examples import plain_ppo
+from agents.examples.near_food import NEAR_FOOD
+
+CONFIG = Config(
+    env_id=NEAR_FOOD.id,
+    episodes_per_iteration=32,
+    minibatch_size=32,
+    epochs=1,
+    filters=(3, 4),
+    hidden=5,
+    embedding=2,
+    encode_chunk_size=8,
+)
+
+
+def plain_params(params):
+    """The parameters of `agents.ppo` under the names of the plain network."""
+    encoder, core, heads = (params[name]["params"] for name in ("encoder", "core", "heads"))
+    forward, inverse = (params["curiosity"][name]["params"] for name in ("forward", "inverse"))
+    update, reset, candidate = zip(
+        *(jnp.split(core[name], 3, axis=-1) for name in ("input_kernel", "state_kernel", "bias")),
+        strict=True,
+    )
+    gates = {"z": update, "r": reset, "n": candidate}
+    gru = {f"i{g}": {"kernel": x, "bias": b[0]} for g, (x, _, b) in gates.items()}
+    gru |= {f"h{g}": {"kernel": h} for g, (_, h, _) in gates.items()}
+    gru["hn"]["bias"] = candidate[2][1]
+
+    def pair(layers):
+        grasp, move = layers["grasp"], layers["move"]
+        return {name: jnp.stack([grasp[name], move[name]], axis=-2) for name in ("kernel", "bias")}
+
+    blocks = [encoder[block][conv] for block in ("block1", "block2") for conv in ("conv1", "conv2")]
+    convolutions = [encoder["conv1"], encoder["conv2"], *blocks]
+    return {
+        "params": {
+            "encoder": {f"Conv_{i}": layer for i, layer in enumerate(convolutions)},
+            "grasp": core["grasp_embedding"],
+            "move": core["move_embedding"],
+            "reward": core["reward_embedding"],
+            "mix": core["mix"],
+            "initial": core["initial"],
+            "gru": gru,
+            "policy": pair(heads),
+            "critic": heads["value"],
+            "forward": forward["Dense_0"],
+            "inverse": {"layers_0": inverse["Dense_0"], "layers_2": pair(inverse)},
+        }
+    }
+
+
+def test_rewards_advantages_and_losses_are_those_of_the_learner():
+    learner, plain = make_train(CONFIG), plain_ppo.make_train(CONFIG)
+    state = learner.init(jax.random.key(0))
+    reset_keys = jax.random.split(jax.random.key(1), CONFIG.episodes_per_iteration)
+    trajectory = learner.play(state.params, reset_keys, jax.random.key(2))
+    episodes = trajectory.episodes
+    assert 0 < episodes.mask.mean() < 1, "some end early"
+    moved, batch, _ = learner.prepare(state, trajectory)
+    # Updated parameters, so that ratios are not 1.
+    noise = iter(jax.random.split(jax.random.key(3), len(jax.tree.leaves(state.params))))
+    now = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(noise), x.shape), state.params)
+    now["core"]["params"]["bias"] = now["core"]["params"]["bias"].at[1, : 2 * CONFIG.hidden].set(0)
+    _, expected = learner.loss(now, batch)
+
+    steps = (
+        episodes.action,
+        episodes.reward,
+        episodes.mask,
+        trajectory.log_prob,
+        trajectory.value[:-1, :, 0],
+    )
+    steps = jax.tree.map(lambda x: x.swapaxes(0, 1), (episodes.observations(), *steps))
+    plain_state = plain.init(jax.random.key(0))._replace(params=plain_params(state.params))
+    variance, (episode, advantage, target) = plain.prepare(plain_state, plain_ppo.Episode(*steps))
+    total, terms = plain.loss(plain_params(now), (episode, advantage, target))
+    chex.assert_trees_all_close(
+        [*variance, advantage.T, target.T[..., None], {**terms, "loss": total}],
+        [
+            moved.extrinsic.variance,
+            moved.intrinsic.variance,
+            batch.advantage,
+            batch.value_target,
+            {name: expected[name] for name in ("loss", *terms)},
+        ],
+        rtol=1e-4,
+        atol=1e-5,
+    )
+
+
+def test_an_update_lowers_the_loss():
+    plain = plain_ppo.make_train(CONFIG)
+    state, batch, minibatches = jax.jit(plain.collect)(plain.init(jax.random.key(0)))
+    after, terms = jax.jit(plain.update)(state, batch, minibatches[0])
+    assert plain.loss(after.params, batch)[0] < sum(terms.values())
+
+
+@pytest.mark.slow
+def test_learns_to_reach_near_food(capsys):
+    assert plain_ppo.main(iterations=10) > 0.9
+    assert capsys.readouterr().out.count("solved") == 10
