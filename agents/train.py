@@ -151,6 +151,8 @@ def train(options: Options, run: Run) -> None:
         console.print(f"Stopped. {again}", soft_wrap=True, highlight=False, markup=False)
         number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT
         raise SystemExit(128 + number) from None
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise OSError(f"{error}. Saved checkpoints are kept. {again}") from error
     if processes.is_first():

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+from concurrent import futures
 
 import pytest
 
@@ -72,6 +73,28 @@ def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
     assert (process.returncode, errors) == (130, "")
     assert f"Stopped. Continue with: python -m agents.train --resume {path}" in output
     assert final_state(path)[0] == len(untimed(path)) >= 3
+
+
+@pytest.mark.parametrize("vanishes", ["pipe", "folder"])
+def test_training_ends_without_a_traceback_where(vanishes, tmp_path):
+    arguments = ["--iterations", 100_000, "--out", tmp_path, "--name", "x"]
+    with start("agents.train", *options(), *arguments) as process:
+        read_iterations(process, 1)
+        if vanishes == "pipe":
+            process.stdout.close()
+        else:
+            shutil.rmtree(tmp_path / "x")
+        errors = process.stderr.read()
+    assert process.returncode == 1
+    assert "Traceback" not in errors
+    assert (f"--resume {tmp_path}/x" in errors) == (vanishes == "folder")
+
+
+def test_training_runs_in_a_thread(tmp_path):
+    arguments = [*options(), "--iterations", "1", "--out", str(tmp_path), "--name", "x"]
+    with futures.ThreadPoolExecutor(1) as pool:
+        pool.submit(main, arguments).result()
+    assert final_state(tmp_path / "x")[0] == 1
 
 
 def test_evaluate_writes_before_it_prints(whole, tmp_path):

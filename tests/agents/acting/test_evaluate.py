@@ -1,19 +1,10 @@
 """Greedy evaluation: fixed tasks, scores, tables and the page of a run."""
 
-import base64
-import html
-import io
-import json
-import re
-import shutil
-import subprocess
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
 
 import trap_tube_jax as tt
 from agents import make_train
@@ -21,8 +12,6 @@ from agents.acting.evaluation import Evaluation, Evaluator
 from agents.config import Config
 from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
-from trap_tube_jax.dynamics import step
-from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.registry import PAPER_TASK_SETS
 from trap_tube_jax.scoring import benchmark
 from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, wilson_interval
