@@ -5,6 +5,7 @@ Source of the `paper` preset: agents/agent.md.
 
 import dataclasses
 import difflib
+import functools
 import math
 from typing import Any, Literal, Self, get_args, get_origin
 
@@ -14,10 +15,18 @@ from trap_tube_jax.registry import task_set
 LARGEST = 2**31 - 1  # of an i32, in which training counts
 
 
-def _setting(default: Any, low: float | None = None, high: float = LARGEST) -> Any:
-    """Declares a field of `Config` with its default and, for numbers, its inclusive limits."""
+def _setting(group: str, default: Any, low: float | None = None, high: float = LARGEST) -> Any:
+    """Declares a field of `Config`: its group, default and, for numbers, inclusive limits."""
     limits = None if low is None else (low, high)
-    return dataclasses.field(default=default, metadata={"limits": limits})
+    return dataclasses.field(default=default, metadata={"group": group, "limits": limits})
+
+
+_task = functools.partial(_setting, "task")
+_length = functools.partial(_setting, "length of training")
+_ppo = functools.partial(_setting, "PPO")
+_curiosity = functools.partial(_setting, "curiosity")
+_replay = functools.partial(_setting, "replay of failed tasks")
+_network = functools.partial(_setting, "network")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,8 +41,8 @@ class Config:
       iterations: rollouts to train for, at most. Schedules span this number.
       max_transitions: environment steps to train for, at most; training stops before an iteration
         that could exceed it. None sets no limit.
-      stop_when_solved: stops a seed early once its greedy policy solves this fraction of the
-        validation tasks of `env_id`; 0 never stops early.
+      stop_when_solved: stops a seed once it solves this fraction of the validation tasks of
+        `env_id` greedily; 0 never stops early.
       eval_episodes: fixed evaluation tasks per task set.
 
       episodes_per_iteration: episodes played per iteration.
@@ -42,92 +51,91 @@ class Config:
 
       discount: gamma.
       gae_lambda: lambda of the advantage estimates.
-      bootstrap: value that follows the last step of an episode. `value`: 0 after termination, the
+      bootstrap: value after the last step of an episode. `value`: 0 after termination, the
         last observation's value after truncation; the value target is advantage + value.
         `baseline`, as in the paper's published baseline: the value of the final board after
         termination, the last step's own value after truncation; the value target is the
         discounted sum of rewards.
-      clip_eps: half-width of PPO's interval of probability ratios.
+      clip_eps: half-width of the interval of probability ratios.
       value_coef: weight of the squared value error.
-      entropy_coef: weight of the entropy bonus, summed over grasp and move.
+      entropy_coef: weight of the entropy bonus. Entropy is summed over grasp and move.
 
       learning_rate: Adam's step size.
-      lr_decay_fraction: final fraction of the gradient steps, over which the step size decays
+      lr_decay_fraction: final fraction of training that decays the step size. It decays
         geometrically to a fiftieth.
       adam_epsilon: Adam's epsilon.
       max_gradient_norm: global norm to which gradients are clipped.
 
-      curiosity: source of the intrinsic reward, by registered name (README.md lists them).
-      intrinsic_coef: weight of the normalised intrinsic reward, or of its advantage.
-      intrinsic_coef_init: initial weight, which decays geometrically to `intrinsic_coef`; 0 keeps
-        the weight constant.
-      intrinsic_anneal_fraction: initial fraction of the iterations over which the weight decays.
+      curiosity: intrinsic reward, by its registered name. README.md lists them.
+      intrinsic_coef: weight of the intrinsic reward. The reward is normalised; with separate value
+        heads its advantage is weighted instead.
+      intrinsic_coef_init: initial weight. It decays geometrically to `intrinsic_coef`; 0 keeps the
+        weight constant.
+      intrinsic_anneal_fraction: fraction of iterations that decay the weight.
       curiosity_coef: weight of the curiosity's losses.
-      value_heads: `shared`: rewards are divided by their standard deviation and added, and one
-        head values the sum. `separate`: each reward has its own value head, and the normalised
-        advantages are added (`agents.ppo.advantages`).
-      reward_ema_decay: decay of the moving moments that normalise both rewards, and of the rates
-        of `effects`.
+      value_heads: one for all rewards, or one each. `shared`: rewards are divided by their standard
+        deviation and added, and one head values the sum. `separate`: each reward has its own head,
+        and the normalised advantages are added (`agents.ppo.advantages`).
+      reward_ema_decay: decay of the moving moments of both rewards. They normalise the rewards;
+        the rates of `effects` decay alike.
 
-      replay_fractions: fractions of the episodes that replay tasks failed once, twice, and so on.
-      replay_capacity: newest failed tasks kept for each of these.
+      replay_fractions: episodes that replay tasks failed once, twice, ... Each number is a fraction
+        of the episodes of an iteration.
+      replay_capacity: newest failed tasks kept for each of them.
 
-      align_to_food: turns and mirrors the board once per episode so that the food is ahead.
-      encoder: `paper`; `objects`, which groups cells by colour and encodes their positions relative
-        to agent and food; or a registered name.
-      filters: channels of the first convolution and of all later ones; layer widths of `objects`.
-      hidden: units of the GRU, of the layer before it and of the inverse model.
-      embedding: units of each action embedding and of the reward's.
+      align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
+      encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
+        their positions relative to agent and food.
+      filters: channels of the first and of later convolutions; layer widths of `objects`.
+      hidden: units of the GRU. The layer before it and the inverse model have as many.
+      embedding: units of each embedding of actions and reward.
       recurrent: keeps the GRU's state between steps; without it the agent remembers its previous
         action and reward only.
       encode_chunk_size: distinct observations encoded at once; affects speed, and results only
         through the order of float32 sums.
     """
 
-    # Task.
-    env_id: str = _setting("TrapTube-v0")
-    num_features: int = _setting(3, 1, 256)
-    max_steps: int | None = _setting(None, 1, 10_000)
-    # Length.
-    iterations: int = _setting(250, 1, 10_000_000)
-    max_transitions: int | None = _setting(None, 1)
-    stop_when_solved: float = _setting(0.0, 0, 1)
-    eval_episodes: int = _setting(128, 1, 1_000_000)
-    # Episodes and gradient steps of an iteration.
-    episodes_per_iteration: int = _setting(1024, 1, 1_000_000)
-    epochs: int = _setting(10, 1, 10_000)
-    minibatch_size: int = _setting(128, 1, 1_000_000)
-    # PPO.
-    discount: float = _setting(0.99, 0, 1)
-    gae_lambda: float = _setting(0.95, 0, 1)
-    bootstrap: Literal["value", "baseline"] = _setting("baseline")
-    clip_eps: float = _setting(0.2, 0)
-    value_coef: float = _setting(0.01, 0)
-    entropy_coef: float = _setting(1e-4, 0)
-    # Optimizer.
-    learning_rate: float = _setting(1e-3, 0)
-    lr_decay_fraction: float = _setting(0.0, 0, 1)
-    adam_epsilon: float = _setting(1e-7, 1e-12)
-    max_gradient_norm: float = _setting(1.0, 0)
-    # Intrinsic reward.
-    curiosity: str = _setting("icm")
-    intrinsic_coef: float = _setting(0.1, 0)
-    intrinsic_coef_init: float = _setting(0.0, 0)
-    intrinsic_anneal_fraction: float = _setting(0.3, 0, 1)
-    curiosity_coef: float = _setting(10.0, 0)
-    value_heads: Literal["shared", "separate"] = _setting("shared")
-    reward_ema_decay: float = _setting(0.9, 0, 1)
-    # Replay of failed tasks.
-    replay_fractions: tuple[float, ...] = _setting((), 0, 1)
-    replay_capacity: int = _setting(1024, 1, 1_000_000)
-    # Network.
-    align_to_food: bool = _setting(False)
-    encoder: str = _setting("paper")
-    filters: tuple[int, int] = _setting((32, 64), 1, 4096)
-    hidden: int = _setting(64, 1, 65_536)
-    embedding: int = _setting(8, 1, 65_536)
-    recurrent: bool = _setting(True)
-    encode_chunk_size: int = _setting(64, 1, 1_000_000)
+    env_id: str = _task("TrapTube-v0")
+    num_features: int = _task(3, 1, 256)
+    max_steps: int | None = _task(None, 1, 10_000)
+
+    iterations: int = _length(250, 1, 10_000_000)
+    max_transitions: int | None = _length(None, 1)
+    stop_when_solved: float = _length(0.0, 0, 1)
+    eval_episodes: int = _length(128, 1, 1_000_000)
+
+    episodes_per_iteration: int = _ppo(1024, 1, 1_000_000)
+    epochs: int = _ppo(10, 1, 10_000)
+    minibatch_size: int = _ppo(128, 1, 1_000_000)
+    discount: float = _ppo(0.99, 0, 1)
+    gae_lambda: float = _ppo(0.95, 0, 1)
+    bootstrap: Literal["value", "baseline"] = _ppo("baseline")
+    clip_eps: float = _ppo(0.2, 0)
+    value_coef: float = _ppo(0.01, 0)
+    entropy_coef: float = _ppo(1e-4, 0)
+    learning_rate: float = _ppo(1e-3, 0)
+    lr_decay_fraction: float = _ppo(0.0, 0, 1)
+    adam_epsilon: float = _ppo(1e-7, 1e-12)
+    max_gradient_norm: float = _ppo(1.0, 0)
+
+    curiosity: str = _curiosity("icm")
+    intrinsic_coef: float = _curiosity(0.1, 0)
+    intrinsic_coef_init: float = _curiosity(0.0, 0)
+    intrinsic_anneal_fraction: float = _curiosity(0.3, 0, 1)
+    curiosity_coef: float = _curiosity(10.0, 0)
+    value_heads: Literal["shared", "separate"] = _curiosity("shared")
+    reward_ema_decay: float = _curiosity(0.9, 0, 1)
+
+    replay_fractions: tuple[float, ...] = _replay((), 0, 1)
+    replay_capacity: int = _replay(1024, 1, 1_000_000)
+
+    align_to_food: bool = _network(False)
+    encoder: str = _network("paper")
+    filters: tuple[int, int] = _network((32, 64), 1, 4096)
+    hidden: int = _network(64, 1, 65_536)
+    embedding: int = _network(8, 1, 65_536)
+    recurrent: bool = _network(True)
+    encode_chunk_size: int = _network(64, 1, 1_000_000)
 
     def __post_init__(self) -> None:
         """Checks the settings.
@@ -136,9 +144,10 @@ class Config:
           ValueError: a setting is not allowed; the message names its value and the allowed ones.
         """
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+            value: Any = getattr(self, field.name)
             if isinstance(value, list):  # as JSON and YAML have it
-                object.__setattr__(self, field.name, value := tuple(value))
+                value = tuple(value)
+                object.__setattr__(self, field.name, value)
             _check_value(field, value)
         registry.curiosities.factory(self.curiosity)
         registry.encoders.factory(self.encoder)
@@ -289,11 +298,7 @@ def _check_value(field: dataclasses.Field, value: Any) -> None:
     if field.metadata["limits"] is None or (value is None and field.default is None):
         return
     low, high = field.metadata["limits"]
-    whole = isinstance(field.default, int) or field.name in (
-        "filters",
-        "max_steps",
-        "max_transitions",
-    )
+    whole = "int" in str(field.type)
     kind = "an integer" if whole else "a finite number"
     for number in value if isinstance(value, tuple) else (value,):
         is_number = type(number) is int or (type(number) is float and not whole)

@@ -4,13 +4,10 @@ import csv
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets
-from agents.command_line import Flag, Imports
+from agents.command_line import option, parse
 from agents.runs import compilation
 from agents.runs.evaluator import evaluation_rows
 from agents.runs.loading import load_policies
@@ -37,19 +34,19 @@ class Options:
       gif: GIF file for the first solved episode.
     """
 
-    source: Annotated[str, tyro.conf.Positional]
+    source: str
     sets: tuple[str, ...] = ()
-    imports: Imports = ()
+    imports: tuple[str, ...] = option((), append=True, flags=("--import",))
     tasks: int | None = None
     iteration: int | None = None
-    optimality: Flag = False
+    optimality: bool = False
     output: Path | None = None
     gif: Path | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if None."""
-    options = tyro.cli(Options, args=arguments, prog="python -m agents.evaluate")
+    options = parse(Options, arguments, "python -m agents.evaluate")
     compilation.enable_cache()
     with plain_errors():
         evaluate(options)

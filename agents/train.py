@@ -1,18 +1,18 @@
 """Training from the command line: python -m agents.train --help."""
 
+import argparse
 import dataclasses
 import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import tyro
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.command_line import Imports
-from agents.config import PRESETS, Config
+from agents.command_line import add_options, build, make_parser, option
+from agents.config import Config
 from agents.parallel import processes
 from agents.parallel.devices import become_devices
 from agents.runs import compilation, display
@@ -27,108 +27,83 @@ PROGRAM = "python -m agents.train"
 
 
 @dataclasses.dataclass(frozen=True)
-class Selection:
-    """Options that are read first, because they decide the defaults of the settings.
-
-    Attributes:
-      preset: named settings to start from.
-      env: task set to train on, by id or short name.
-      imports: modules to import first, which register curiosities, encoders or task sets.
-      resume: folder of a run to continue; its settings become the defaults, and only
-        --iterations, --max-transitions and --stop-when-solved may change.
-    """
-
-    preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
-    env: Annotated[str | None, tyro.conf.arg(aliases=("--env-id",))] = None
-    imports: Annotated[Imports, tyro.conf.arg(aliases=("--imports",))] = ()
-    resume: Path | None = None
-
-
-class Settings(Config):
-    """`Config` without the setting that `Selection` gives."""
-
-    env_id: Annotated[str, tyro.conf.Suppress]
-
-
-@dataclasses.dataclass(frozen=True)
-class Options(Selection):
+class Options:
     """Trains an agent, evaluates it on all task sets and writes a folder of results.
 
-    Ctrl-C stops after the current iteration and saves; --resume continues to the same result. A
-    second Ctrl-C stops at once.
+    Ctrl-C stops after the current iteration and saves; --resume continues to the same result.
+    A second Ctrl-C stops at once.
 
     Attributes:
+      preset: named settings to start from: fast, best or paper.
+      env: task set to train on, by id or short name.
       seed: the first seed.
       seeds: number of seeds to train side by side.
       name: the run's folder within --out; <preset>-<task set>-<seed> if absent.
       out: the folder of all runs.
+      resume: folder of a run to continue; its settings become the defaults, and only
+        --iterations, --max-transitions and --stop-when-solved may change.
+      imports: module to import first. It may register curiosities, encoders and task sets.
       checkpoint_every: iterations from one checkpoint to the next.
       keep: number of newest checkpoints to keep.
-      devices: number of devices that share the run; one if absent, all with --distributed.
+      devices: devices that share the run; one if absent, all if distributed.
     """
 
-    seed: int = 0
-    seeds: int = 1
-    name: str | None = None
-    out: Path = Path("runs")
-    config: Annotated[Config, tyro.conf.arg(name="", constructor=Settings)] = dataclasses.field(
-        default_factory=Config
-    )
-    checkpoint_every: int = 10
-    keep: int = 3
-    devices: int | None = None
-    job: Annotated[processes.Job, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=processes.Job
-    )
+    preset: str = option("fast", "run")
+    env: str | None = option(None, "run", flags=("--env-id",))
+    seed: int = option(0, "run")
+    seeds: int = option(1, "run")
+    name: str | None = option(None, "run")
+    out: Path = option(Path("runs"), "run")
+    resume: Path | None = option(None, "run")
+    imports: tuple[str, ...] = option((), "run", append=True, flags=("--import",))
+    checkpoint_every: int = option(10, "run")
+    keep: int = option(3, "run")
+    devices: int | None = option(None, "devices and hosts")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if None."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     with plain_errors():
-        options, run = parse(arguments)
-        train(options, run)
+        train(*parse(arguments))
 
 
-def parse(arguments: Sequence[str]) -> tuple[Options, Run]:
+def parse(arguments: Sequence[str]) -> tuple[Options, Run, processes.Job]:
     """Reads a command line and, with --resume, the stored run.
 
     Raises:
       ValueError: a value is not allowed, or contradicts the stored run.
     """
-    selection, _ = tyro.cli(
-        Selection, args=arguments, prog=PROGRAM, add_help=False, return_unknown_args=True
+    # The preset, or the stored run, decides the defaults of all other options.
+    first, _ = _parser(Options(), Config.preset("fast")).parse_known_args(
+        [argument for argument in arguments if argument not in ("-h", "--help")]
     )
-    import_modules(selection.imports)
-    given = {} if selection.env is None else {"env_id": tt.task_set(selection.env).id}
-    if selection.resume is None:
-        config = Config.preset(selection.preset, **given)
-        defaults = Options(preset=selection.preset, config=config)
-    else:
-        folder, stored = RunFolder.open(selection.resume, selection.imports)
-        defaults = Options(
-            preset=stored.preset,
-            seed=stored.seed,
-            seeds=stored.seeds,
-            out=folder.path.parent,
-            name=folder.path.name,
-            config=dataclasses.replace(stored.config, **given),
-        )
-    options = tyro.cli(
-        Options,
-        args=arguments,
-        prog=PROGRAM,
-        default=defaults,
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
-    config = Config.from_dict(options.config.to_dict())
-    config = dataclasses.replace(config, env_id=tt.task_set(config.env_id).id)
-    return options, Run(
-        config, options.preset, options.seed, options.seeds, imports=options.imports
-    )
+    import_modules(first.imports)
+    own: dict[str, Any] = {} if first.env is None else {"env_id": tt.task_set(first.env).id}
+    defaults, config = Options(), Config.preset(first.preset, **own)
+    if first.resume is not None:
+        _, stored = RunFolder.open(first.resume, tuple(first.imports))
+        defaults = Options(preset=stored.preset, seed=stored.seed, seeds=stored.seeds)
+        config = dataclasses.replace(stored.config, **own)
+    found = _parser(defaults, config).parse_args(arguments)
+    options = build(Options, found)
+    config = build(Config, found, env_id=tt.task_set(config.env_id).id)
+    run = Run(config, options.preset, options.seed, options.seeds, imports=options.imports)
+    return options, run, build(processes.Job, found)
 
 
-def train(options: Options, run: Run) -> None:
+def _parser(options: Options, config: Config) -> argparse.ArgumentParser:
+    """Returns the parser with these defaults."""
+    parser = make_parser(Options, PROGRAM)
+    add_options(parser, Options, options, skip=("devices",))
+    add_options(parser, Config, config, skip=("env_id",))
+    others = [field.name for field in dataclasses.fields(Options) if field.name != "devices"]
+    add_options(parser, Options, options, skip=others)
+    add_options(parser, processes.Job)
+    return parser
+
+
+def train(options: Options, run: Run, job: processes.Job) -> None:
     """Trains a run, or continues it, and prints its results.
 
     Raises:
@@ -137,7 +112,7 @@ def train(options: Options, run: Run) -> None:
       OSError: a file cannot be written.
     """
     become_devices(options.devices)
-    options.job.join()
+    job.join()
     console = Console(quiet=not processes.is_first())
     folder = RunFolder(run_path(options, run))
     if options.resume is None and processes.is_first():

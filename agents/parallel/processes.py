@@ -27,14 +27,12 @@ class Job:
     """How this process finds the others.
 
     Attributes:
-      distributed: train together with the other processes of this job, as Slurm, Open MPI,
+      distributed: trains together with the other processes of this job. Slurm, Open MPI,
         Kubernetes or a Cloud TPU describe it.
-      coordinator: host:port of the first process, the same in all; needed where no launcher
-        describes the job.
-      processes: how many processes there are, beside --coordinator.
-      process_id: which of them this is, from 0, beside --coordinator.
-      peer_timeout: seconds without a sign of life after which a process counts as lost and
-        all others end.
+      coordinator: HOST:PORT of the first process. Needed where no launcher describes the job.
+      processes: number of processes, with --coordinator.
+      process_id: number of this process from 0, with --coordinator.
+      peer_timeout: seconds after which a silent process counts as lost.
     """
 
     distributed: Flag = False

@@ -109,11 +109,11 @@ class Checkpoints:
         try:
             restored = self._manager.restore(chosen, args=items)
             arrays, record = restored["state"], restored["record"]
-            problem = None if digest(arrays) == record["digest"] else "its numbers have changed"
+            if digest(arrays) == record["digest"]:
+                return arrays, record
+            problem = "its numbers have changed"
         except Exception as error:  # depends on the file that is damaged
             problem = _first_line(error)
-        if problem is None:
-            return arrays, record
         if iteration is None and chosen not in (now := self.iterations) and now:
             return self.load()
         others = [other for other in known if other != chosen]

@@ -35,7 +35,7 @@ from agents.runs.provenance import provenance
 from agents.runs.stopping import DivergedError, Stopped, StopSignals
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
-Advance = Callable[[TrainState, np.ndarray], tuple[TrainState, dict[str, jax.Array]]]
+Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -368,7 +368,7 @@ def make_advance(learner: Learner) -> Advance:
             "steps": after.transitions - state.transitions,
         }
 
-    def advance(states: TrainState, active: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
+    def advance(states: TrainState, active: Any) -> tuple[TrainState, dict[str, jax.Array]]:
         if len(active) == 1:  # a run whose only seed is not active is over
             after, metrics = one_seed(jax.tree.map(lambda x: x[0], states))
             return jax.tree.map(lambda x: x[None], (after, metrics))

@@ -1,6 +1,5 @@
 """Greedy evaluation: fixed tasks, scores, tables and the page of a run."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
