@@ -5,130 +5,87 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from agents.acting.policy import Policy
 from agents.command_line import Imports
-from agents.experiments.records import check_clean, read_record
-from agents.pretrained import load_shipped
-from agents.profiles import figures, tables
-from agents.profiles.measure import SCHEMA, Settings, profile
+from agents.profiles import figures
+from agents.profiles.measure import failure_table, profile, success_table
+from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation
-from agents.runs.folder import RunFolder, read_json, write_json
-from agents.runs.loading import load_policy
+from agents.runs.folder import write_json
+from agents.runs.loading import load_policies
+from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.imports import import_modules
-
-PROGRAM = "python -m agents.profile"
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Settings):
-    """Profiles trained agents: how success falls with the distance from the base task.
+class Options:
+    """Profiles trained agents: success by distance from the base task and by kind of task.
 
-    Percent solved and optimality against the angle of the colours, the distance of the layout,
-    the length of the shortest plan, by the way that the food has to take, and by kind of symbolic
-    swap; the controls of comparative psychology; the paired test of the first push; and at which
-    step and subgoal plans go wrong. All agents in one figure, and one more figure for each.
-    Greedy play on tasks drawn with keys that training never uses, compared with exact shortest
-    plans.
+    Agents play greedily, one episode a task, on tasks drawn with keys that training never uses.
+    Writes profile.csv, provenance.json and, if their parts are measured, success.png and
+    controls.png.
 
     Attributes:
-      runs: folders of runs, or files of parameters; of a run its first seed.
-      pretrained: names of shipped parameters.
-      imports: modules of your own to import first, for what the agents' settings name; those of
-        the runs are known.
-      out: the folder of record, tables and figures.
-      record: also write the record to this file; refused unless all is of committed code.
-      commit: the commit to note where git does not tell it.
-      draw: measure nothing; draw tables and figures of this record.
+      runs: runs' folders, files of parameters, or names of shipped agents; of a run all seeds.
+      output: the folder to write.
+      parts: what to measure: structural, perceptual or both transfers by strength; symbolic by the
+        object swapped; the tasks of {P} by kind or by plan-length; the control tasks.
+      strengths: strengths of the graded transfers, from 0 (base) to 1 (the paper's transfer).
+      tasks: tasks of each strength and symbolic swap, and of {P}.
+      imports: modules of your own to import first, which register names of an agent's settings.
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    pretrained: tuple[str, ...] = ()
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    output: Path = Path("runs/profile")
+    parts: tuple[str, ...] = tuple(PARTS)
+    strengths: tuple[float, ...] = STRENGTHS
+    tasks: int = 200
     imports: Imports = ()
-    out: Path = Path("runs/profile")
-    record: Path | None = None
-    commit: str | None = None
-    draw: Path | None = None
 
     def policies(self) -> dict[str, Policy]:
-        """What to profile, by the name that figures show.
+        """Loads the policies, by source and, where a source has several, by seed.
 
         Raises:
-          ValueError: nothing is given, two have one name, or one cannot be read.
+          ValueError: no source is given, or one cannot be read.
         """
-        if not self.runs and not self.pretrained:
-            raise ValueError("give runs' folders or --pretrained NAME, one or more of them")
-        names = [*(path.resolve().name for path in self.runs), *self.pretrained]
-        if len(set(names)) < len(names):
-            raise ValueError(
-                "two agents have the same name, by which figures tell them apart: "
-                f"{', '.join(names)}; rename one folder or file"
-            )
-        found = [*map(load_policy, self.runs), *map(load_shipped, self.pretrained)]
-        return dict(zip(names, found, strict=True))
-
-    def machines(self) -> list[Any]:
-        """Those that the runs were trained on."""
-        return [each for path in self.runs for each in read_json(RunFolder(path).machines) or ()]
+        if not self.runs:
+            raise ValueError("give one or more runs' folders, files or names of shipped agents")
+        found = {}
+        for source in self.runs:
+            policies = load_policies(source, imports=self.imports)
+            for policy in policies:
+                suffix = f", {policy.name}" if len(policies) > 1 else ""
+                found[f"{Path(source)}{suffix}"] = policy
+        return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if absent."""
+    """Runs the command line; `arguments` are those of the process if None."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    options = tyro.cli(Options, args=arguments, prog="python -m agents.profile")
     with plain_errors():
-        options = tyro.cli(Options, args=arguments, prog=PROGRAM)
         compilation.enable_cache()
-        run(options, arguments)
-
-
-def without_places(arguments: Sequence[str]) -> list[str]:
-    """The arguments but --out and --record: where results go says nothing of them."""
-    kept, given = [], iter(arguments)
-    for argument in given:
-        name, _, value = argument.partition("=")
-        if name not in ("--out", "--record"):
-            kept.append(argument)
-        elif not value:
-            next(given, None)
-    return kept
-
-
-def run(options: Options, arguments: Sequence[str]) -> None:
-    """Measures as the options say, and shows and writes the results.
-
-    Raises:
-      ValueError: an option is not allowed, or a record cannot be read or written.
-    """
-    console = Console()
-    import_modules(options.imports)
-    drawn = None if options.draw is None else read_record(options.draw, SCHEMA)
-    if options.record is not None:  # before measuring, which would be in vain
-        check_clean(drawn or {"machines": options.machines()}, options.commit)
-    found = drawn or profile(
-        options.policies(),
-        options,
-        console,
-        command=f"{PROGRAM} {shlex.join(without_places(arguments))}",
-        machines=options.machines(),
-        commit=options.commit,
-    )
-    for table in tables.tables(found):
-        console.print(table.to_rich())
-    write_json(options.out / "profile.json", found)
-    text = f"# Profile\n\n{tables.markdown(found)}\n"
-    (options.out / "tables.md").write_text(text, encoding="utf-8")
-    for name, save in figures.drawings(found, "profile").items():
-        save(options.out / name)
-    console.print(f"record, tables and figures: {options.out}", soft_wrap=True, highlight=False)
-    if options.record is not None:
-        check_clean(found, options.commit)
-        write_json(options.record, found)
-        console.print(f"record: {options.record}", soft_wrap=True, highlight=False)
+        policies = options.policies()
+        origin = {
+            "command": f"python -m agents.profile {shlex.join(arguments)}",
+            "iterations": {name: policy.iteration for name, policy in policies.items()},
+            **provenance(),
+        }
+        options.output.mkdir(parents=True, exist_ok=True)
+        found = profile(policies, options.parts, options.strengths, options.tasks)
+        found.to_csv(options.output / "profile.csv", index=False, float_format="%.6g")
+        write_json(options.output / "provenance.json", origin)
+        if set(options.parts) & set(figures.PANELS):
+            figures.save_success(found, options.output / "success.png")
+        if "control" in options.parts:
+            figures.save_controls(found, options.output / "controls.png")
+        print(f"Tasks solved, %\n\n{success_table(found).to_string()}\n")
+        print(f"Failed episodes, by last subgoal reached\n\n{failure_table(found).to_string()}\n")
+        print(f"results: {options.output}")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,7 @@
-"""Profiles: how a policy's success falls with the distance from the base task, and where it errs.
+"""Profiles of trained agents: success by distance from the base task and by kind of task.
 
-    tasks.py      the tasks, point by point
-    oracle.py     distances to the goal along episodes
-    mistakes.py   where an episode leaves the shortest way, and how far it comes
-    measure.py    plays and compares all of it; the record
-    summary.py    what a record comes to: percentages, intervals, counts
-    tables.py     the tables of a record
-    figures.py    its figures
-
-The command line is `agents/profile.py`.
+tasks.py      the tasks of each part of a profile
+subgoals.py   the last subgoal that an episode reached
+measure.py    greedy play on these tasks, as a tidy table, and smaller tables made from it
+figures.py    the figures
 """

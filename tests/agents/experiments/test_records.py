@@ -11,7 +11,6 @@ import pytest
 
 from agents.experiments import figures, records, statistics, tables, training
 from agents.experiments.protocol import PROTOCOLS, Protocol
-from agents.profiles import figures as profile_figures
 from agents.runs import machine
 from agents.runs.folder import Run, RunFolder, write_json
 from paths import ROOT
@@ -223,7 +222,7 @@ def test_curves_are_drawn_of_seeds_of_any_length(example, tmp_path):
     assert figures.drawn_from(tmp_path / "none.png") is None
 
 
-@pytest.mark.parametrize("drawn_by", [figures, profile_figures])
+@pytest.mark.parametrize("drawn_by", [figures])
 def test_figures_are_out_of_date_where_the_code_that_draws_them_changed(monkeypatch, drawn_by):
     before = drawn_by.digest({})
     assert before == drawn_by.digest({}) != drawn_by.digest({"seed": 1})

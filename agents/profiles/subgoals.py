@@ -1,0 +1,68 @@
+"""The last subgoal that an episode reached."""
+
+import jax
+import numpy as np
+from scipy import ndimage
+
+from trap_tube_jax import dynamics
+from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
+from trap_tube_jax.state import State
+
+# In the order of a plan. Tool touched: the agent has grasped it. Tool moved, food moved: it has
+# left its first cell. Food out: the agent could walk to the food without moving the tool.
+SUBGOALS = ("none", "tool touched", "tool moved", "food moved", "food out")
+
+
+def last_subgoals(tasks: State, actions: np.ndarray) -> np.ndarray:
+    """Returns i32[B], the index in `SUBGOALS` of the last subgoal that each episode reached.
+
+    Args:
+      tasks: B states at time 0.
+      actions: i32[B, T, 2], (grasp, move); actions after the end of an episode change nothing.
+    """
+    agent, tool, food = _replay(tasks, actions)
+    extent = np.asarray(tasks.tool_extent)[:, None]
+    at_hand = _covers(tool[:, :-1], extent, agent[:, :-1] + DIRECTIONS[actions[..., 0]])
+    is_inside = _covers(tool[:, :-1], extent, agent[:, :-1])
+    reached = [
+        np.ones(len(agent), bool),
+        (at_hand & ~is_inside).any(axis=1),
+        (tool != tool[:, :1]).any(axis=(1, 2)),
+        (food != food[:, :1]).any(axis=(1, 2)),
+        _walks_to_food(np.asarray(tasks.board), extent, agent, tool, food).any(axis=1),
+    ]
+    return np.max(np.arange(len(SUBGOALS))[:, None] * reached, axis=0)
+
+
+def _replay(tasks: State, actions: np.ndarray) -> np.ndarray:
+    """Returns i32[3, B, T + 1, 2], the cells of agent, tool and food along B episodes."""
+    states = [tasks]
+    for action in np.moveaxis(actions, 1, 0):
+        states.append(_step(states[-1], action))
+    return np.stack([np.stack([each.agent, each.tool, each.food]) for each in states], axis=2)
+
+
+_step = jax.jit(jax.vmap(dynamics.step))
+
+
+def _walks_to_food(board: np.ndarray, extent: np.ndarray, *cells: np.ndarray) -> np.ndarray:
+    """Returns bool[B, T]: the agent can walk to the food with the tool left in its place.
+
+    Args:
+      board: u8[B, 12, 12].
+      extent: i32[B, 1, 2], the tool's.
+      cells: of agent, tool and food, i32[B, T, 2] each.
+    """
+    every = np.moveaxis(np.indices((BOARD_SIZE, BOARD_SIZE)), 0, -1)
+    agent, tool, food = (x[:, :, None, None] for x in cells)
+    is_tool = _covers(tool, extent[:, :, None, None], every)
+    is_food = (every == food).all(axis=-1) & ~is_tool
+    is_free = ((board == GROUND)[:, None] & ~is_tool) | is_food
+    start = (every == agent).all(axis=-1)
+    steps = ndimage.generate_binary_structure(2, 1)[None, None]
+    return (ndimage.binary_propagation(start, steps, mask=is_free) & is_food).any(axis=(2, 3))
+
+
+def _covers(corner: np.ndarray, extent: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Returns bool[...]: the tool at `corner` covers `cell`."""
+    return np.all((cell >= corner) & (cell < corner + extent), axis=-1)

@@ -1,0 +1,67 @@
+"""Parts of a profile hold the tasks that their names and levels promise."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents.profiles.tasks import PARTS, Sampling, layout_kinds
+from trap_tube_jax.controls import trap_exchanged
+from trap_tube_jax.solver.search import take
+
+LAYOUT = ("board", "agent", "tool", "tool_extent", "food")
+SAMPLING = Sampling((0.0, 1.0), 3, 3)
+
+
+def level(part, name):
+    tasks, levels = PARTS[part](SAMPLING)
+    return take(tasks, np.array(levels) == name)
+
+
+def same(one, other, *fields):
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in fields)
+
+
+@pytest.mark.parametrize("part", ["structural", "perceptual", "both"])
+def test_strength_0_is_the_base_task_alone(part):
+    tasks = level(part, "0")
+    assert same(tasks, jax.tree.map(lambda x: x[None], tt.base_state()), *LAYOUT, "palette")
+    assert len(level(part, "1").time) == 3
+
+
+def test_transfers_change_layout_or_colours_and_draw_alike_in_all_parts():
+    structural, perceptual, both = (
+        level(part, "1") for part in ("structural", "perceptual", "both")
+    )
+    base = tt.base_state()
+    assert all(same(take(structural, i), base, *LAYOUT) for i in range(3))
+    assert all(same(take(perceptual, i), base, "palette") for i in range(3))
+    assert same(perceptual, both, *LAYOUT)
+    assert same(level("symbolic", "tool"), both, *LAYOUT, "palette")
+    assert not same(level("symbolic", "trap"), both, *LAYOUT)
+    for part in ("kind", "plan-length"):
+        assert same(PARTS[part](SAMPLING).tasks, perceptual, *LAYOUT)
+
+
+def test_controls_have_the_layouts_of_the_registered_sets_in_base_colours():
+    tasks, levels = PARTS["control"](SAMPLING)
+    names = [level.split(",")[0] for level in levels or ()]
+    assert len(tasks.time) == len(set(levels or ())) == 14
+    assert set(names) == {"base", *(entry.short for entry in tt.CONTROL_TASK_SETS)}
+    assert all(np.array_equal(each, tt.base_palette()) for each in tasks.palette)
+
+
+@pytest.mark.parametrize(
+    ("state", "agent", "extent", "kind"),
+    [
+        (tt.base_state(), (9, 1), (4, 1), "away, across"),  # the food leaves to the right
+        (tt.base_state(), (11, 5), (4, 1), "sideways, across"),
+        (tt.base_state(), (5, 1), (1, 4), "away, along"),
+        (tt.base_state(), (7, 11), (1, 4), "towards, along"),
+        (trap_exchanged()[0], (7, 11), (1, 4), "away, along"),
+    ],
+)
+def test_kinds_of_layouts(state, agent, extent, kind):
+    state = state.replace(agent=jnp.array(agent), tool_extent=jnp.array(extent))
+    assert layout_kinds(jax.tree.map(lambda x: x[None], state)) == [kind]
