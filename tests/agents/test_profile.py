@@ -6,39 +6,44 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from agents import load
 from agents import profile as command
 from agents.pretrained import FOLDER
 
 
 def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
     source = str(FOLDER / "fast-base.safetensors")
-    arguments = ["fast-base", source, "--parts", "structural", "control"]
-    arguments += ["--strengths", "0", "1", "--tasks", "2", "--output", str(tmp_path / "out")]
+    out = tmp_path / "out"
+    options = f"--parts structural control --strengths 0 1 --tasks 2 --output {out}"
 
     def refuse(*values):
-        assert len(list((tmp_path / "out").iterdir())) == 4
+        assert len(list(out.iterdir())) == 4
         raise RuntimeError("the terminal is gone")
 
     monkeypatch.setattr("builtins.print", refuse)
     with pytest.raises(RuntimeError, match="terminal"):
-        command.main(arguments)
-    table = pd.read_csv(tmp_path / "out" / "profile.csv")
+        command.main(["fast-base", source, *options.split()])
+    table = pd.read_csv(out / "profile.csv")
     one, two = (group.drop(columns="policy") for _, group in table.groupby("policy", sort=False))
     pd.testing.assert_frame_equal(one.reset_index(drop=True), two.reset_index(drop=True))
     assert list(table["policy"].unique()) == ["fast-base", source]
-    provenance = json.loads((tmp_path / "out" / "provenance.json").read_text())
-    assert provenance["command"].startswith("python -m agents.profile fast-base ")
-    assert provenance["jax"]
+    assert json.loads((out / "provenance.json").read_text())["command"].endswith(options)
     for name in ("success.png", "controls.png"):
-        with Image.open(tmp_path / "out" / name) as picture:
+        with Image.open(out / name) as picture:
             assert picture.width == 830
+
+
+def test_policies_of_a_source_with_several_are_told_apart_by_name(monkeypatch):
+    policies = [load("fast-base")._replace(name=f"seed {seed}") for seed in range(2)]
+    monkeypatch.setattr(command, "load_policies", lambda source, imports: policies)
+    names = list(command.Options(("runs/mine/",)).policies())
+    assert names == ["runs/mine, seed 0", "runs/mine, seed 1"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "give one or more runs' folders"),
-        (["none"], "none"),
         (["fast-base", "--import", "no.such"], "no.such"),
         (["fast-base", "--tasks", "0"], "evaluation tasks must be"),
         (["fast-base", "--parts", "swaps"], "allowed: one or more of structural, perceptual"),
