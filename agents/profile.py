@@ -5,12 +5,9 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from agents.acting.policy import Policy
-from agents.command_line import Imports
+from agents.command_line import option, parse
 from agents.profiles import figures
 from agents.profiles.measure import failure_table, profile, success_table
 from agents.profiles.tasks import PARTS, STRENGTHS
@@ -30,21 +27,21 @@ class Options:
     controls.png.
 
     Attributes:
-      runs: runs' folders, files of parameters, or names of shipped agents; of a run all seeds.
-      output: the folder to write.
-      parts: what to measure: structural, perceptual or both transfers by strength; symbolic by the
-        object swapped; the tasks of {P} by kind or by plan-length; the control tasks.
+      runs: runs' folders (all seeds), files of parameters, or names of shipped agents.
+      output: folder for the files.
+      parts: some of structural, perceptual and both (success by strength), symbolic (by swapped
+        object), kind and plan-length (of the tasks of {P}) and control.
       strengths: strengths of the graded transfers, from 0 (base) to 1 (the paper's transfer).
-      tasks: tasks of each strength and symbolic swap, and of {P}.
-      imports: modules of your own to import first, which register names of an agent's settings.
+      tasks: tasks of each strength, each symbolic swap, and {P}.
+      imports: modules to import first, which register names in an agent's settings.
     """
 
-    runs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    runs: tuple[str, ...]
     output: Path = Path("runs/profile")
     parts: tuple[str, ...] = tuple(PARTS)
     strengths: tuple[float, ...] = STRENGTHS
     tasks: int = 200
-    imports: Imports = ()
+    imports: tuple[str, ...] = option((), append=True, flags=("--import",))
 
     def policies(self) -> dict[str, Policy]:
         """Loads the policies, by source and, where a source has several, by seed.
@@ -66,7 +63,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if None."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = tyro.cli(Options, args=arguments, prog="python -m agents.profile")
+    options = parse(Options, arguments, "python -m agents.profile")
     with plain_errors():
         compilation.enable_cache()
         policies = options.policies()
