@@ -115,8 +115,8 @@ def train(options: Options, run: Run, job: processes.Job) -> None:
     job.join()
     console = Console(quiet=not processes.is_first())
     folder = RunFolder(run_path(options, run))
-    if options.resume is None and processes.is_first():
-        folder.check_free()
+    if options.resume is None:
+        processes.on_first(folder.check_free)
     compilation.enable_cache()
     again = f"Continue with: {display.resume_command(folder)}"
     run_options = RunOptions(options.checkpoint_every, options.keep, options.devices)

@@ -106,7 +106,8 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         return train.play(state.params, reset_keys, action_key)
 
     trajectory = _jitted(play, train, state)()
-    _, batch, _ = jax.jit(train.prepare)(state, trajectory)
+    rewards, _ = jax.jit(train.intrinsic_reward)(state, trajectory)
+    batch, _ = jax.jit(train.make_batch)(state, trajectory, rewards)
     flop = useful_flop(train, state, batch)
     parts: list[tuple[str, Callable[[], Any], float]] = [
         ("iteration", _jitted(Learner.iterate, train, state), sum(flop)),

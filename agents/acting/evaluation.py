@@ -12,7 +12,6 @@ from agents.acting.frames import Frame
 from agents.acting.rollout import Trajectory, greedy_action, rollout
 from agents.config import Config
 from agents.networks.agent import Agent, Params
-from agents.parallel.sharding import ALONE, Shards
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.scoring.benchmark import blocks
 from trap_tube_jax.scoring.scores import Optimality, Score
@@ -38,9 +37,7 @@ class Evaluation(NamedTuple):
     value: jax.Array
 
 
-def evaluate(
-    agent: Agent, params: Params, env: Environment, tasks: State, shards: Shards = ALONE
-) -> Evaluation:
+def evaluate(agent: Agent, params: Params, env: Environment, tasks: State) -> Evaluation:
     """Plays every task once with the most probable actions. Pure; jit it.
 
     Args:
@@ -48,19 +45,12 @@ def evaluate(
       params: its parameters.
       env: the dynamics and the step limit; its transfers play no part.
       tasks: B states at time 0.
-      shards: how devices divide the tasks among themselves, evenly or not.
     """
-    num_tasks = len(tasks.time)
-    if shards.count > 1:
-        # Where they do not divide evenly, the first ones are played twice.
-        place = np.arange(-(-num_tasks // shards.count) * shards.count) % num_tasks
-        tasks = take(tasks, shards.part(jnp.asarray(place)))
     frame, played = play_greedily(agent, params, env, tasks)
     episodes = played.episodes
     action = jax.vmap(Frame.original_action)(frame, episodes.action.swapaxes(0, 1))
     value = played.value[:-1, :, 0].swapaxes(0, 1)
-    outcome = Evaluation(episodes.solved, episodes.length, action, value)
-    return outcome if shards.count == 1 else take(shards.whole(outcome), slice(num_tasks))
+    return Evaluation(episodes.solved, episodes.length, action, value)
 
 
 def play_greedily(

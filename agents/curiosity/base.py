@@ -45,12 +45,9 @@ class Curiosity:
     Attributes:
       needs_embeddings: whether the experience is to hold the embeddings, which cost a second
         pass of the GRU.
-      needs_all_episodes: whether `reward` compares episodes or updates a memory. Where devices
-        share the episodes, it is then given those of all devices, otherwise those of its own.
     """
 
     needs_embeddings = False
-    needs_all_episodes = False
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Parameters that are trained beside the policy's; {} if there are none.
@@ -62,7 +59,10 @@ class Curiosity:
         return {}
 
     def memory(self) -> Any:
-        """What is carried from one iteration to the next, at first; () if nothing is."""
+        """Returns the first memory, carried from one iteration to the next; () if there is none.
+
+        Several devices average it, so its arrays must then be floats.
+        """
         return ()
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
@@ -79,6 +79,6 @@ class Curiosity:
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """Terms of the loss by name, f32[T, B] each, finite also after an episode's end.
 
-        {} if nothing is trained. Names are other than the metrics' (`ppo.learner.RESERVED_NAMES`).
+        {} if nothing is trained. Names end in `_loss`.
         """
         return {}

@@ -34,8 +34,6 @@ class Counts(Curiosity):
       ValueError: the environment draws tasks by anything but `symbolic`.
     """
 
-    needs_all_episodes = True
-
     def __init__(self, env: Environment):
         if any(transfer is not tt.symbolic for transfer in env.transfers):
             names = [getattr(transfer, "__name__", str(transfer)) for transfer in env.transfers]

@@ -36,8 +36,6 @@ class Effects(Curiosity):
       config: the settings, of which `reward_ema_decay` counts.
     """
 
-    needs_all_episodes = True
-
     def __init__(self, config: Config):
         self._keep = config.reward_ema_decay
 

@@ -17,8 +17,6 @@ from agents.curiosity import Curiosity, Experience, register
 class ToolMoves(Curiosity):
     """reward: n^(-1/2) for a move of the tool, n the moves in training so far."""
 
-    needs_all_episodes = True  # they share the count
-
     def memory(self) -> jax.Array:
         """No moves yet, f32[]."""
         return jnp.zeros(())

@@ -1,11 +1,161 @@
+"""Several devices for one run: a mesh of seeds × episodes.
+
+Along `seeds` the devices train different seeds and exchange nothing. Along `episodes` they share a
+seed: each device plays its own episodes and differentiates its own part of every minibatch, and
+the gradients are averaged. States [S, ...] are split along `seeds` and replicated along `episodes`,
+so a checkpoint fits any number of devices.
+
+    placement = Placement.of(devices, config, seeds)
+    learner = make_train(config, axis=placement.axis)
+    iterate = jax.jit(placement.shard(jax.vmap(learner.iterate)), donate_argnums=0)
+    states = placement.put(jax.vmap(learner.init)(keys))
+    states, metrics = iterate(states)
+    metrics, states_here = placement.local(metrics), placement.local(states)
+"""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, Self, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from agents.config import Config
+
+Tree = TypeVar("Tree")
+
+SEEDS, EPISODES = "seeds", "episodes"  # axes of the mesh
+
+
+def become_devices(devices: int | None) -> None:
+    """Makes the CPU appear as several devices; call it before JAX starts.
+
+    JAX_NUM_CPU_DEVICES takes precedence.
+    """
+    if devices is not None and devices > 1 and jax.config.values["jax_num_cpu_devices"] < 0:
+        with contextlib.suppress(RuntimeError):  # JAX has started: `Placement.of` says what it has
+            jax.config.update("jax_num_cpu_devices", devices)
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeAxis:
+    """Devices that share the episodes of a seed; on one device every method is the identity.
+
+    Attributes:
+      size: devices along the mesh axis `episodes`.
+    """
+
+    size: int = 1
+
+    def mean(self, tree: Tree) -> Tree:
+        """Averages floats over the devices; integers are the same on all and stay."""
+        if self.size == 1:
+            return tree
+
+        def mean(x: jax.Array) -> jax.Array:
+            return jax.lax.pmean(x, EPISODES) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+        return jax.tree.map(mean, tree)
+
+    def sum(self, x: jax.Array) -> jax.Array:
+        """Sums over the devices."""
+        return x if self.size == 1 else jax.lax.psum(x, EPISODES)
+
+    def part(self, x: jax.Array) -> jax.Array:
+        """Returns this device's rows i, i + size, i + 2 size, ... of `x` [B, ...]."""
+        return x if self.size == 1 else x.reshape(-1, self.size)[:, jax.lax.axis_index(EPISODES)]
+
+    def gather(self, x: jax.Array) -> jax.Array:
+        """Returns the rows [B] of all devices; inverts `part`."""
+        return x if self.size == 1 else jax.lax.all_gather(x, EPISODES, axis=1).reshape(-1)
+
+    def own_key(self, key: jax.Array) -> jax.Array:
+        """Derives this device's PRNG key."""
+        if self.size == 1:
+            return key
+        return jax.random.fold_in(key, jax.lax.axis_index(EPISODES))
+
+
+ONE_DEVICE = EpisodeAxis()
+
+
+@dataclasses.dataclass(frozen=True)
 class Placement:
-    axis=None
+    """The devices of a run.
+
+    Attributes:
+      mesh: devices, seeds × episodes; None for the default device alone.
+    """
+
+    mesh: Mesh | None = None
+
     @classmethod
-    def of(cls, devices, config, seeds): return cls()
-    def shard(self, f): return f
-    def put(self, s): return s
-    def local(self, s): return s
-    def __str__(self): return "cpu"
-def become_devices(n): pass
+    def of(cls, devices: int | None, config: Config, seeds: int) -> Self:
+        """Chooses the devices of a run.
+
+        Args:
+          devices: devices over all processes; None for one, or for all of several processes.
+          config: settings of the run.
+          seeds: seeds trained side by side.
+
+        Raises:
+          ValueError: the devices do not exist, or do not divide the minibatches.
+        """
+        processes, available = jax.process_count(), jax.device_count()
+        counts = [available] if processes > 1 else range(1, available + 1)
+        allowed = [n for n in counts if config.minibatch_size % (n // math.gcd(n, seeds)) == 0]
+        devices = devices if devices is not None else 1 if processes == 1 else available
+        if devices not in allowed:
+            raise ValueError(
+                f"{devices} of {available} {jax.default_backend()} devices in {processes} "
+                f"process(es) cannot share {seeds} seed(s) with minibatch_size="
+                f"{config.minibatch_size}; allowed: {', '.join(map(str, allowed)) or 'none'}"
+            )
+        if devices == 1:
+            return cls()
+        grid = np.array(jax.devices()[:devices]).reshape(math.gcd(devices, seeds), -1)
+        return cls(Mesh(grid, (SEEDS, EPISODES)))
+
+    @property
+    def devices(self) -> int:
+        """Number of devices."""
+        return 1 if self.mesh is None else self.mesh.size
+
+    @property
+    def axis(self) -> EpisodeAxis:
+        """Devices that share the episodes of a seed."""
+        return EpisodeAxis(1 if self.mesh is None else self.mesh.shape[EPISODES])
+
+    def shard(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Maps a function of arrays [S, ...] to arrays [S, ...] over the devices."""
+        if self.mesh is None:
+            return function
+        rows = PartitionSpec(SEEDS)
+        # Loops turn replicated carries into ones that vary, which check_vma refuses.
+        return jax.shard_map(
+            function, mesh=self.mesh, in_specs=rows, out_specs=rows, check_vma=False
+        )
+
+    def put(self, states: Tree) -> Tree:
+        """Moves arrays [S, ...] from the default device, or NumPy, to the devices."""
+        if self.mesh is None:
+            return states
+        return jax.device_put(states, NamedSharding(self.mesh, PartitionSpec(SEEDS)))
+
+    def local(self, states: Tree) -> Tree:
+        """Copies arrays [S, ...] to one device of this process; all processes must call it."""
+        if self.mesh is None:
+            return states
+        whole = jax.device_put(states, NamedSharding(self.mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: x.addressable_data(0), whole)
+
+    def __str__(self) -> str:
+        """Names the devices, as in "4 gpu devices of 2 processes"."""
+        platform, processes = jax.default_backend(), jax.process_count()
+        if self.mesh is None:
+            return platform
+        return f"{self.devices} {platform} devices" + f" of {processes} processes" * (processes > 1)

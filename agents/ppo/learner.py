@@ -1,7 +1,7 @@
 """PPO with curiosity: one iteration of training as one pure function.
 
-Read `Learner.iterate` first: it plays episodes, prepares a batch of them (rewards, advantages) and
-takes gradient steps on minibatches.
+Read `Learner.iterate` first. It draws tasks, plays them, computes intrinsic rewards and advantages,
+and takes gradient steps on minibatches.
 
 Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO" and "Curiosity".
 """
@@ -10,22 +10,20 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
 from agents.acting.encodings import encode_episodes
-from agents.acting.episodes import Episodes, along_episodes, take
+from agents.acting.episodes import Episodes, take
 from agents.acting.frames import Frame
 from agents.acting.identity import observation_ids
 from agents.acting.rollout import Trajectory, rollout, sample_action
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
-from agents.curiosity.checks import check_curiosity
 from agents.networks.agent import Agent, Params
-from agents.parallel.sharding import ALONE, Shards
+from agents.parallel.devices import ONE_DEVICE, EpisodeAxis
 from agents.ppo import advantages, losses, returns
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
@@ -36,44 +34,19 @@ from trap_tube_jax.registry import make
 
 Metrics = dict[str, jax.Array]
 
-COUNTABLE = np.iinfo(np.int32).max  # by `TrainState.transitions`
-
-# The names of all other metrics, which a curiosity's losses may not have: those of play, of
-# gradient steps, and what a run adds to them. Those of evaluations begin with GREEDY.
-RESERVED_NAMES = {
-    "success",
-    "replayed_success",
-    "episode_length",
-    "intrinsic_reward",
-    "distinct_observations",
-    "policy_loss",
-    "value_loss",
-    "entropy_loss",
-    "loss",
-    "entropy",
-    "steps",
-    "gradient_norm",
-    "seed",
-    "iteration",
-    "episodes",
-    "transitions",
-    "evaluation",
-    "seconds",
-    "transitions_per_second",
-}
-GREEDY = "greedy_"
+LARGEST_COUNT = np.iinfo(np.int32).max  # of `TrainState.transitions`
 
 
 class TrainState(NamedTuple):
     """Everything that training carries from one iteration to the next.
 
     Attributes:
-      params: `encoder`, `core`, `heads` of the policy network, and `curiosity`.
-      opt_state: the optimizer's state.
+      params: parameters by part: `encoder`, `core`, `heads` of the policy network, `curiosity`.
+      opt_state: state of the optimizer.
       extrinsic: moments of the extrinsic reward.
-      intrinsic: moments of the intrinsic reward, or of its returns where rewards are apart.
-      memory: what the curiosity carries along.
-      task_replay: failed tasks, to be played again.
+      intrinsic: moments of the intrinsic reward, or of its returns with separate value heads.
+      memory: memory of the curiosity.
+      task_replay: failed tasks to replay.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       episodes: i32[], episodes played.
@@ -93,14 +66,14 @@ class TrainState(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What gradient steps see of B episodes.
+    """B episodes as the loss sees them.
 
     Attributes:
       episodes: the episodes.
       observation_id: i32[T + 1, B], equal only for equal observations.
-      log_prob: f32[T, B], of the actions under the acting parameters.
+      log_prob: f32[T, B], log-probabilities of the actions under the acting parameters.
       advantage: f32[T, B], normalised.
-      value_target: f32[T, B, V], for each stream of rewards.
+      value_target: f32[T, B, V], one for each value head.
     """
 
     episodes: Episodes
@@ -112,18 +85,17 @@ class Batch(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Learner:
-    """The parts of training, and what one iteration does with them. Holds no parameters.
+    """The parts of training as pure functions of arrays; holds no parameters.
 
-    `init` and `iterate` are all that training needs: jit `iterate`, and vmap both over seeds. All
-    methods are pure functions of arrays.
+    `init` and `iterate` are all that training needs: jit `iterate`, and vmap both over seeds.
 
     Attributes:
-      config: the settings.
-      env: the environment.
-      agent: the policy network's functions.
-      curiosity: the intrinsic reward.
-      optimizer: clip and Adam.
-      shards: how `iterate` divides its episodes over devices.
+      config: settings.
+      env: environment.
+      agent: functions of the policy network.
+      curiosity: intrinsic reward.
+      optimizer: gradient clipping and Adam.
+      axis: devices that share the episodes of an iteration.
     """
 
     config: Config
@@ -131,12 +103,12 @@ class Learner:
     agent: Agent
     curiosity: Curiosity
     optimizer: optax.GradientTransformation
-    shards: Shards = ALONE
+    axis: EpisodeAxis = ONE_DEVICE
 
     @functools.partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array) -> TrainState:
-        """The first state, compiled as one program."""
-        params_key, failures_key, key = jax.random.split(key, 3)
+        """Returns the first state."""
+        params_key, replay_key, key = jax.random.split(key, 3)
         params = self.init_params(params_key)
         zero = jnp.zeros((), jnp.int32)
         return TrainState(
@@ -146,7 +118,7 @@ class Learner:
             intrinsic=returns.Moments.zero(),
             memory=self.curiosity.memory(),
             task_replay=TaskReplay.untried(
-                failures_key, len(self.config.replay_fractions), self.config.replay_capacity
+                replay_key, len(self.config.replay_fractions), self.config.replay_capacity
             ),
             key=key,
             iteration=zero,
@@ -155,136 +127,92 @@ class Learner:
         )
 
     def init_params(self, key: jax.Array) -> Params:
-        """Fresh parameters of the policy network and of the curiosity, which may have none."""
+        """Draws parameters of the policy network and of the curiosity, which may have none."""
         agent_key, curiosity_key = jax.random.split(key)
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
-        own = self.curiosity.init(curiosity_key, board)
-        return {**self.agent.init(agent_key), "curiosity": own}
+        curiosity = self.curiosity.init(curiosity_key, board)
+        return {**self.agent.init(agent_key), "curiosity": curiosity}
 
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """Collects and learns: the next state, and metrics f32[] each."""
-        state, batch, play_metrics = self.collect(state)
-        state, loss_metrics = self.learn(state, batch)
-        return state, {**play_metrics, **loss_metrics, 'is_finite': jnp.float32(1)}
+        """Plays one iteration's episodes and learns from them.
 
-    def collect(self, state: TrainState) -> tuple[TrainState, Batch, Metrics]:
-        """Plays an iteration's episodes: the state, brought up to date; a batch; metrics of play.
+        Args:
+          state: state of one seed.
 
-        The parameters are those before. `learn` is to follow.
+        Returns:
+          The next state and the iteration's metrics, f32[] each. `is_finite` is 1 unless a
+          parameter or another metric is infinite or NaN.
         """
-        reset_key, action_key, _, _ = _keys(state)
+        reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
         reset_keys = self.draw_tasks(state.task_replay, reset_key)
-        trajectory = self.play(state.params, reset_keys, action_key)
-        state, batch, metrics = self.prepare(state, trajectory)
-        if again := self.config.num_replayed:
-            task_replay = state.task_replay.remember(reset_keys, ~batch.episodes.solved, again)
-            state = state._replace(task_replay=task_replay)
-        return state, batch, metrics
+        trajectory = self.play(
+            state.params, self.axis.part(reset_keys), self.axis.own_key(action_key)
+        )
+        intrinsic_reward, memory = self.intrinsic_reward(state, trajectory)
+        batch, (extrinsic, intrinsic) = self.make_batch(state, trajectory, intrinsic_reward)
+        params, opt_state, update_metrics = self.update(state, batch, update_key)
 
-    def learn(self, state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        """Learns from the batch that `collect` returned with this state."""
-        _, _, update_key, key = _keys(state)
-        params, opt_state, metrics = self.optimize(state, batch, update_key)
-        state = state._replace(
+        episodes = trajectory.episodes
+        solved = self.axis.gather(episodes.solved)
+        metrics = {**self.play_metrics(batch, intrinsic_reward, solved), **update_metrics}
+        metrics["is_finite"] = _is_finite((params, metrics))
+        next_state = TrainState(
             params=params,
             opt_state=opt_state,
+            extrinsic=extrinsic,
+            intrinsic=intrinsic,
+            memory=self.axis.mean(memory),
+            task_replay=state.task_replay.remember(reset_keys, ~solved, self.config.num_replayed),
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + self.config.episodes_per_iteration,
+            transitions=state.transitions + self.axis.sum(jnp.sum(episodes.length)),
         )
-        return state, metrics
+        return next_state, metrics
 
     def draw_tasks(self, task_replay: TaskReplay, key: jax.Array) -> jax.Array:
-        """The reset keys [B] of an iteration's tasks: first new ones, then those failed before."""
+        """Draws the reset keys [B] of an iteration: new tasks first, then tasks failed before."""
         config = self.config
         if not config.replay_fractions:
             return jax.random.split(key, config.episodes_per_iteration)
-        failures_key, key = jax.random.split(key)
+        replay_key, key = jax.random.split(key)
         new = jax.random.split(key, config.num_new)
-        return jnp.concatenate([new, task_replay.draw(failures_key, config.num_replayed)])
+        return jnp.concatenate([new, task_replay.draw(replay_key, config.num_replayed)])
 
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
-        """Plays this device's share of an iteration's episodes."""
-        initial, timestep = jax.vmap(self.env.reset)(self.shards.part(reset_keys))
+        """Plays one episode from each reset key [B], with sampled actions."""
+        initial, timestep = jax.vmap(self.env.reset)(reset_keys)
         if self.config.align_to_food:
             frame = jax.vmap(Frame.facing_food)(timestep.observation)
             initial = jax.vmap(Frame.state)(frame, initial)
-        choose = self.shards.drawing(sample_action)
-        return rollout(self.agent, params, self.env, initial, action_key, choose=choose)
-
-    def prepare(
-        self, state: TrainState, trajectory: Trajectory
-    ) -> tuple[TrainState, Batch, Metrics]:
-        """Turns episodes into what the gradient steps learn from, under the acting parameters.
-
-        Args:
-          state: the state of training.
-          trajectory: this device's episodes.
-
-        Returns:
-          The state with rewards' moments, curiosity's memory and transitions brought up to date;
-          the batch of all devices' episodes; and metrics of play.
-        """
-        config = self.config
-        novelty, memory = self.intrinsic_reward(state, trajectory)
-        episodes = self._whole(trajectory.episodes)
-        log_prob, value = self.shards.whole((trajectory.log_prob, trajectory.value), axis=1)
-        join = (
-            advantages.combined_advantages
-            if config.value_heads == "shared"
-            else advantages.separate_advantages
-        )
-        moments = (state.extrinsic, state.intrinsic)
-        scale = advantages.intrinsic_scale(config)(state.iteration)
-        advantage, target, moments = join(config, episodes, novelty, scale, value, moments)
-        batch = Batch(
-            episodes=episodes,
-            observation_id=observation_ids(episodes),
-            log_prob=log_prob,
-            advantage=returns.normalize(advantage, episodes.mask),
-            value_target=target,
-        )
-        metrics = {
-            "success": jnp.mean(episodes.solved[: config.num_new].astype(jnp.float32)),
-            "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
-            "intrinsic_reward": jnp.sum(novelty) / jnp.sum(episodes.mask),
-            "distinct_observations": jnp.max(batch.observation_id) + 1,
-        }
-        if sum(config.num_replayed):
-            solved = episodes.solved[config.num_new :]
-            metrics["replayed_success"] = jnp.mean(solved.astype(jnp.float32))
-        state = state._replace(
-            extrinsic=moments[0],
-            intrinsic=moments[1],
-            memory=memory,
-            transitions=state.transitions + jnp.sum(episodes.length),
-        )
-        return state, batch, metrics
+        return rollout(self.agent, params, self.env, initial, action_key, choose=sample_action)
 
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
-        """The intrinsic reward f32[T, B] of all devices' episodes, and the curiosity's new memory.
+        """Computes the curiosity's reward of every step.
 
-        It is 0 after an episode's end.
+        Returns:
+          The reward f32[T, B], 0 after an episode's end, and the curiosity's new memory.
+
+        Raises:
+          ValueError: the curiosity returns another shape or dtype.
         """
         experience = self.acting_experience(state.params, trajectory)
-        if self.curiosity.needs_all_episodes:
-            experience = self._whole(experience)
-            # Devices number their observations apart.
-            everyones = observation_ids(experience.episodes)
-            experience = experience._replace(observation_id=everyones)
-        reward, memory = self.curiosity.reward(state.params["curiosity"], state.memory, experience)
-        mask = experience.episodes.mask
-        chex.assert_equal_shape([reward, mask])
-        reward = jnp.where(mask > 0, reward, 0.0)
-        if not self.curiosity.needs_all_episodes:
-            reward = self.shards.whole(reward, axis=1)
-        return reward, memory
+        result = self.curiosity.reward(state.params["curiosity"], state.memory, experience)
+        mask = trajectory.episodes.mask
+        wanted, found = _shapes((mask, state.memory)), _shapes(result)
+        if wanted != found:
+            raise ValueError(
+                f"curiosity {self.config.curiosity!r}: reward must return (reward, memory) "
+                f"{wanted}, got {found}"
+            )
+        reward, memory = result
+        return jnp.where(mask > 0, reward, 0.0), memory
 
     def acting_experience(self, params: Params, trajectory: Trajectory) -> Experience:
-        """What the curiosity sees of episodes when it pays for them."""
+        """Returns the curiosity's view of episodes under the parameters that acted."""
         episodes = trajectory.episodes
         observation_id = observation_ids(episodes)
-        features = jnp.zeros((*observation_id.shape, 0))
+        features = jnp.zeros((*observation_id.shape, 0), jnp.float32)
         if type(self.curiosity).encode is not Curiosity.encode:
             own = params["curiosity"]
 
@@ -306,50 +234,103 @@ class Learner:
             action_embedding=self.agent.embed_action(params, episodes.action),
         )
 
-    def optimize(
+    def make_batch(
+        self, state: TrainState, trajectory: Trajectory, intrinsic_reward: jax.Array
+    ) -> tuple[Batch, advantages.RewardMoments]:
+        """Computes advantages and value targets; see `agents.ppo.advantages`.
+
+        Args:
+          state: state before the iteration.
+          trajectory: B episodes.
+          intrinsic_reward: f32[T, B].
+
+        Returns:
+          The batch, and the moments of both rewards.
+        """
+        config, episodes = self.config, trajectory.episodes
+        moments = advantages.update_moments(
+            config, (state.extrinsic, state.intrinsic), episodes, intrinsic_reward
+        )
+        moments = self.axis.mean(moments)
+        estimate = (
+            advantages.combined_advantages
+            if config.value_heads == "shared"
+            else advantages.separate_advantages
+        )
+        coef = advantages.intrinsic_coef_schedule(config)(state.iteration)
+        advantage, target = estimate(
+            config, episodes, intrinsic_reward, coef, trajectory.value, moments
+        )
+        batch = Batch(
+            episodes=episodes,
+            observation_id=observation_ids(episodes),
+            log_prob=trajectory.log_prob,
+            advantage=returns.normalize(advantage, episodes.mask),
+            value_target=target,
+        )
+        return batch, moments
+
+    def play_metrics(self, batch: Batch, intrinsic_reward: jax.Array, solved: jax.Array) -> Metrics:
+        """Returns metrics of the episodes; `solved` bool[B] is of all devices."""
+        new, replayed = jnp.split(solved.astype(jnp.float32), [self.config.num_new])
+        episodes = batch.episodes
+        metrics = self.axis.mean(
+            {
+                "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
+                "intrinsic_reward": jnp.sum(intrinsic_reward) / jnp.sum(episodes.mask),
+                "distinct_observations": (jnp.max(batch.observation_id) + 1).astype(jnp.float32),
+            }
+        )
+        metrics["success"] = jnp.mean(new)
+        if len(replayed):
+            metrics["replayed_success"] = jnp.mean(replayed)
+        return metrics
+
+    def update(
         self, state: TrainState, batch: Batch, key: jax.Array
     ) -> tuple[Params, Any, Metrics]:
-        """All epochs of gradient steps on minibatches of whole episodes, shuffled in each.
+        """Takes `epochs` passes of gradient steps over shuffled minibatches of whole episodes.
 
-        Every device differentiates its part of each minibatch; the mean is everyone's gradient.
+        On several devices each minibatch is made of equal parts of every device's episodes.
+
+        Returns:
+          Parameters, state of the optimizer, and metrics averaged over gradient steps.
         """
-        config = self.config
+        num_episodes = self.config.episodes_per_iteration // self.axis.size
+        minibatch_size = self.config.minibatch_size // self.axis.size
 
-        def update(carry: tuple[Params, Any], places: jax.Array) -> tuple[Any, Metrics]:
+        def step(carry: tuple[Params, Any], places: jax.Array) -> tuple[Any, Metrics]:
             params, opt_state = carry
-            own = take(batch, self.shards.part(places))
-            gradient, metrics = self.shards.mean(jax.grad(self.loss, has_aux=True)(params, own))
+            gradient, metrics = self.axis.mean(
+                jax.grad(self.loss, has_aux=True)(params, take(batch, places))
+            )
             updates, opt_state = self.optimizer.update(gradient, opt_state, params)
             metrics["gradient_norm"] = optax.tree.norm(gradient)
-            metrics["entropy"] /= metrics.pop("steps")
             return (optax.apply_updates(params, updates), opt_state), metrics
 
-        def permute(epoch_key: jax.Array) -> jax.Array:
-            order = jax.random.permutation(epoch_key, config.episodes_per_iteration)
-            return order.reshape(-1, config.minibatch_size)
+        def shuffle(epoch_key: jax.Array) -> jax.Array:
+            return jax.random.permutation(epoch_key, num_episodes).reshape(-1, minibatch_size)
 
-        minibatches = jax.vmap(permute)(jax.random.split(key, config.epochs))
+        minibatches = jax.vmap(shuffle)(jax.random.split(key, self.config.epochs))
         (params, opt_state), metrics = jax.lax.scan(
-            update, (state.params, state.opt_state), minibatches.reshape(-1, config.minibatch_size)
+            step, (state.params, state.opt_state), minibatches.reshape(-1, minibatch_size)
         )
         return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
     def loss(self, params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
-        """The total loss f32[] and its terms, weighted as they enter it.
-
-        Their mean over devices is the whole minibatch's.
+        """Computes the loss of a minibatch.
 
           L = policy + value - entropy + curiosity_coef * curiosity's losses
 
-        Also returned: `entropy`, summed over the steps before an episode's end, and `steps`, their
-        number.
-
         Args:
-          params: the parameters to differentiate by.
-          batch: this device's part of a minibatch.
+          params: parameters to differentiate by.
+          batch: the minibatch.
+
+        Returns:
+          L f32[] and metrics: its terms as weighted in L, and the mean entropy of a step.
 
         Raises:
-          ValueError: the curiosity calls a loss of its own like a metric.
+          ValueError: a loss of the curiosity has the name of another term, or not `..._loss`.
         """
         config, mask = self.config, batch.episodes.mask
         embedding, experience = self.learning_experience(params, batch)
@@ -365,19 +346,19 @@ class Learner:
             "value_loss": config.value_coef * losses.padded_mean(value_error, mask),
             "entropy_loss": -config.entropy_coef * losses.padded_mean(entropy, mask),
         }
-        own = self.curiosity.losses(params["curiosity"], experience)
-        if taken := {name for name in own if name in RESERVED_NAMES or name.startswith(GREEDY)}:
-            raise ValueError(
-                f"a curiosity's losses need names of their own, got {', '.join(sorted(taken))}"
-            )
-        for name, term in own.items():
+        for name, term in self.curiosity.losses(params["curiosity"], experience).items():
+            if name in terms or not name.endswith("_loss"):
+                raise ValueError(
+                    f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
+                    f"differ from {', '.join(terms)}; got {name!r}"
+                )
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
-        total = sum(terms.values(), jnp.zeros(()))
-        sums = {"entropy": jnp.sum(entropy * mask), "steps": jnp.sum(mask)}
-        return total, {**terms, "loss": total, **sums}
+        total = sum(terms.values(), jnp.zeros((), jnp.float32))
+        mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
+        return total, {**terms, "loss": total, "entropy": mean_entropy}
 
     def learning_experience(self, params: Params, batch: Batch) -> tuple[jax.Array, Experience]:
-        """The GRU's outputs f32[T, B, hidden], and what the curiosity sees of a minibatch."""
+        """Returns the GRU's outputs f32[T, B, hidden] and the curiosity's view of a minibatch."""
         episodes = batch.episodes
         read = {name: params[name] for name in ("encoder", "curiosity")}
 
@@ -399,28 +380,20 @@ class Learner:
             action_embedding=self.agent.embed_action(params, episodes.action),
         )
 
-    def _whole(self, record: Any) -> Any:
-        """A record of all devices' episodes from those of each."""
-        return along_episodes(lambda axis, x: self.shards.whole(x, axis), record)
 
-
-def _keys(state: TrainState) -> jax.Array:
-    """Those of an iteration's resets, actions and gradient steps, and that of what follows."""
-    return jax.random.split(state.key, 4)
-
-
-def memory_estimate(c): return 1
-def make_train(config: Config, env: Environment | None = None, shards: Shards = ALONE, axis=None) -> Learner:
-    """Builds training from its settings.
+def make_train(
+    config: Config, env: Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
+) -> Learner:
+    """Builds the learner of some settings.
 
     Args:
-      config: the settings.
-      env: an environment of your own; that of `config.env_id` if absent.
-      shards: how to divide the episodes; more than one only within `Placement.shard`.
+      config: settings.
+      env: environment; by default that of `config.env_id`.
+      axis: devices that share the episodes; `Placement.axis` on several devices.
 
     Raises:
-      ValueError: `env` contradicts `config`, the curiosity is not for this environment or, if it is
-        your own, breaks its contract, or the environment steps are too many to count.
+      ValueError: `env` contradicts `config`, the curiosity does not suit the environment or the
+        devices, or there are too many environment steps to count.
     """
     if env is None:
         env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
@@ -431,12 +404,26 @@ def make_train(config: Config, env: Environment | None = None, shards: Shards = 
                 f"{getattr(config, name)}; they must agree"
             )
     steps = config.iterations * config.episodes_per_iteration * env.max_steps
-    if min(steps, config.max_transitions or steps) > COUNTABLE:
+    if min(steps, config.max_transitions or steps) > LARGEST_COUNT:
         raise ValueError(
-            f"iterations={config.iterations} of {config.episodes_per_iteration} episodes of {env.max_steps} "
-            f"steps are {steps:,} steps; allowed: at most {COUNTABLE:,}"
+            f"iterations={config.iterations} of {config.episodes_per_iteration} episodes of "
+            f"{env.max_steps} steps are {steps:,} steps; allowed: at most {LARGEST_COUNT:,}"
         )
     curiosity = curiosities.factory(config.curiosity)(config, env)
-    if type(curiosity).__module__.split(".")[0] != "agents":
-        check_curiosity(curiosity, config, env)
-    return Learner(config, env, Agent(config), curiosity, make_optimizer(config), shards)
+    memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))
+    if axis.size > 1 and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in memory):
+        raise ValueError(
+            f"curiosity {config.curiosity!r} needs one device: several average its memory, which "
+            "must then be floats"
+        )
+    return Learner(config, env, Agent(config), curiosity, make_optimizer(config), axis)
+
+
+def _shapes(tree: Any) -> str:
+    described = jax.tree.map(lambda x: f"{jnp.dtype(x.dtype).name}{list(x.shape)}", tree)
+    return str(described).replace("'", "")
+
+
+def _is_finite(tree: Any) -> jax.Array:
+    finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]
+    return jnp.all(jnp.stack(finite)).astype(jnp.float32)

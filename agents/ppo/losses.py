@@ -1,4 +1,4 @@
-"""The terms of the loss: functions of arrays, one number per step.
+"""Terms of the loss: functions of arrays, one number per step.
 
 Source: agents/agent.md, "PPO".
 """
@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 
 def padded_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
-    """The sum of `x` f32[...] where `mask` is 1, over the number of all elements.
+    """Sums `x` f32[...] where `mask` is 1, and divides by the number of all elements.
 
-    So steps after an episode's end count as zeros, as in the published baseline: an episode that
+    As in the published baseline, steps after an episode's end count as zeros, so an episode that
     ends early weighs less.
     """
     chex.assert_equal_shape([x, mask])
@@ -19,23 +19,23 @@ def padded_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def clipped_surrogate(
-    log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip: float
+    log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array, clip_eps: float
 ) -> jax.Array:
-    """PPO's clipped policy loss (Schulman et al., 2017, equation 7), negated to minimise.
+    """Computes PPO's clipped surrogate (Schulman et al., 2017, equation 7), negated to minimise.
 
       ratio = exp(log_prob - old_log_prob)
-      loss = -min(ratio * A, clip(ratio, 1 - clip, 1 + clip) * A)
+      loss = -min(ratio * A, clip(ratio, 1 - clip_eps, 1 + clip_eps) * A)
 
     Args:
-      log_prob: f32[...], of the actions taken, under the present parameters.
-      old_log_prob: f32[...], under the parameters that acted.
+      log_prob: f32[...], log-probabilities of the actions under the present parameters.
+      old_log_prob: f32[...], the same under the parameters that acted.
       advantage: f32[...].
-      clip: half-width of the interval of ratios.
+      clip_eps: half-width of the interval of ratios.
 
     Returns:
       f32[...].
     """
     chex.assert_equal_shape([log_prob, old_log_prob, advantage])
     ratio = jnp.exp(log_prob - old_log_prob)
-    clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
+    clipped = jnp.clip(ratio, 1 - clip_eps, 1 + clip_eps)
     return -jnp.minimum(ratio * advantage, clipped * advantage)

@@ -1,6 +1,6 @@
-"""The published baseline's optimiser: Adam with epsilon added before the correction of bias."""
+"""Optimizer of the published baseline: Adam with epsilon added before bias correction."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,22 +8,8 @@ import optax
 
 from agents.config import Config
 
-LAST_STEP_SIZE = 1 / 50  # of the last gradient step of a cooldown, as a fraction of the first
+FINAL_LR_FRACTION = 1 / 50  # learning rate of the last gradient step of a decay, over the first
 BETA1, BETA2 = 0.9, 0.999  # decay of Adam's moments
-
-
-class AdamState(NamedTuple):
-    """Adam's moments.
-
-    Attributes:
-      updates: i32[], how many so far.
-      first: moving averages of the gradients.
-      second: moving averages of their squares.
-    """
-
-    updates: jax.Array
-    first: optax.Params
-    second: optax.Params
 
 
 def adam(learning_rate: optax.Schedule, epsilon: float) -> optax.GradientTransformation:
@@ -32,45 +18,46 @@ def adam(learning_rate: optax.Schedule, epsilon: float) -> optax.GradientTransfo
       m <- BETA1 m + (1 - BETA1) g,  v <- BETA2 v + (1 - BETA2) g^2,
       step = -learning_rate sqrt(1 - BETA2^t) / (1 - BETA1^t) * m / (sqrt(v) + epsilon).
 
-    This is the form at the end of section 2 of Kingma and Ba (2015), which the baseline's
-    framework uses. `optax.adam` adds epsilon after the correction of v. At t = 1 epsilon
-    then weighs 30 times less (sqrt(1 - BETA2) = 0.03), which shows in parameters whose gradient is
-    near 1e-6.
+    This form closes section 2 of Kingma and Ba (2015), and the baseline's framework uses it.
+    `optax.adam` adds epsilon after the correction of v. At t = 1 epsilon then weighs 30 times less
+    (sqrt(1 - BETA2) = 0.03), which shows in parameters whose gradient is near 1e-6.
 
     Args:
-      learning_rate: step size, by the number of updates so far.
+      learning_rate: step size by the number of updates so far.
       epsilon: added to the root of the second moment.
     """
 
-    def init(params: optax.Params) -> AdamState:
+    def init(params: optax.Params) -> optax.ScaleByAdamState:
         zeros = jax.tree.map(jnp.zeros_like, params)
-        return AdamState(jnp.zeros((), jnp.int32), zeros, zeros)
+        return optax.ScaleByAdamState(jnp.zeros((), jnp.int32), zeros, zeros)
 
-    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, AdamState]:
-        count = state.updates + 1
-        first = optax.tree.update_moment(updates, state.first, BETA1, 1)
-        second = optax.tree.update_moment(updates, state.second, BETA2, 2)
-        rate = learning_rate(state.updates) * jnp.sqrt(1 - BETA2**count) / (1 - BETA1**count)
-        step = jax.tree.map(lambda m, v: -rate * m / (jnp.sqrt(v) + epsilon), first, second)
-        return step, AdamState(count, first, second)
+    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        count = state.count + 1
+        mu = optax.tree.update_moment(updates, state.mu, BETA1, 1)
+        nu = optax.tree.update_moment(updates, state.nu, BETA2, 2)
+        t = count.astype(jnp.float32)
+        rate = jnp.asarray(learning_rate(state.count), jnp.float32)
+        rate = rate * jnp.sqrt(1 - BETA2**t) / (1 - BETA1**t)
+        step = jax.tree.map(lambda m, v: -rate * m / (jnp.sqrt(v) + epsilon), mu, nu)
+        return step, optax.ScaleByAdamState(count, mu, nu)
 
     return optax.GradientTransformation(init, update)
 
 
 def make_optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam behind a clip of the gradients' global norm."""
+    """Builds Adam behind clipping of the gradient's global norm."""
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
-        adam(step_size(config), epsilon=config.adam_epsilon),
+        adam(learning_rate_schedule(config), epsilon=config.adam_epsilon),
     )
 
 
-def step_size(config: Config) -> optax.Schedule:
-    """The learning rate by gradient steps: constant, then falling geometrically in the cooldown."""
+def learning_rate_schedule(config: Config) -> optax.Schedule:
+    """Returns the learning rate by gradient step: constant, then decaying geometrically."""
     total = config.iterations * config.gradient_steps
-    falling = round(config.lr_decay_fraction * total)
-    if not falling:
+    decaying = round(config.lr_decay_fraction * total)
+    if not decaying:
         return optax.constant_schedule(config.learning_rate)
     return optax.exponential_decay(
-        config.learning_rate, falling, LAST_STEP_SIZE, transition_begin=total - falling
+        config.learning_rate, decaying, FINAL_LR_FRACTION, transition_begin=total - decaying
     )

@@ -1,7 +1,7 @@
-"""Returns, advantages and the statistics that scale them: functions of arrays.
+"""Returns, advantages and the moments that scale them: functions of arrays.
 
-Time ranges follow the paper's episodes of T steps: step t leads from observation t to
-observation t + 1. `mask` is 1 on steps before the episode's end, 0 after it.
+Episodes have T steps; step t leads from observation t to observation t + 1. `mask` is 1 on steps
+before the episode's end, 0 after it.
 
 Source: agents/agent.md, "PPO" and "Curiosity".
 """
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 
 def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Array:
-    """The discounted sum of rewards to the end of the episode, without bootstrap.
+    """Computes discounted sums of rewards to the end of the episode, without bootstrap.
 
       G_t = r_t + discount * G_{t+1},  G_T = 0.
 
@@ -26,7 +26,7 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
       f32[T, ...].
     """
     chex.assert_rank(discount, 0)
-    return _backward_sum(reward, jnp.full(len(reward), discount))
+    return _backward_sum(reward, jnp.full(len(reward), discount, reward.dtype))
 
 
 def generalized_advantages(
@@ -36,15 +36,15 @@ def generalized_advantages(
     mask: jax.Array,
     lambda_: float | jax.Array,
 ) -> jax.Array:
-    """Generalised advantage estimates over padded episodes (Schulman et al., 2016).
+    """Computes generalised advantage estimates of padded episodes (Schulman et al., 2016).
 
       delta_t = mask_t (r_t + discount_t v_{t+1} - v_t),
       A_t = delta_t + discount_t * lambda * A_{t+1},  A_T = 0.
 
     Args:
       reward: f32[T, ...].
-      discount: f32[T, ...], of what follows each step: gamma, or 0 where a step terminates.
-      value: f32[T + 1, ...], the values of all observations.
+      discount: f32[T, ...], gamma, or 0 where a step terminates.
+      value: f32[T + 1, ...], values of all observations.
       mask: f32[T, ...].
       lambda_: scalar in [0, 1].
 
@@ -57,7 +57,7 @@ def generalized_advantages(
 
 
 def masked_moments(x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and variance f32[] of the elements of `x` f32[...] where `mask` f32[...] is 1.
+    """Computes the mean and variance f32[] of `x` f32[...] where `mask` f32[...] is 1.
 
     Both are 0 if the mask is empty.
     """
@@ -68,7 +68,7 @@ def masked_moments(x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]
 
 
 def normalize(x: jax.Array, mask: jax.Array, epsilon: float = 1e-8) -> jax.Array:
-    """`x` f32[...] less its masked mean, over its masked deviation; 0 where masked out."""
+    """Subtracts the masked mean of `x` f32[...] and divides by its masked standard deviation."""
     mean, variance = masked_moments(x, mask)
     return mask * (x - mean) / jnp.sqrt(variance + epsilon)
 
@@ -79,7 +79,7 @@ class Moments(NamedTuple):
     Attributes:
       mean: f32[].
       variance: f32[].
-      batches: i32[], batches seen; the first one is taken as it is.
+      batches: i32[], batches seen; the first one replaces the zeros.
     """
 
     mean: jax.Array
@@ -88,14 +88,14 @@ class Moments(NamedTuple):
 
     @staticmethod
     def zero() -> "Moments":
-        """The moments before the first batch."""
+        """Returns the moments before the first batch."""
         zero = jnp.zeros((), jnp.float32)
         return Moments(zero, zero, jnp.zeros((), jnp.int32))
 
-    def update(self, x: jax.Array, mask: jax.Array, rate: float) -> "Moments":
-        """Moves by 1 - `rate` towards the moments of a batch f32[...] under its mask."""
+    def update(self, x: jax.Array, mask: jax.Array, decay: float) -> "Moments":
+        """Moves by 1 - `decay` towards the moments of a batch f32[...] under its mask."""
         mean, variance = masked_moments(x, mask)
-        keep = jnp.where(self.batches == 0, 0.0, rate)
+        keep = jnp.where(self.batches == 0, jnp.float32(0), jnp.float32(decay))
         return Moments(
             mean=keep * self.mean + (1 - keep) * mean,
             variance=keep * self.variance + (1 - keep) * variance,
@@ -103,13 +103,13 @@ class Moments(NamedTuple):
         )
 
     @property
-    def deviation(self) -> jax.Array:
-        """The standard deviation f32[], 1 where it would be 0."""
+    def std(self) -> jax.Array:
+        """Standard deviation f32[], 1 where it would be 0."""
         return jnp.where(self.variance > 0, jnp.sqrt(self.variance), 1.0)
 
 
 def _backward_sum(x: jax.Array, decay: jax.Array) -> jax.Array:
-    """y_t = x_t + decay_t * y_{t+1} with y_T = 0, f32[T, ...]; decay is f32[T] or f32[T, ...]."""
+    """Computes y_t = x_t + decay_t * y_{t+1}, y_T = 0; decay is f32[T], or f32[T, ...] as x."""
 
     def body(y: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         x_t, decay_t = inputs

@@ -1,10 +1,9 @@
-"""Tasks that the agent failed, to be played again.
+"""Replay of failed tasks.
 
-Where most tasks of a set are easy, what the others need is lost among them. So failed tasks are
-played again, as the same draws of `env.reset`. A replayed task that fails again is copied to the
-next of L lists. Each list is thus poorer in easy tasks than the one before, though nobody says
-which tasks are hard. A task stays in its list, solved or not, until newer ones overwrite it: what
-has just been learnt is worth repeating.
+Where most tasks of a set are easy, few updates teach the others. So failed tasks are replayed: the
+same reset keys draw the same tasks. A replayed task that fails again is copied to the next of L
+lists, so each list holds fewer easy tasks than the one before, without any measure of difficulty. A
+task stays in its list, solved or not, until newer ones overwrite it, so new skills are rehearsed.
 
 Source: own; a simple relative of prioritized level replay, Jiang et al. (2021).
 """
@@ -18,13 +17,11 @@ import jax.numpy as jnp
 
 
 class TaskReplay(NamedTuple):
-    """L lists of K tasks each; list l holds tasks that were failed l + 1 times.
-
-    At first the lists hold tasks that nobody has tried.
+    """L lists of K tasks each; list l holds tasks failed l + 1 times, at first untried tasks.
 
     Attributes:
-      keys: PRNG keys [L, K] that `env.reset` draws the tasks from.
-      next: i32[L], the place of each list that is filled next.
+      keys: PRNG keys [L, K] from which `env.reset` draws the tasks.
+      next: i32[L], the place of each list to fill next.
     """
 
     keys: jax.Array
@@ -32,17 +29,18 @@ class TaskReplay(NamedTuple):
 
     @staticmethod
     def untried(key: jax.Array, lists: int, capacity: int) -> "TaskReplay":
-        """Lists of tasks that nobody has tried yet; one list, unused, in place of none."""
+        """Returns lists of untried tasks; one list, unused, if `lists` is 0."""
         lists = max(lists, 1)  # checkpoints hold no empty arrays
         keys = jax.random.split(key, (lists, capacity))
         return TaskReplay(keys, jnp.zeros(lists, jnp.int32))
 
     def draw(self, key: jax.Array, counts: Sequence[int]) -> jax.Array:
-        """Reset keys of tasks to play again: `counts[l]` from list l, each with equal chances."""
+        """Draws the reset keys of `counts[l]` tasks from each list l, with equal probabilities."""
+        # Keys are used again on purpose; `jax_debug_key_reuse` allows that of clones only.
         drawn = [
-            keys[jax.random.randint(list_key, (count,), 0, len(keys))]
+            keys[jax.random.randint(list_key, (count,), 0, len(keys), jnp.int32)]
             for keys, list_key, count in zip(
-                self.keys, jax.random.split(key, len(counts)), counts, strict=True
+                jax.random.clone(self.keys), jax.random.split(key, len(counts)), counts, strict=True
             )
         ]
         return jnp.concatenate(drawn)
@@ -50,29 +48,34 @@ class TaskReplay(NamedTuple):
     def remember(
         self, reset_keys: jax.Array, failed: jax.Array, counts: Sequence[int]
     ) -> "TaskReplay":
-        """The lists after an iteration: each task that failed is added to the next list.
+        """Adds each failed task of an iteration to the next list.
 
         Args:
-          reset_keys: PRNG keys [M] of an iteration's tasks: new ones, then those of `draw`.
+          reset_keys: PRNG keys [M] of the tasks: new ones, then those of `draw`.
           failed: bool[M].
           counts: as in `draw`. Tasks of the last list are not added again.
         """
-        ends = list(itertools.accumulate([len(failed) - sum(counts), *counts]))
-        played = jnp.split(reset_keys, ends)[: len(counts)]
-        fails = jnp.split(failed, ends)[: len(counts)]
+        if not counts:
+            return self
+        reset_keys = jax.random.clone(reset_keys)
+        new = len(failed) - sum(counts)
+        parts = itertools.pairwise([0, *itertools.accumulate([new, *counts[:-1]])])
         lists = [
-            _put(*of_list) for of_list in zip(self.keys, self.next, played, fails, strict=True)
+            _put(self.keys[index], self.next[index], reset_keys[start:end], failed[start:end])
+            for index, (start, end) in enumerate(parts)
         ]
-        keys, following = zip(*lists, strict=True)
-        return TaskReplay(jnp.stack(keys), jnp.stack(following))
+        keys, places = zip(*lists, strict=True)
+        # Not by `stack`, whose result `jax_debug_key_reuse` takes for used.
+        return TaskReplay(jnp.concatenate(keys).reshape(self.keys.shape), jnp.stack(places))
 
 
 def _put(
     keys: jax.Array, start: jax.Array, new: jax.Array, chosen: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """A list [K] with the chosen of `new` [M] from place `start` on, and the place after them.
+    """Puts the chosen of `new` [M] into a list [K] from place `start` on.
 
-    Of more than K the last K are put.
+    Returns:
+      The list, with the last K chosen if there are more, and the place after them.
     """
     order, total = jnp.cumsum(chosen, dtype=jnp.int32), jnp.sum(chosen, dtype=jnp.int32)
     fits = chosen & (order > total - len(keys))

@@ -4,6 +4,7 @@
 saving, then evaluation. No thread runs JAX in the background.
 """
 
+import contextlib
 import dataclasses
 import os
 import time
@@ -23,7 +24,8 @@ from agents.arrays import from_arrays
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.devices import Placement
-from agents.ppo.learner import Learner, TrainState, make_train, memory_estimate
+from agents.ppo.learner import Learner, TrainState, make_train
+from agents.ppo.memory import memory_estimate
 from agents.runs import report
 from agents.runs.checkpoint import CheckpointError, Checkpoints
 from agents.runs.display import ProgressLine
@@ -104,14 +106,18 @@ def train_run(
     options, console = options or RunOptions(), console or Console(quiet=True)
     folder = RunFolder(path)
     check_memory(run)
-    with folder.lock() if processes.is_first() else processes.nothing():
-        if processes.is_first():
+    with contextlib.ExitStack() as stack:
+
+        def prepare() -> None:
+            stack.enter_context(folder.lock())
             if folder.config.is_file():
                 run.check_continues(RunFolder.open(path)[1])
             else:
                 folder.create(run)
+
+        processes.on_first(prepare)
         session = Session(folder, run, options, console, stop_file)
-        with session.checkpoints or processes.nothing():
+        with session.checkpoints or contextlib.nullcontext():
             session.train()
             session.finish()
 
@@ -242,7 +248,6 @@ class Session:
           ValueError: the checkpoint is unusable, or of other settings.
         """
         nothing = {"iteration": 0, "seconds": 0.0, "compile_seconds": 0.0, "last": []}
-        processes.barrier()  # the first process may be making the folder
         if not self.folder.checkpoints.is_dir():
             return None, nothing
         with Checkpoints(self.folder.checkpoints) as checkpoints:
@@ -283,6 +288,7 @@ class Session:
         """Advances the active seeds by one iteration; returns and logs their rows of metrics."""
         active, started = self.active, time.perf_counter()
         self.state, metrics = advance(self.state, active)
+        metrics = self.placement.local(metrics)
         host = {name: np.asarray(values) for name, values in sorted(metrics.items())}
         taken = time.perf_counter() - started
         self.iteration, self.seconds = self.iteration + 1, self.seconds + taken

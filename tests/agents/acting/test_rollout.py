@@ -210,8 +210,9 @@ def prepared(curiosity):
         # The same episodes with the features of these parameters.
         boards = trajectory.episodes.observations()
         features = jax.vmap(lambda rows: train.agent.encode(state.params, rows))(boards)
-        _, batch, _ = train.prepare(state, trajectory._replace(features=features))
-        return state, batch
+        trajectory = trajectory._replace(features=features)
+        reward, _ = train.intrinsic_reward(state, trajectory)
+        return state, train.make_batch(state, trajectory, reward)[0]
 
     return train, prepare
 

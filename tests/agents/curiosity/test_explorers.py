@@ -102,10 +102,9 @@ def test_elliptical_bonus_is_that_of_the_inverse_matrix():
 
 @pytest.mark.parametrize("name", ["rnd", "noveld", "ride", "e3b"])
 def test_an_episode_is_paid_the_same_among_others_as_apart(name):
-    """So devices that share the episodes may pay their own each."""
+    """So devices that share the episodes pay as one does."""
     features = np.random.default_rng(0).normal(size=(6, 8, 3))
     ids = np.random.default_rng(1).integers(0, 4, size=(6, 8))
-    assert not learner_of(name).curiosity.needs_all_episodes
     whole = reward_of(name, features, ids)
     np.testing.assert_array_equal(reward_of(name, features[:, 4:], ids[:, 4:]), whole[:, 4:])
     assert np.std(whole) > 0

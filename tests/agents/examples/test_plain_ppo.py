@@ -64,7 +64,8 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
     trajectory = learner.play(state.params, reset_keys, jax.random.key(2))
     episodes = trajectory.episodes
     assert 0 < episodes.mask.mean() < 1, "some end early"
-    moved, batch, _ = learner.prepare(state, trajectory)
+    reward, _ = learner.intrinsic_reward(state, trajectory)
+    batch, moments = learner.make_batch(state, trajectory, reward)
     # Updated parameters, so that ratios are not 1.
     noise = iter(jax.random.split(jax.random.key(3), len(jax.tree.leaves(state.params))))
     now = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(noise), x.shape), state.params)
@@ -85,8 +86,7 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
     chex.assert_trees_all_close(
         [*variance, advantage.T, target.T[..., None], {**terms, "loss": total}],
         [
-            moved.extrinsic.variance,
-            moved.intrinsic.variance,
+            *[each.variance for each in moments],
             batch.advantage,
             batch.value_target,
             {name: expected[name] for name in ("loss", *terms)},

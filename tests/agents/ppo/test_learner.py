@@ -1,6 +1,6 @@
-"""What an iteration of training makes of its parts: tasks, weights of rewards, gradient steps.
+"""One iteration of training: tasks, weights of rewards, gradient steps, and what it refuses.
 
-Play and gradient steps are replaced where they are not what is tested.
+Play and gradient steps are replaced where they are not tested.
 """
 
 import dataclasses
@@ -17,24 +17,33 @@ from agents import Config, make_train
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
 from agents.arrays import to_arrays
+from agents.curiosity import Curiosity
+from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
-from agents.ppo.learner import RESERVED_NAMES, Learner, TrainState
+from agents.ppo.learner import Learner, TrainState
+from agents.ppo.memory import memory_estimate
+from agents.registry import curiosities
+from easy import rows
 
+SIZES = {
+    "epochs": 1,
+    "filters": (4, 4),
+    "hidden": 4,
+    "embedding": 2,
+    "max_steps": 6,
+    "encode_chunk_size": 8,
+    "iterations": 10,
+}
 BEST = Config.preset(
     "best",
+    **{**SIZES, "epochs": 3},
     episodes_per_iteration=8,
     minibatch_size=4,
-    epochs=3,
-    filters=(4, 4),
-    hidden=4,
-    embedding=2,
-    max_steps=6,
-    encode_chunk_size=8,
     replay_capacity=5,
     replay_fractions=(0.25, 0.25),
-    iterations=10,
     max_transitions=None,
 )
+PLAIN = Config(**SIZES, episodes_per_iteration=2, minibatch_size=2, curiosity="none")
 STEPS, EPISODES = 6, 8
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
@@ -66,7 +75,7 @@ class Scripted(Learner):
     def intrinsic_reward(self, state, trajectory):
         return jax.random.uniform(jax.random.key(4), (STEPS, EPISODES)), state.memory
 
-    def optimize(self, state, batch, key):
+    def update(self, state, batch, key):
         return state.params, state.opt_state, {"advantage": batch.advantage}
 
 
@@ -75,29 +84,28 @@ def reset_keys() -> jax.Array:
 
 
 def data(keys: jax.Array) -> list[tuple[int, ...]]:
-    """Keys as what can be compared."""
+    """Keys as numbers, to compare."""
     return [tuple(key) for key in np.asarray(jax.random.key_data(keys)).reshape(-1, 2)]
 
 
 @pytest.fixture(scope="module")
 def scripted() -> tuple[Learner, TrainState, Any]:
     """A scripted learner, its first state, and its iteration, compiled."""
-    parts = vars(make_train(BEST))
-    train = Scripted(**parts)
-    return train, train.init(jax.random.key(0)), jax.jit(train.iterate)
+    scripted = Scripted(**vars(make_train(BEST)))
+    return scripted, scripted.init(jax.random.key(0)), jax.jit(scripted.iterate)
 
 
 def test_new_tasks_are_new_and_others_are_of_the_lists():
-    train = make_train(BEST)
-    task_replay = train.init(jax.random.key(0)).task_replay
-    drawn = data(train.draw_tasks(task_replay, jax.random.key(1)))
+    best = make_train(BEST)
+    task_replay = best.init(jax.random.key(0)).task_replay
+    drawn = data(best.draw_tasks(task_replay, jax.random.key(1)))
     once, twice = data(task_replay.keys[0]), data(task_replay.keys[1])
     assert len(set(drawn[:4]) - {*once, *twice}) == 4
     assert set(drawn[4:6]) <= set(once)
     assert set(drawn[6:]) <= set(twice)
 
 
-def test_tasks_that_failed_are_remembered_and_success_is_that_on_new_tasks(scripted):
+def test_failed_tasks_are_remembered_and_success_is_that_on_new_tasks(scripted):
     _, state, iterate = scripted
     after, metrics = iterate(state)
     keys, first, second = data(reset_keys()), *map(data, state.task_replay.keys)
@@ -111,21 +119,22 @@ def test_tasks_that_failed_are_remembered_and_success_is_that_on_new_tasks(scrip
 def test_an_iteration_counts_what_was_played(scripted):
     _, state, iterate = scripted
     after, metrics = iterate(iterate(state)[0])
-    assert int(after.iteration) == 2
-    assert int(after.episodes) == 2 * EPISODES
-    assert int(after.transitions) == 2 * EPISODES * STEPS
+    counts = [int(x) for x in (after.iteration, after.episodes, after.transitions)]
+    assert counts == [2, 2 * EPISODES, 2 * EPISODES * STEPS]
     assert float(metrics["episode_length"]) == STEPS
 
 
-@pytest.mark.parametrize(("iteration", "weight"), [(0, 3.0), (4, 0.3), (8, 0.03), (9, 0.03)])
-def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, weight):
-    train, state, iterate = scripted
+@pytest.mark.parametrize(("iteration", "coef"), [(0, 3.0), (4, 0.3), (8, 0.03), (9, 0.03)])
+def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, coef):
+    scripted, state, iterate = scripted
     _, metrics = iterate(state._replace(iteration=jnp.int32(iteration)))
-    trajectory = train.play(None, reset_keys(), None)
-    novelty, _ = train.intrinsic_reward(state, trajectory)
-    moments = (state.extrinsic, state.intrinsic)
-    expected, _, _ = advantages.separate_advantages(
-        BEST, trajectory.episodes, novelty, weight, trajectory.value, moments
+    trajectory = scripted.play(None, reset_keys(), None)
+    reward, _ = scripted.intrinsic_reward(state, trajectory)
+    moments = advantages.update_moments(
+        BEST, (state.extrinsic, state.intrinsic), trajectory.episodes, reward
+    )
+    expected, _ = advantages.separate_advantages(
+        BEST, trajectory.episodes, reward, coef, trajectory.value, moments
     )
     # Normalised once more.
     expected = (expected - expected.mean()) / expected.std()
@@ -141,47 +150,6 @@ def test_episodes_are_played_facing_the_food(monkeypatch):
     assert np.all((down >= right) & (right >= 0))
     drawn, _ = jax.jit(jax.vmap(tt.make("pstsy").reset))(keys)
     assert not np.all(drawn.food >= drawn.agent)
-
-
-def test_no_key_is_used_twice(monkeypatch):
-    """Those of two iterations, of their resets, steps and gradient steps."""
-    used: list[tuple[int, ...]] = []
-
-    def note(key):
-        jax.debug.callback(lambda key: used.extend(data(key)), key)
-
-    class Environment(tt.Environment):
-        def reset(self, key):
-            note(key)
-            return super().reset(key)
-
-    def choose(key, actions):
-        note(key)
-        return actions.mode()
-
-    class Playing(Learner):
-        def prepare(self, state, trajectory) -> Any:
-            note(state.key)
-            return state, trajectory, {}
-
-        def optimize(self, state, batch, key):
-            note(key)
-            return state.params, state.opt_state, {}
-
-    monkeypatch.setattr(learner, "sample_action", choose)
-    small = {
-        "max_steps": STEPS,
-        "filters": (2, 2),
-        "hidden": 4,
-        "embedding": 2,
-        "encode_chunk_size": 4,
-    }
-    config = Config(**small, episodes_per_iteration=EPISODES, minibatch_size=4, curiosity="none")
-    train = Playing(**vars(make_train(config, Environment(max_steps=STEPS))))
-    state, iterate = train.init(jax.random.key(0)), jax.jit(train.iterate)
-    iterate(iterate(state)[0])
-    jax.effects_barrier()
-    assert len(set(used)) == len(used) == 2 * (1 + EPISODES + STEPS + 1 + 1)
 
 
 def recorder(updates: int) -> optax.GradientTransformation:
@@ -201,16 +169,17 @@ class Counting(Learner):
     """Its gradient is 1 at the episodes of the minibatch."""
 
     def loss(self, params: Any, batch: Any):
-        return jnp.sum(params[batch["number"][0]]), {"entropy": jnp.ones(()), "steps": jnp.ones(())}
+        return jnp.sum(params[batch.log_prob[0]]), {}
 
 
 def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
     updates = BEST.gradient_steps
-    train = Counting(**{**vars(make_train(BEST)), "optimizer": recorder(updates)})
+    counting = Counting(**{**vars(make_train(BEST)), "optimizer": recorder(updates)})
     params = jnp.zeros(EPISODES)
-    state = TrainState(params, train.optimizer.init(params), *[None] * 8)  # pyright: ignore
-    batch: Any = {"number": jnp.arange(EPISODES)[None]}
-    after, (count, seen), _ = train.optimize(state, batch, jax.random.key(0))
+    state = TrainState(params, counting.optimizer.init(params), *[None] * 8)  # pyright: ignore
+    number: Any = jnp.arange(EPISODES)[None]
+    batch = learner.Batch(*[number] * 5)
+    after, (count, seen), _ = counting.update(state, batch, jax.random.key(0))
     assert count == updates == 3 * 2
     np.testing.assert_array_equal(after, -3)
     epochs = np.asarray(seen).reshape(3, 2, EPISODES)
@@ -222,32 +191,101 @@ def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
 @pytest.mark.slow
 def test_seeds_side_by_side_are_those_alone():
     """With the cache of encodings and the loops of the real rollout; up to rounding."""
-    small = {
-        "max_steps": 4,
-        "episodes_per_iteration": 4,
-        "minibatch_size": 4,
-        "epochs": 1,
-        "encode_chunk_size": 4,
-    }
-    network = {"filters": (2, 3), "hidden": 4, "embedding": 2}
-    train = make_train(Config(**small, **network, env_id="sy", curiosity="none"))
-    both = jax.vmap(train.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))
-    together, alone = jax.jit(jax.vmap(train.iterate))(both), jax.jit(train.iterate)
+    plain = make_train(dataclasses.replace(PLAIN, env_id="sy"))
+    both = jax.vmap(plain.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))
+    together, alone = jax.jit(jax.vmap(plain.iterate))(both), jax.jit(plain.iterate)
     for seed in range(2):
-        expected = to_arrays(alone(jax.tree.map(lambda x, i=seed: x[i], both)))
-        got = to_arrays(jax.tree.map(lambda x, i=seed: x[i], together))
+        expected = to_arrays(alone(rows(both, seed)))
+        got = to_arrays(rows(together, seed))
         assert got.keys() == expected.keys()
         for name, array in got.items():
             np.testing.assert_allclose(array, expected[name], rtol=1e-4, atol=1e-5, err_msg=name)
 
 
-def test_an_iteration_of_best_is_finite_and_changes_all_parameters():
-    train = make_train(dataclasses.replace(BEST, epochs=1))
-    state = train.init(jax.random.key(0))
+def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key():
+    best = make_train(dataclasses.replace(BEST, epochs=1))
+    state = best.init(jax.random.key(0))
     assert state.params["heads"]["params"]["value"]["kernel"].shape == (4, 2)
-    after, metrics = jax.jit(train.iterate)(state)
+    with jax.debug_key_reuse(True):
+        after, metrics = jax.jit(best.iterate)(state)
+        jax.jit(best.iterate)(after)
+    assert float(metrics["is_finite"]) == 1
     assert all(np.isfinite(float(value)) for value in metrics.values())
-    assert metrics.keys() <= RESERVED_NAMES  # the curiosity has no losses
     before, after = to_arrays(state.params), to_arrays(after.params)
     same = [name for name in before if np.array_equal(before[name], after[name])]
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
+
+
+def test_divergence_is_a_metric():
+    diverging = make_train(dataclasses.replace(PLAIN, learning_rate=1e9, max_gradient_norm=1e9))
+    iterate = jax.jit(diverging.iterate)
+    _, metrics = iterate(iterate(diverging.init(jax.random.key(0)))[0])
+    assert float(metrics["is_finite"]) == 0
+
+
+class Returning(Curiosity):
+    """Returns what it was given, whatever that is."""
+
+    def __init__(self, reward=None, given=None, losses=None):
+        self.memory = lambda: jnp.zeros((), jnp.int32)
+        self.reward = lambda params, memory, experience: (
+            experience.episodes.reward if reward is None else reward,
+            memory if given is None else given,
+        )
+        self.losses = lambda params, experience: dict.fromkeys(
+            losses or (), experience.episodes.reward
+        )
+
+
+@pytest.fixture
+def with_curiosity(monkeypatch):
+    """Builds a learner with a curiosity."""
+
+    def build(curiosity, **arguments):
+        monkeypatch.setattr(curiosities, "factory", lambda name: lambda config, env: curiosity)
+        return make_train(PLAIN, **arguments)
+
+    return build
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [
+        ({"reward": jnp.zeros(3)}, ["reward must return", "float32[6, 2]", "float32[3]"]),
+        ({"reward": jnp.zeros((6, 2), int)}, ["float32[6, 2]", "int32[6, 2]"]),
+        ({"given": jnp.zeros(2)}, ["int32[]", "float32[2]"]),
+        ({"losses": ["policy_loss"]}, ["losses must end in '_loss'", "got 'policy_loss'"]),
+        ({"losses": ["mine"]}, ["policy_loss, value_loss, entropy_loss", "got 'mine'"]),
+    ],
+)
+def test_a_curiosity_that_breaks_its_contract_is_named(with_curiosity, returned, words):
+    own = with_curiosity(Returning(**returned))
+    with pytest.raises(ValueError, match="curiosity 'none'") as error:
+        jax.eval_shape(own.iterate, own.init(jax.random.key(0)))
+    assert all(word in str(error.value) for word in words)
+
+
+def test_devices_average_floats_only(with_curiosity):
+    with pytest.raises(ValueError, match="'none' needs one device"):
+        with_curiosity(Returning(), axis=EpisodeAxis(2))
+
+
+@pytest.mark.parametrize(
+    ("settings", "env", "message"),
+    [
+        ({"max_steps": 10_000}, None, r"2,560,000,000 steps; allowed: at most 2,147,483,647"),
+        ({"max_steps": 7}, tt.Environment(max_steps=6), "max_steps is 6, the config's 7"),
+        ({}, tt.make("base", num_features=4), "num_features is 4, the config's 3"),
+    ],
+)
+def test_settings_that_cannot_be_trained_with_are_refused(settings, env, message):
+    with pytest.raises(ValueError, match=message):
+        make_train(Config(**settings), env)
+
+
+def test_the_memory_of_the_presets_is_estimated():
+    """Within a factor of three of XLA's own figures, in MB."""
+    for name, found in (("paper", 180.6), ("fast", 25.7), ("best", 45.3)):
+        assert found / 3 < memory_estimate(Config.preset(name)) / 1e6 < 3 * found
+    many = Config(iterations=1, episodes_per_iteration=1_000_000, minibatch_size=1_000_000)
+    assert memory_estimate(many) > 1e11

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents import Config
-from agents.ppo.optimizer import adam, step_size
+from agents.ppo.optimizer import adam, learning_rate_schedule
 
 
 def test_the_cooldown_counts_gradient_steps():
@@ -18,7 +18,7 @@ def test_the_cooldown_counts_gradient_steps():
         learning_rate=0.5,
     )
     assert config.gradient_steps == 4
-    schedule = step_size(config)
+    schedule = learning_rate_schedule(config)
     for count, share in ((0, 1), (28, 1), (29, 50 ** (-1 / 12)), (34, 50**-0.5), (40, 0.02)):
         np.testing.assert_allclose(schedule(jnp.int32(count)), 0.5 * share, rtol=1e-5)
 
@@ -32,12 +32,12 @@ def test_none_or_all_of_training_may_be_cooldown(cooldown):
         minibatch_size=4,
         lr_decay_fraction=cooldown,
     )
-    rates = jnp.stack([jnp.asarray(step_size(config)(jnp.int32(n))) for n in range(4)])
+    rates = jnp.stack([jnp.asarray(learning_rate_schedule(config)(jnp.int32(n))) for n in range(4)])
     expected = 1e-3 * 50 ** (-cooldown * np.arange(4) / 4)
     np.testing.assert_allclose(rates, expected, rtol=1e-5)
 
 
-def test_adam_takes_the_step_size_of_its_count():
+def test_adam_takes_the_learning_rate_schedule_of_its_count():
     """With a constant gradient each step is as long as the schedule says."""
     optimizer = adam(lambda count: jnp.where(jnp.equal(count, 0), 0.1, 0.01), epsilon=0.0)
     params = jnp.zeros(3)

@@ -25,39 +25,38 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def ours(recording: Recording) -> dict[str, Any]:
-    train = make_train(CONFIG)
-    params = recording.params("param", jax.jit(train.init_params)(jax.random.key(0)))
+    learner = make_train(CONFIG)
+    params = recording.params("param", jax.jit(learner.init_params)(jax.random.key(0)))
 
     @jax.jit
     def run(params):
-        trajectory = make_trajectory(train.agent, params, recording)
-        state = train.init(jax.random.key(0))._replace(params=params)
-        experience = train.acting_experience(params, trajectory)
-        assert isinstance(train.curiosity, ICM)
-        prediction = train.curiosity.predict(params["curiosity"], experience)
-        raw, _ = train.intrinsic_reward(state, trajectory)
-        state, batch, _ = train.prepare(state, trajectory)
-        moments = (state.extrinsic, state.intrinsic)
+        trajectory = make_trajectory(learner.agent, params, recording)
+        state = learner.init(jax.random.key(0))._replace(params=params)
+        experience = learner.acting_experience(params, trajectory)
+        assert isinstance(learner.curiosity, ICM)
+        prediction = learner.curiosity.predict(params["curiosity"], experience)
+        raw, _ = learner.intrinsic_reward(state, trajectory)
+        batch, moments = learner.make_batch(state, trajectory, raw)
         return trajectory, experience.next_embedding, prediction, raw, batch, moments
 
     names = ("trajectory", "next_embedding", "prediction", "raw", "batch", "moments")
-    return {"train": train, "params": params, **dict(zip(names, run(params), strict=True))}
+    return {"learner": learner, "params": params, **dict(zip(names, run(params), strict=True))}
 
 
 @pytest.fixture(scope="module")
 def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
-    train, batch = ours["train"], ours["batch"]
+    learner, batch = ours["learner"], ours["batch"]
     clip = optax.clip_by_global_norm(CONFIG.max_gradient_norm)
 
     @jax.jit
     def update(params, opt_state):
-        gradient, terms = jax.grad(train.loss, has_aux=True)(params, batch)
-        step, opt_state = train.optimizer.update(gradient, opt_state, params)
+        gradient, terms = jax.grad(learner.loss, has_aux=True)(params, batch)
+        step, opt_state = learner.optimizer.update(gradient, opt_state, params)
         clipped, _ = clip.update(gradient, clip.init(params))
         params = optax.apply_updates(params, step)
         return params, opt_state, clipped, {**terms, "gradient_norm": optax.tree.norm(gradient)}
 
-    params, opt_state, done = ours["params"], jax.jit(train.optimizer.init)(ours["params"]), []
+    params, opt_state, done = ours["params"], jax.jit(learner.optimizer.init)(ours["params"]), []
     for _ in range(5):
         params, opt_state, clipped, terms = update(params, opt_state)
         done.append({"params": params, "clipped": clipped, "terms": terms})
@@ -91,7 +90,7 @@ def test_replayed_boards_are_the_recorded_ones(recording, ours):
 
 def test_network_outputs(recording, ours):
     trajectory, (error, inferred) = ours["trajectory"], ours["prediction"]
-    actions, _ = ours["train"].agent.policy_and_value(ours["params"], trajectory.embedding)
+    actions, _ = ours["learner"].agent.policy_and_value(ours["params"], trajectory.embedding)
     assert_close(trajectory.embedding, recording.steps("out/embedding"))
     assert_close(trajectory.log_prob, recording.steps("out/log_probs"))
     assert_close(actions.entropy(), recording.steps("out/entropy"))
@@ -108,10 +107,10 @@ def test_rewards_and_targets(recording, ours):
     mask = recording.steps("batch/weight")
     raw = ours["raw"]
     assert_close(raw * mask, recording.steps("reward/intrinsic") * mask)
-    assert_close(extrinsic.deviation, recording["reward/extrinsic_std"])
-    assert_close(intrinsic.deviation, recording["reward/intrinsic_std"])
-    reward = ours["trajectory"].episodes.reward / extrinsic.deviation
-    reward = reward + CONFIG.intrinsic_coef * raw * mask / intrinsic.deviation
+    assert_close(extrinsic.std, recording["reward/extrinsic_std"])
+    assert_close(intrinsic.std, recording["reward/intrinsic_std"])
+    reward = ours["trajectory"].episodes.reward / extrinsic.std
+    reward = reward + CONFIG.intrinsic_coef * raw * mask / intrinsic.std
     assert_close(reward, recording.steps("reward/total") * mask)
     assert_close(ours["batch"].advantage, recording.steps("target/advantages") * mask)
     assert_close(

@@ -130,9 +130,9 @@ def test_moving_moments():
         mean = keep * mean + (1 - keep) * batch_mean
         variance = keep * variance + (1 - keep) * batch_variance
         np.testing.assert_allclose(moments.mean, mean, rtol=1e-5)
-        np.testing.assert_allclose(moments.deviation, np.sqrt(variance), rtol=1e-5)
+        np.testing.assert_allclose(moments.std, np.sqrt(variance), rtol=1e-5)
 
 
 def test_constant_rewards_are_not_scaled():
     moments = returns.Moments.zero().update(jnp.zeros((3, 4)), jnp.ones((3, 4)), 0.9)
-    assert moments.deviation == 1.0
+    assert moments.std == 1.0
