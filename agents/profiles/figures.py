@@ -73,8 +73,9 @@ def save_controls(profile: pd.DataFrame, path: Path) -> None:
         groups = profile.query("part == 'control' and level == @level")
         share = (groups["solved"] / groups["tasks"]).to_numpy()
         cells[index].imshow(share[:, None], vmin=0, vmax=1, cmap="cividis", aspect="auto")
-        for row, steps in enumerate(groups["steps"]):
-            text, color = ("fails", "white") if np.isnan(steps) else (f"{steps:.0f} steps", "black")
+        for row, (steps, plan) in enumerate(zip(groups["steps"], groups["plan"], strict=True)):
+            failed = "no plan" if np.isnan(plan) else "fails"
+            text, color = (failed, "white") if np.isnan(steps) else (f"{steps:.0f} steps", "black")
             cells[index].text(0, row, text, color=color, ha="center", va="center", fontsize="small")
         names = policies if index % COLUMNS == 0 else [""] * len(policies)
         cells[index].set_yticks(range(len(policies)), names, fontsize="small")

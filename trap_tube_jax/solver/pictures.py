@@ -41,12 +41,16 @@ def save_distances(
     times = np.unique(np.linspace(0, last, MOMENTS).round().astype(int))
     boards = [distances.to_goal[(*states[time].food, *states[time].tool)] for time in times]
     scale = Normalize(0, max(np.max(boards), 1))
-    figure = Figure(figsize=(4 * len(times) + 0.6, 4.2), layout="constrained")
-    axes = figure.subplots(1, len(times), squeeze=False)[0]
-    for axis, time, steps in zip(axes, times, boards, strict=True):
+    rows, columns = -(-len(times) // 2), min(len(times), 2)
+    figure = Figure(figsize=(3.8 * columns + 0.7, 4 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, time, steps in zip(axes, times, boards, strict=False):
         _draw_distances(axis, states[time], steps, scale)
-        axis.set_title(f"{len(plan.actions) - time} steps left" if plan.solvable else "unsolvable")
-    figure.colorbar(axes[0].images[-1], ax=list(axes), label="steps to the goal", shrink=0.8)
+        left = f"steps left: {len(plan.actions) - time}"
+        axis.set_title(left if plan.solvable else "unsolvable")
+    figure.colorbar(axes[0].images[-1], ax=list(axes), label="steps to the goal", shrink=0.6)
     figure.savefig(path, format="png", dpi=100)
 
 
@@ -78,4 +82,3 @@ def _draw_distances(axis: Axes, state: State, steps: np.ndarray, scale: Normaliz
         value = steps[row, column]
         color = "white" if scale(value) > 0.5 else "black"
         axis.text(column, row, str(value), color=color, ha="center", va="center", fontsize=7)
-    axis.set_axis_off()
