@@ -6,8 +6,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from agents import load
-from agents import profile as command
+from agents import load, profile
 from agents.pretrained import FOLDER
 
 
@@ -22,7 +21,7 @@ def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
 
     monkeypatch.setattr("builtins.print", refuse)
     with pytest.raises(RuntimeError, match="terminal"):
-        command.main(["fast-base", source, *options.split()])
+        profile.main(["fast-base", source, *options.split()])
     table = pd.read_csv(out / "profile.csv")
     one, two = (group.drop(columns="policy") for _, group in table.groupby("policy", sort=False))
     pd.testing.assert_frame_equal(one.reset_index(drop=True), two.reset_index(drop=True))
@@ -35,8 +34,8 @@ def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
 
 def test_policies_of_a_source_with_several_are_told_apart_by_name(monkeypatch):
     policies = [load("fast-base")._replace(name=f"seed {seed}") for seed in range(2)]
-    monkeypatch.setattr(command, "load_policies", lambda source, imports: policies)
-    names = list(command.Options(("runs/mine/",)).policies())
+    monkeypatch.setattr(profile, "load_policies", lambda source, imports: policies)
+    names = list(profile.Options(("runs/mine/",)).policies())
     assert names == ["runs/mine, seed 0", "runs/mine, seed 1"]
 
 
@@ -52,5 +51,5 @@ def test_policies_of_a_source_with_several_are_told_apart_by_name(monkeypatch):
 )
 def test_the_command_line_refuses(arguments, message, capsys, tmp_path):
     with pytest.raises(SystemExit):
-        command.main([*arguments, "--output", str(tmp_path)])
+        profile.main([*arguments, "--output", str(tmp_path)])
     assert message in capsys.readouterr().err
