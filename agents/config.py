@@ -144,11 +144,9 @@ class Config:
           ValueError: a setting is not allowed; the message names its value and the allowed ones.
         """
         for field in dataclasses.fields(self):
-            value: Any = getattr(self, field.name)
-            if isinstance(value, list):  # as JSON and YAML have it
-                value = tuple(value)
-                object.__setattr__(self, field.name, value)
-            _check_value(field, value)
+            if isinstance(getattr(self, field.name), list):  # as JSON has it
+                object.__setattr__(self, field.name, tuple(getattr(self, field.name)))
+            _check_value(field, getattr(self, field.name))
         registry.curiosities.factory(self.curiosity)
         registry.encoders.factory(self.encoder)
         if self.value_heads == "separate" and self.bootstrap != "value":

@@ -17,11 +17,13 @@ from agents.parallel import processes
 from agents.parallel.devices import become_devices
 from agents.runs import compilation, display
 from agents.runs.folder import Run, RunFolder, check_name
-from agents.runs.metrics import first_solved, read_rows
 from agents.runs.session import RunOptions, train_run
 from agents.runs.stopping import Stopped
+from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import import_modules
+from trap_tube_jax.scoring.scores import Scores
+from trap_tube_jax.scoring.tasks import PROTOCOL
 
 PROGRAM = "python -m agents.train"
 
@@ -121,7 +123,7 @@ def train(options: Options, run: Run, job: processes.Job) -> None:
     again = f"Continue with: {display.resume_command(folder)}"
     run_options = RunOptions(options.checkpoint_every, options.keep, options.devices)
     try:
-        train_run(folder.path, run, run_options, console=console)
+        scores = train_run(folder.path, run, run_options, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
         console.print(f"Stopped. {again}", soft_wrap=True, highlight=False, markup=False)
         number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT
@@ -130,19 +132,8 @@ def train(options: Options, run: Run, job: processes.Job) -> None:
         raise
     except OSError as error:
         raise OSError(f"{error}. Saved checkpoints are kept. {again}") from error
-    if processes.is_first():
-        show(folder, run, console)
-
-
-def show(folder: RunFolder, run: Run, console: Console) -> None:
-    """Prints the scores of a finished run and a few facts."""
-    rows = [row for row in read_rows(folder.evaluations) if row["purpose"] == "test"]
-    newest = max(row["iteration"] for row in rows)
-    tested = [row for row in rows if row["iteration"] == newest]
-    metrics = read_rows(folder.metrics)
-    solved = first_solved(metrics, run.seed_range, run.config.stop_when_solved)
-    lines = [display.evaluation_table(tested), "", *display.summary(folder, run, tested, solved)]
-    for line in lines:
+    tables = [str(Scores(PROTOCOL, __version__, None, tuple(each))) for each in scores.values()]
+    for line in (*tables, *display.summary(folder, run, scores)):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 

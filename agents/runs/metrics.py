@@ -1,12 +1,11 @@
-"""Files of numbers that a run appends to, and when its seeds were solved.
+"""Files of numbers that a run appends to.
 
 `metrics.csv` has a row per seed and iteration, `evaluations.csv` a row per seed, evaluated
 iteration and task set.
 """
 
 import csv
-import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,45 +77,6 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         for row in reader
         if None not in row and None not in row.values()
     ]
-
-
-@dataclasses.dataclass(frozen=True)
-class FirstSolved:
-    """Cost until the greedy policy first solved the validation tasks of the training set.
-
-    Attributes:
-      iteration: iterations.
-      episodes: episodes.
-      transitions: environment steps.
-      seconds: seconds of training, without compilation.
-    """
-
-    iteration: int
-    episodes: int
-    transitions: int
-    seconds: float
-
-    @classmethod
-    def of(cls, row: Row) -> "FirstSolved":
-        """Reads the cost from a row of metrics."""
-        return cls(**{field.name: row[field.name] for field in dataclasses.fields(cls)})
-
-
-def first_solved(
-    rows: Iterable[Row], seeds: Iterable[int], stop_when_solved: float
-) -> dict[int, FirstSolved]:
-    """Returns when each seed first solved enough validation tasks, for seeds that have.
-
-    Args:
-      rows: metrics, in order of time.
-      seeds: the seeds to look for.
-      stop_when_solved: fraction of the tasks that is enough; 0 stands for all of them.
-    """
-    found: dict[int, Row] = {}
-    for row in rows:
-        if row["evaluation"] >= (stop_when_solved or 1.0):
-            found.setdefault(int(row["seed"]), row)
-    return {seed: FirstSolved.of(found[seed]) for seed in seeds if seed in found}
 
 
 def is_last(row: Row, config: Config) -> bool:

@@ -32,9 +32,10 @@ from agents.runs.display import ProgressLine
 from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows, make_evaluator
 from agents.runs.folder import Run, RunFolder, read_json, write_json
 from agents.runs.loading import policies
-from agents.runs.metrics import CsvLog, FirstSolved, Row, first_solved, is_last
+from agents.runs.metrics import CsvLog, Row, is_last
 from agents.runs.provenance import provenance
 from agents.runs.stopping import DivergedError, Stopped, StopSignals
+from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
@@ -85,10 +86,10 @@ def train_run(
     *,
     console: Console | None = None,
     stop_file: Path | None = None,
-) -> None:
+) -> dict[int, list[Score]]:
     """Trains a run to its end from its newest checkpoint, evaluates it and writes its files.
 
-    Returns at once if the run is finished. Only one process may call it for a folder at a time.
+    A finished run is left as it is. Only one process may call it for a folder at a time.
 
     Args:
       path: the run's folder, made if missing.
@@ -97,6 +98,9 @@ def train_run(
       console: where progress is shown; nowhere if None.
       stop_file: training stops as by SIGTERM once this file exists, which reaches threads and
         other hosts.
+
+    Returns:
+      The scores on test tasks by seed; none if the run was finished before.
 
     Raises:
       ValueError: the run cannot be trained or continued, or it diverged (`DivergedError`).
@@ -117,9 +121,11 @@ def train_run(
 
         processes.on_first(prepare)
         session = Session(folder, run, options, console, stop_file)
+        if processes.is_first():
+            folder.note(run)  # it may have other limits than before
         with session.checkpoints or contextlib.nullcontext():
             session.train()
-            session.finish()
+            return session.finish()
 
 
 class Session:
@@ -174,12 +180,6 @@ class Session:
         over = [seed in last and is_last(last[seed], config) for seed in self.run.seed_range]
         return ~np.array(over)
 
-    @property
-    def solved(self) -> dict[int, FirstSolved]:
-        """When each solved seed was first solved, as far as `metrics.csv` tells."""
-        rows = self.metrics.rows if self.metrics is not None else ()
-        return first_solved(rows, self.run.seed_range, self.run.config.stop_when_solved)
-
     def train(self) -> None:
         """Trains until every seed has reached a limit.
 
@@ -212,11 +212,11 @@ class Session:
                 if request:
                     raise Stopped(request)
 
-    def finish(self) -> None:
-        """Evaluates the final policies, or the best ones, and writes the results."""
+    def finish(self) -> dict[int, list[Score]]:
+        """Evaluates the final policies, or the best ones; writes and returns the results."""
         state = self.placement.local(self.state)
-        if self.evaluations is None or self.metrics is None:
-            return
+        if self.evaluations is None:
+            return {}
         final = policies(self.run, state.params, np.asarray(state.iteration))
         shown = {}
         for seed, policy in zip(self.run.seed_range, final, strict=True):
@@ -229,17 +229,18 @@ class Session:
         }
         missing = [s for s, policy in shown.items() if (s, policy.iteration) not in tested]
         if not missing and (self.folder.page.exists() or not self.options.report):
-            return
+            return {}
         self._say("Evaluating ...")
         tasks = self.options.reported or self.run.config.eval_episodes
         evaluator = make_evaluator(self.run, self.sets, tasks, "test")
         played = {seed: evaluator(policy.params) for seed, policy in shown.items()}
+        scores = {seed: evaluator.scores(outcome) for seed, outcome in played.items()}
         for seed in missing:
-            scores = evaluator.scores(played[seed])
-            self.evaluations.append(evaluation_rows(scores, shown[seed], seed, "test"))
+            self.evaluations.append(evaluation_rows(scores[seed], shown[seed], seed, "test"))
         if self.options.report:
             first = jax.tree.map(lambda x: x[0], state)
             report.write(self.folder, self.run, self.learner, first, evaluator, played)
+        return scores
 
     def _restore(self) -> tuple[TrainState | None, dict[str, Any]]:
         """Returns the state of the newest checkpoint, if there is one, and its record.

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import os
-import re
 import shutil
 import signal
 from concurrent import futures

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.config import Config
-from agents.runs.metrics import CsvLog, FirstSolved, first_solved, is_last, read_rows
+from agents.runs.metrics import CsvLog, is_last, read_rows
 
 
 def row(iteration, seed=0, **values):
@@ -51,13 +51,6 @@ def test_columns_never_change(tmp_path):
     log.append([row(1)])
     with pytest.raises(ValueError, match=r"has columns .*'seconds'.*, got .*'more'"):
         log.append([row(2, more=1)])
-
-
-def test_seeds_are_first_solved_at_the_share_that_is_asked_for():
-    rows = [row(n, seed, evaluation=share) for n, seed, share in ((1, 0, 0.5), (2, 0, 1.0))]
-    rows += [row(3, 0, evaluation=1.0), row(3, 1, evaluation=0.5)]
-    assert first_solved(rows, (0, 1), 0.0) == {0: FirstSolved(2, 16, 96, 2.0)}
-    assert {s: f.iteration for s, f in first_solved(rows, (0, 1), 0.5).items()} == {0: 1, 1: 3}
 
 
 @pytest.mark.parametrize(

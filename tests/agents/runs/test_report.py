@@ -8,7 +8,6 @@ import math
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +21,10 @@ from agents import make_train
 from agents.acting.evaluation import Evaluator
 from agents.runs import display, report
 from agents.runs.folder import Run, RunFolder
-from agents.runs.metrics import CsvLog, FirstSolved
+from agents.runs.metrics import CsvLog
 from small_runs import small_config
 from trap_tube_jax.objects import DIRECTION_NAMES
+from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 # The food next to the agent, on each side in turn: whichever way the first move of a policy
@@ -161,40 +161,25 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
     assert ("2/5" in text) == is_terminal
 
 
-def scored(name, tasks, solved, **values):
-    empty = {"layouts": "", "layouts_total": "", "length": ""}
-    return {"seed": 0, "task_set": name, "tasks": tasks, "solved": solved, **empty, **values}
-
-
-def test_the_table_fits_a_terminal():
-    rows = [
-        scored("stsy", 1000, 999, layouts=5, layouts_total=5, length=33.0),
-        scored("pstsy", 1000, 999, length=33.0),
-        scored("p", 10, 0),
-    ]
-    lines = display.evaluation_table(rows).splitlines()
-    assert max(map(len, lines)) <= 80
-    cells = [re.split(r"\s{2,}", line) for line in lines]
-    assert cells[1] == ["{St, Sy} (stsy)", "1000", "99.9", "–", "5 of 5", "33.0"]
-    assert cells[2] == ["{P, St, Sy} (pstsy)", "1000", "99.9", "99.4–100.0", "–", "33.0"]
-    assert cells[3] == ["{P} (p)", "10", "0.0", "0.0–27.8", "–", "–"]
-    mean = display.evaluation_table([scored("p", 10, 10), scored("p", 10, 5)]).splitlines()[1]
-    assert re.split(r"\s{2,}", mean) == ["{P} (p)", "10", "75.0", "–", "–", "–"]
+def score(name, solved):
+    return Score.of(name, name, np.arange(10) < solved, np.full(10, 7))
 
 
 @pytest.mark.parametrize(
-    ("settings", "solved", "expected"),
+    ("settings", "episodes", "expected"),
     [
-        ({"stop_when_solved": 1.0}, {0: FirstSolved(2, 4321, 9, 1.0)}, "--preset best"),
-        ({"stop_when_solved": 1.0}, {}, "--resume 'a b' --iterations 14"),
-        ({"lr_decay_fraction": 0.5}, {}, ": a b/report.html"),
+        ({"stop_when_solved": 1.0}, 4321, "--preset best"),
+        ({"stop_when_solved": 1.0}, None, "--iterations 14"),
+        ({"stop_when_solved": 0.0, "lr_decay_fraction": 0.5}, None, "report.html"),
     ],
 )
-def test_a_run_ends_with_facts_and_what_to_do_next(settings, solved, expected):
-    run = Run(small_config(iterations=7, **settings))
-    rows = [scored("base", 1, 1), scored("p", 10, 5), scored("st", 10, 0)]
-    lines = display.summary(RunFolder(Path("a b")), run, rows, solved)
-    assert ("after 4,321 episodes" in lines[0]) == bool(solved)
-    assert "100.0 % of its test tasks" in lines[0]
-    assert lines[1] == "Other task sets: 25.0 % on average."
+def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
+    run, folder = Run(small_config(iterations=7, **settings)), RunFolder(tmp_path)
+    solved = [row(2, evaluation=1.0, episodes=episodes)] if episodes else []
+    CsvLog(folder.metrics).append([row(1), *solved, row(3, evaluation=1.0)] if solved else [row(1)])
+    scores = {0: [score("base", 10), score("p", 5), score("st", 0)]}
+    lines = display.summary(folder, run, scores)
     assert lines[-1].endswith(expected)
+    assert ("First solved base after 4,321 episodes." in lines) == bool(episodes)
+    assert "Solves 100.0 % of base, 25.0 % of other sets." in lines
+    assert len(lines) <= 5

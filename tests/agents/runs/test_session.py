@@ -106,13 +106,14 @@ def test_a_request_saves_and_stops(tmp_path, monkeypatch):
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(session, "make_evaluator", None)
     before = (copy / "evaluations.csv").read_bytes()
-    train_run(copy, small_run(), TRACKED)
+    assert train_run(copy, small_run(), TRACKED) == {}
     assert (copy / "evaluations.csv").read_bytes() == before
 
 
 def test_a_finished_run_is_extended(copy):
     train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
     assert final_state(copy)[0] == ITERATIONS + 1
+    assert RunFolder.open(copy)[1].config.iterations == ITERATIONS + 1
     tested = [row for row in read_rows(copy / "evaluations.csv") if row["purpose"] == "test"]
     assert len(tested) in (2, 4)  # as the best parameters are the old ones or new ones
     with pytest.raises(ValueError, match="iterations must be at least 7, which are done, got 6"):
