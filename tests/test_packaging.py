@@ -14,7 +14,7 @@ MODULES = {"pillow": "PIL"}  # where the distribution has another name
 
 def names(requirements):
     """The modules of these requirements."""
-    found = (re.match(r"[\w-]+", requirement)[0] for requirement in requirements)
+    found = (re.split(r"[\[>=]", requirement)[0] for requirement in requirements)
     return {MODULES.get(name, name) for name in found}
 
 

@@ -1,5 +1,6 @@
 """The Gymnasium adapter under Gymnasium's own tools."""
 
+import functools
 import itertools
 from typing import Any
 
@@ -16,6 +17,7 @@ check_env = pytest.importorskip("gymnasium.utils.env_checker").check_env
 statistics = pytest.importorskip("gymnasium.wrappers.vector")
 AutoresetMode = gymnasium.vector.AutoresetMode
 SyncVectorEnv = gymnasium.vector.SyncVectorEnv
+AsyncVectorEnv = gymnasium.vector.AsyncVectorEnv
 
 from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv, TrapTubeVectorEnv, register
 
@@ -165,10 +167,45 @@ def test_episode_statistics_count_over_the_batch(easy_env):
     assert infos["episode"]["l"].tolist() == [0, 6]
 
 
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_masks_and_missing_seeds_reset_as_gymnasiums_own_batch_does(mode):
+    options = {"task_set": "p", "max_steps": 3}
+    mode = AutoresetMode(mode)
+    ours = TrapTubeVectorEnv(num_envs=3, autoreset_mode=mode, **options)
+    theirs = SyncVectorEnv([lambda: TrapTubeEnv(**options)] * 3, autoreset_mode=mode)
+    ours.action_space.seed(0)
+    for seed, mask in (
+        (4, None),
+        ([1, None, 2], None),
+        (None, [True, False, True]),
+        ([None, 6, 7], [False, True, False]),
+        ([8, None, None], [True, True, False]),
+    ):
+        resets = []
+        for envs in (ours, theirs):
+            masked = None if mask is None else {"reset_mask": np.array(mask)}
+            resets.append(envs.reset(seed=seed, options=masked)[0])
+        np.testing.assert_array_equal(*resets)
+        for _ in range(4):
+            actions = ours.action_space.sample()
+            assert_same(ours.step(actions), theirs.step(actions))
+
+
+def test_refused_masks():
+    envs = TrapTubeVectorEnv(num_envs=2)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.reset(options={"reset_mask": [True, False]})
+    envs.reset(seed=0)
+    for mask in ([True], [False, False], [0, 1]):
+        with pytest.raises(ValueError, match=r"bool\[2\] with at least one true, got \["):
+            envs.reset(options={"reset_mask": mask})
+
+
 def test_several_seeds():
     envs = TrapTubeVectorEnv("p", 2)
     pair = envs.reset(seed=[5, 9])[0]
     np.testing.assert_array_equal(pair[1], envs.reset(seed=9)[0][0])
+    assert not np.array_equal(*TrapTubeVectorEnv("p", 2).reset(seed=[None, None])[0])
     with pytest.raises(ValueError, match="one or 2 integers, got 3"):
         envs.reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="seed must be an integer >= 0, got -1"):
@@ -208,6 +245,19 @@ def test_own_task_sets_can_be_registered(own_task_sets):
     register()
     env = gymnasium.make("trap_tube_jax/GymnasiumTest-v0")
     assert env.reset(seed=0)[0].shape == (12, 12, 3)
+    tt.register("GymnasiumTest-v0", (), max_steps=7)
+    assert gymnasium.make("trap_tube_jax/GymnasiumTest-v0").unwrapped.env.max_steps == 7
+
+
+@pytest.mark.parametrize("context", ["spawn", "forkserver"])
+def test_processes_of_their_own_change_nothing(context):
+    functions = [functools.partial(TrapTubeEnv, "p", max_steps=3)] * 2
+    envs = [SyncVectorEnv(functions), AsyncVectorEnv(functions, context=context)]
+    np.testing.assert_array_equal(*(each.reset(seed=3)[0] for each in envs))
+    for _ in range(6):
+        actions = envs[0].action_space.sample()
+        assert_same(*(each.step(actions) for each in envs))
+    envs[1].close()
 
 
 @pytest.mark.parametrize(
@@ -243,5 +293,5 @@ def test_refused_batches_of_actions(easy_env):
     envs.reset(seed=0)
     with pytest.raises(ValueError, match=r"shape \(2, 2\), got int64 of shape \(2,\)"):
         envs.step(np.array([0, 0]))
-    with pytest.raises(ValueError, match="lie in 0 to 3"):
+    with pytest.raises(ValueError, match="from 0 to 3"):
         envs.step([[0, 0], [0, 4]])

@@ -1,4 +1,4 @@
-"""The batch of environments as Gymnasium resets it by default: in a step of its own."""
+"""A batch of environments that start over in a step of its own, Gymnasium's default."""
 
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,7 @@
-"""The task sets as gymnax environments, with the step of either generation.
+"""The task sets as gymnax environments, with the step of gymnax 0.x or of gymnax >= 1.0.
 
-gymnax 0.x steps return five values, which PureJaxRL, rejax and Stoa expect whatever
-gymnax is installed: `make` and `FiveValueTrapTube`. gymnax 1.0 steps return six:
+A step of gymnax 0.x returns five values, which PureJaxRL, rejax and Stoa expect with any
+gymnax: `make` and `FiveValueTrapTube`. A step of gymnax 1.0 returns six values:
 `SixValueTrapTube`, which importing this module registers.
 
     env, params = to_gymnax.make("TrapTube-v0")
@@ -21,6 +21,7 @@ from flax import struct
 from jax.core import Tracer
 
 from trap_tube_jax.environment import Environment, action_from_index
+from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     MAX_STEPS,
@@ -36,30 +37,26 @@ from trap_tube_jax.registry import make as make_environment
 from trap_tube_jax.registry import registered_ids
 from trap_tube_jax.state import State, TimeStep
 
-try:
+with needs_extra("interop"):
     import gymnax  # pyright: ignore[reportMissingImports]
     from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
-except ImportError as error:
-    raise ImportError(
-        "trap_tube_jax.adapters.to_gymnax needs gymnax: pip install 'trap-tube-jax[interop]'"
-    ) from error
 
 HAS_SIX_VALUES = hasattr(gymnax, "register")  # gymnax >= 1.0
 
 
 @struct.dataclass
 class EnvParams(environment.EnvParams):
-    """What may differ between calls without compiling again.
+    """Parameters that may differ between calls without compiling again.
 
     Attributes:
       max_steps_in_episode: i32[], steps after which an unsolved episode is truncated.
     """
 
-    max_steps_in_episode: int | jax.Array = MAX_STEPS
+    max_steps_in_episode: Any = MAX_STEPS
 
 
 class _TrapTube(environment.Environment):
-    """What both generations share."""
+    """The parts that both steps share."""
 
     def __init__(
         self,
@@ -68,17 +65,17 @@ class _TrapTube(environment.Environment):
         flat_actions: bool = True,
         num_features: int | None = None,
     ):
-        """Checks its arguments.
+        """Checks the arguments.
 
         Args:
-          task_set: a registered id or short name, or an `Environment` of your own, which
-            brings its own number of features and, as the default parameter, step limit.
+          task_set: registered id or short name, or an `Environment` of your own, which has its
+            own number of features and, as the default parameter, step limit.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `Tuple((Discrete(4), Discrete(4)))` or i32[2].
-          num_features: N, the feature channels of the observation; see `make` of the package.
+          num_features: N, the feature channels of the observation; see `trap_tube_jax.make`.
 
         Raises:
-          ValueError: naming the value and what is allowed.
+          ValueError: an argument is invalid; the message says what is allowed.
         """
         super().__init__()
         if not isinstance(task_set, Environment):
@@ -100,7 +97,7 @@ class _TrapTube(environment.Environment):
 
     @property
     def default_params(self) -> EnvParams:
-        """The step limit of the task set or `Environment`: 50 for the paper's sets."""
+        """Returns the step limit of the task set or `Environment`: 50 for the paper's sets."""
         return EnvParams(max_steps_in_episode=self._default_max_steps)
 
     @property
@@ -110,44 +107,44 @@ class _TrapTube(environment.Environment):
 
     @property
     def num_actions(self) -> int:
-        """16."""
+        """The number of (grasp, move) pairs, 16."""
         return NUM_ACTIONS
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:
-        """Draws a task: (observation u8[12, 12, N], state)."""
+        """Draws a task and returns (observation u8[12, 12, N], state)."""
         del params
         state, timestep = self._env.reset(key)
         return timestep.observation, state
 
     def get_obs(self, state: State, params: Any = None, key: Any = None) -> jax.Array:
-        """The observation u8[12, 12, N]."""
+        """Returns the observation u8[12, 12, N]."""
         del params, key
         return observe(state)
 
     def is_terminated(self, state: State, params: EnvParams) -> jax.Array:
-        """bool[]: the task is solved."""
+        """Returns bool[]: the task is solved."""
         del params
         return state.terminated
 
     def is_truncated(self, state: State, params: EnvParams) -> jax.Array:
-        """bool[]: the step limit is reached without success, or was."""
+        """Returns bool[]: the episode has reached the step limit without success."""
         at_limit = state.time >= params.max_steps_in_episode
         return state.truncated | (~state.terminated & at_limit)
 
     def action_space(self, params: EnvParams | None = None) -> Any:
-        """`Discrete(16)`, or two `Discrete(4)`."""
+        """Returns `Discrete(16)`, or two `Discrete(4)`."""
         del params
         if self.flat_actions:
             return spaces.Discrete(NUM_ACTIONS)
         return spaces.Tuple((spaces.Discrete(NUM_DIRECTIONS), spaces.Discrete(NUM_DIRECTIONS)))
 
     def observation_space(self, params: EnvParams | None = None) -> Any:
-        """`Box(0, 255, (12, 12, N), uint8)`."""
+        """Returns `Box(0, 255, (12, 12, N), uint8)`."""
         del params
         return spaces.Box(0, 255, self._env.observation_spec.shape, jnp.uint8)
 
     def state_space(self, params: EnvParams) -> Any:
-        """A `Dict` with the fields of `trap_tube_jax.State`."""
+        """Returns a `Dict` with the fields of `trap_tube_jax.State`."""
         cell = spaces.Box(0, BOARD_SIZE - 1, (2,), jnp.int32)
         flag = spaces.Box(0, 1, (), jnp.bool_)
         return spaces.Dict(
@@ -165,14 +162,14 @@ class _TrapTube(environment.Environment):
         )
 
     def _transition(self, state: State, action: Any, params: EnvParams) -> tuple[State, TimeStep]:
-        """The environment's step under the step limit in `params`."""
+        """Takes the environment's step under the step limit in `params`."""
         state, timestep = self._env.step(state, _pair(action) if self.flat_actions else action)
         truncated = self.is_truncated(state, params)
         return state.replace(truncated=truncated), timestep.replace(truncated=truncated)
 
 
 def _pair(index: Any) -> jax.Array:
-    """The action i32[2] of an index 0 to 15; raises ValueError for other concrete numbers."""
+    """Returns the action i32[2] of an index; raises ValueError for concrete ones beyond 0 to 15."""
     pair = action_from_index(index)
     if not isinstance(pair, Tracer) and np.any(np.asarray(pair) == NO_DIRECTION):
         raise ValueError(f"an action's index must be from 0 to {NUM_ACTIONS - 1}, got {index!r}")
@@ -182,8 +179,8 @@ def _pair(index: Any) -> jax.Array:
 class FiveValueTrapTube(_TrapTube):
     """The environment of gymnax 0.x: (observation, state, reward, done, info).
 
-    `done` is true for either end of an episode, and the state then returned starts the
-    next. `info` holds scalars: discount, terminated, truncated; on request also
+    `done` is true where the episode terminates or is truncated; state and observation then start
+    the next episode. `info` holds the scalars discount, terminated and truncated, and on request
     final_observation, u8[12, 12, N].
     """
 
@@ -195,16 +192,16 @@ class FiveValueTrapTube(_TrapTube):
         num_features: int | None = None,
         final_observation: bool = False,
     ):
-        """Checks its arguments.
+        """Checks the arguments.
 
         Args:
-          task_set: a registered id or short name, or an `Environment` of your own.
+          task_set: registered id or short name, or an `Environment` of your own.
           flat_actions: takes 4 * grasp + move in place of (grasp, move).
           num_features: N, the feature channels of the observation.
           final_observation: adds the observation before any reset to `info`.
 
         Raises:
-          ValueError: naming the value and what is allowed.
+          ValueError: an argument is invalid; the message says what is allowed.
         """
         super().__init__(task_set, flat_actions=flat_actions, num_features=num_features)
         self.final_observation = final_observation
@@ -230,10 +227,10 @@ class FiveValueTrapTube(_TrapTube):
     def step_env(
         self, key: jax.Array, state: State, action: Any, params: EnvParams
     ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action and stays at the end of the episode, if it is one.
+        """Takes one action; a finished episode stays as it is.
 
         Raises:
-          ValueError: the action is none, where its numbers are concrete; see `Environment.step`.
+          ValueError: the action is concrete and out of range; see `Environment.step`.
         """
         del key
         state, timestep = self._transition(state, action, params)
@@ -245,28 +242,28 @@ class FiveValueTrapTube(_TrapTube):
         return timestep.observation, state, timestep.reward, timestep.done, info
 
     def is_terminal(self, state: State, params: EnvParams) -> jax.Array:
-        """bool[]: the episode is over, for either reason."""
+        """Returns bool[]: the episode has terminated or is truncated."""
         return self.is_terminated(state, params) | self.is_truncated(state, params)
 
     def discount(self, state: State, params: EnvParams) -> jax.Array:
-        """f32[]: 0 where the task is solved, else 1."""
+        """Returns f32[]: 0 where the task is solved, else 1."""
         return 1.0 - self.is_terminated(state, params).astype(jnp.float32)
 
 
 class SixValueTrapTube(_TrapTube):
-    """The environment of gymnax >= 1.0, whose base class steps and resets it.
+    """The environment of gymnax >= 1.0, whose base class resets it after an episode.
 
-    (observation, state, reward, terminated, truncated, info); `info` holds discount,
-    terminated, truncated, and final_observation, the observation before any reset.
+    A step returns (observation, state, reward, terminated, truncated, info). `info` holds
+    discount, terminated, truncated, and final_observation, the observation before any reset.
     """
 
     def step_env(
         self, key: jax.Array, state: State, action: Any, params: EnvParams
     ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action: (observation, state, reward, terminated, info).
+        """Takes one action and returns (observation, state, reward, terminated, info).
 
         Raises:
-          ValueError: the action is none, where its numbers are concrete; see `Environment.step`.
+          ValueError: the action is concrete and out of range; see `Environment.step`.
         """
         del key
         state, timestep = self._transition(state, action, params)
@@ -275,7 +272,7 @@ class SixValueTrapTube(_TrapTube):
 
 
 def make(task_set: str | Environment = "TrapTube-v0", **options: Any) -> tuple[Any, EnvParams]:
-    """A five-value environment and its default parameters. See `FiveValueTrapTube`."""
+    """Returns a five-value environment and its default parameters; see `FiveValueTrapTube`."""
     env = FiveValueTrapTube(task_set, **options)
     return env, env.default_params
 
