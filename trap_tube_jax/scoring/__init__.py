@@ -1,1 +1,1 @@
-"""The benchmark's protocol: fixed tasks, scores, and the evaluation of policies."""
+"""The benchmark: fixed tasks, scores, and the evaluation of policies."""

@@ -1,4 +1,4 @@
-"""The score of anybody's agent: the benchmark's protocol in one call.
+"""Scores of any agent by the benchmark's protocol, in one call.
 
 Source: protocol.md.
 """
@@ -7,7 +7,7 @@ import functools
 import inspect
 import zlib
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,33 +29,46 @@ from trap_tube_jax.scoring.tasks import (
 from trap_tube_jax.solver.search import solve_batch, take
 from trap_tube_jax.state import State
 
-BLOCK = 1024  # tasks played at once: bounds the memory, whatever their number
+BLOCK = 1024  # tasks played at once, which bounds the memory
 
-# Time, states, observations, the policy's carry, and whether all actions were in range so far.
-_Now = tuple[jax.Array, State, jax.Array, Any, jax.Array]
-
-# From a set and B of its tasks to solved bool[B] and the steps taken i32[B].
+# Maps a set and B of its tasks to solved bool[B] and the steps taken i32[B].
 Play = Callable[[TaskSet, State], tuple[np.ndarray, np.ndarray]]
 
 
 class Policy(Protocol):
-    """What `score` plays with: two pure functions of B episodes."""
+    """A policy for `score`: two pure functions of B episodes."""
 
     def initial(self, batch: int) -> Any:
-        """What the policy remembers before the first step of `batch` episodes, any pytree."""
+        """Returns the memory of `batch` episodes before their first step, any pytree of arrays."""
 
     def act(self, observation: jax.Array, carry: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """The actions i32[B, 2], (grasp, move), for observations u8[B, 12, 12, N].
+        """Chooses actions.
 
         Args:
-          observation: of every episode.
-          carry: `initial(B)`, then what the last call returned.
+          observation: u8[B, 12, 12, N].
+          carry: `initial(B)` at the first step, then the carry of the last call.
           key: PRNG key of the policy's draws.
 
         Returns:
-          The actions, and the next carry, of the same structure, shapes and types.
+          Actions integer[B, 2], (grasp, move), and the next carry of the same structure, shapes
+          and types, without NaN.
         """
         ...
+
+
+class _Episodes(NamedTuple):
+    """B episodes in play. The flags say whether actions and memory have been sound so far."""
+
+    time: jax.Array
+    states: State
+    observation: jax.Array
+    carry: Any
+    in_range: jax.Array
+    is_number: jax.Array
+
+    @property
+    def over(self) -> jax.Array:
+        return self.states.terminated | self.states.truncated
 
 
 def score(
@@ -67,19 +80,19 @@ def score(
     optimality: int = 0,
     num_features: int | None = None,
 ) -> Scores:
-    """Plays the fixed tasks of every set once, compiled, and counts what is solved.
+    """Plays the fixed tasks of every set once, compiled, and counts the solved ones.
 
     Args:
-      policy: an object with the functions of `Policy`; one of `agents.load`, for example.
+      policy: an object with the functions of `Policy`, such as `agents.load` returns.
       sets: ids or short names; the paper's eight if absent.
-      tasks: how many of each set, at least 1. A set without transfers has one.
-      seed: of the policy's draws, 0 to 2**32 - 1.
-      optimality: how many of the first tasks of each set to compare with shortest plans, which
-        are searched for first.
+      tasks: tasks per set, at least 1. A set without transfers has one.
+      seed: seed of the policy's draws, 0 to 2**32 - 1.
+      optimality: number of tasks per set, the first ones, to compare with shortest plans.
       num_features: N, feature channels of the observation; see `make`.
 
     Raises:
-      ValueError: naming the argument and what is allowed, or an invalid action.
+      ValueError: an argument is invalid; the policy returns an action out of range, or its memory
+        becomes NaN.
     """
     for name in ("initial", "act"):
         if not callable(getattr(policy, name, None)):
@@ -98,11 +111,16 @@ def score(
             program(env, take(states, block), jax.random.fold_in(key, block[0]))
             for block in blocks(total)
         ]
-        solved, length, is_valid = zip(*played, strict=True)
-        if not np.all(is_valid):
+        solved, length, in_range, is_number = zip(*played, strict=True)
+        if not np.all(in_range):
             raise ValueError(
-                f"the policy's act returned an invalid action; allowed: (grasp, move), each in "
-                f"0 to {NUM_DIRECTIONS - 1}"
+                f"the policy's act returned an invalid action on {entry.label}; allowed: "
+                f"(grasp, move), each in 0 to {NUM_DIRECTIONS - 1}"
+            )
+        if not np.all(is_number):
+            raise ValueError(
+                f"the policy's act returned a carry with NaN on {entry.label}; check that its "
+                "parameters are finite"
             )
         return np.concatenate(solved)[:total], np.concatenate(length)[:total]
 
@@ -117,21 +135,21 @@ def score_gymnasium(
     optimality: int = 0,
     num_features: int | None = None,
 ) -> Scores:
-    """As `score`, for an agent in plain Python that acts on one observation at a time.
+    """Scores an agent in plain Python, which acts on one observation at a time; see `score`.
 
     Args:
-      agent: an object with `predict(observation)` or `act(observation)`, which is given
-        u8[12, 12, N] and returns (grasp, move) or 4 * grasp + move. Where the function takes
-        `state`, it gets None at first and returns the action and the next state, as in
-        Stable-Baselines3. Where it takes `deterministic`, that is true. Where the agent has
-        `reset()`, that is called before every episode.
+      agent: an object with `predict(observation)` or `act(observation)`, which takes
+        u8[12, 12, N] and returns (grasp, move) or 4 * grasp + move. A function that takes
+        `state` gets None at first and returns the action and the next state, as in
+        Stable-Baselines3. A function that takes `deterministic` gets True. An agent's `reset()`,
+        if it has one, is called before every episode.
       sets: as for `score`.
       tasks: as for `score`.
       optimality: as for `score`.
       num_features: as for `score`.
 
     Raises:
-      ValueError: naming the argument and what is allowed, or an invalid action.
+      ValueError: an argument is invalid, or the agent returns an invalid action.
     """
     act = getattr(agent, "predict", None) or getattr(agent, "act", None)
     if not callable(act):
@@ -158,7 +176,7 @@ def _scores(
     optimality: int,
     num_features: int | None,
 ) -> Scores:
-    """The score of every set; its first `optimality` tasks are compared with shortest plans."""
+    """Scores every set, and compares its first `optimality` tasks with shortest plans."""
     if isinstance(sets, str) or not sets:
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
     check_integer("optimality", optimality, minimum=0)
@@ -179,10 +197,10 @@ def _scores(
 
 
 def blocks(total: int) -> list[np.ndarray]:
-    """The indices of `total` tasks, in blocks i64[b] that are played at once.
+    """Returns the indices of `total` tasks in blocks i64[b] that are played at once.
 
-    All are of one size, the smaller of `BLOCK` and `total`, so that they share a compilation: after
-    the last task the last block goes on with the first ones.
+    All blocks have one size, the smaller of `BLOCK` and `total`, so that they share a compilation.
+    After the last task the last block continues with the first ones.
     """
     size = min(BLOCK, total)
     return [np.arange(start, start + size) % total for start in range(0, total, size)]
@@ -190,42 +208,51 @@ def blocks(total: int) -> list[np.ndarray]:
 
 def _play(
     policy: Policy, env: Environment, states: State, key: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Plays B tasks side by side until all are over.
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Plays B tasks in lockstep until all are over.
 
     Returns:
-      Solved bool[B], the steps taken i32[B], and whether all actions of episodes that were not
-      over were in range, bool[].
+      Solved bool[B]; steps taken i32[B]; bool[], all actions of unfinished episodes were in
+      range; bool[], the policy's memory held no NaN.
     """
 
-    def step(now: _Now) -> _Now:
-        time, states, observation, carry, is_valid = now
-        over = states.terminated | states.truncated
-        action, carry = _pair(policy.act(observation, carry, jax.random.fold_in(key, time)))
-        states, timestep = jax.vmap(env.step)(states, action)
+    def step(now: _Episodes) -> _Episodes:
+        step_key = jax.random.fold_in(key, now.time)
+        action, carry = _pair(policy.act(now.observation, now.carry, step_key))
+        states, timestep = jax.vmap(env.step)(now.states, action)
         in_range = jnp.all((action >= 0) & (action < NUM_DIRECTIONS), axis=-1)
-        return time + 1, states, timestep.observation, carry, is_valid & jnp.all(in_range | over)
+        return _Episodes(
+            time=now.time + 1,
+            states=states,
+            observation=timestep.observation,
+            carry=carry,
+            in_range=now.in_range & jnp.all(in_range | now.over),
+            is_number=now.is_number & ~_has_nan(carry),
+        )
 
-    def is_on(now: _Now) -> jax.Array:
-        return ~jnp.all(now[1].terminated | now[1].truncated)
-
-    first = (
-        jnp.int32(0),
-        states,
-        jax.vmap(observe)(states),
-        policy.initial(len(states.time)),
-        jnp.array(True),
+    first = _Episodes(
+        time=jnp.int32(0),
+        states=states,
+        observation=jax.vmap(observe)(states),
+        carry=policy.initial(len(states.time)),
+        in_range=jnp.array(True),
+        is_number=jnp.array(True),
     )
-    _, states, _, _, is_valid = jax.lax.while_loop(is_on, step, first)
-    return states.terminated, states.time, is_valid
+    last = jax.lax.while_loop(lambda now: ~jnp.all(now.over), step, first)
+    return last.states.terminated, last.states.time, last.in_range, last.is_number
+
+
+def _has_nan(tree: Any) -> jax.Array:
+    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+    return jnp.any(jnp.array([jnp.any(jnp.isnan(leaf)) for leaf in leaves], bool))
 
 
 def _pair(returned: Any) -> tuple[jax.Array, Any]:
-    """What a policy's act returned, if it is a pair."""
+    """Returns the result of a policy's act if it is a pair."""
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         raise ValueError(
-            "the policy's act must return a pair (actions i32[B, 2], carry), with carry = () where "
-            f"nothing is remembered, got {type(returned).__name__}"
+            "the policy's act must return a pair (actions i32[B, 2], carry), with carry = () for a "
+            f"policy without memory, got {type(returned).__name__}"
         )
     return returned[0], returned[1]
 
@@ -233,7 +260,7 @@ def _pair(returned: Any) -> tuple[jax.Array, Any]:
 def _play_one(
     agent: Any, act: Callable[..., Any], step: Callable[..., Any], state: State
 ) -> tuple[bool, int]:
-    """Plays one task: whether it is solved, and the steps taken."""
+    """Plays one task; returns solved and the number of steps."""
     known = inspect.signature(act).parameters
     options: dict[str, Any] = {"deterministic": True} if "deterministic" in known else {}
     if callable(getattr(agent, "reset", None)):
@@ -250,7 +277,7 @@ def _play_one(
 
 
 def _grasp_and_move(action: Any) -> np.ndarray:
-    """i32[2] of (grasp, move), or of 4 * grasp + move; raises ValueError for anything else."""
+    """Converts (grasp, move) or 4 * grasp + move to i32[2]; raises ValueError for the rest."""
     array = np.asarray(action)
     count = {1: NUM_ACTIONS, 2: NUM_DIRECTIONS}.get(array.size, 0)
     if not count or array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count:
@@ -264,7 +291,7 @@ def _grasp_and_move(action: Any) -> np.ndarray:
 
 @functools.cache
 def _dynamics(max_steps: int) -> Environment:
-    """The rules under a step limit; states bring their tasks along."""
+    """Returns the rules under a step limit; the states hold the tasks."""
     return Environment(max_steps=max_steps)
 
 

@@ -1,7 +1,7 @@
 """The fixed tasks on which policies are compared, drawn with keys that training never draws.
 
-A key that training never draws may still give a task that it has seen: base is one task, {Sy}
-five, {St} and {St, Sy} one and five layouts in any colours.
+Training may still have seen an evaluation task: base is one task, {Sy} has five, {St} and
+{St, Sy} one and five layouts in any colours.
 
 Source: protocol.md, "Tasks".
 """
@@ -22,11 +22,11 @@ from trap_tube_jax.transfers import Transfer, compose
 
 Purpose = Literal["test", "validation"]
 
-# The version of the fixed tasks: what is scored under different ones does not compare.
+# The version of the fixed tasks. Scores of different versions do not compare.
 PROTOCOL = 1
 ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
-FEW_LAYOUTS = 5  # the most layouts, colours aside, of a set that counts as having few
-SETS_OF_FEW = ("base", "st", "sy", "stsy")  # of the paper's
+FEW_LAYOUTS = 5  # a set with at most as many layouts, colours aside, has few
+SETS_OF_FEW = ("base", "st", "sy", "stsy")  # among the paper's
 
 # "trap" and "tube", or "trap" and "vali". The first word of `jax.random.key(seed)` is 0 for every
 # seed from 0 to 2**32 - 1, so no seed of training leads here.
@@ -39,7 +39,7 @@ _ROOTS: dict[Purpose, np.ndarray] = {
 def evaluation_tasks(
     name: str, num_tasks: int, num_features: int | None = None, purpose: Purpose = "test"
 ) -> State:
-    """The fixed evaluation tasks of a registered set: B states, the same at every call.
+    """Returns the fixed evaluation tasks of a registered set: B states, the same at every call.
 
     B is `num_tasks`, or 1 for a set without transfers, whose tasks are all the same.
 
@@ -47,20 +47,20 @@ def evaluation_tasks(
       name: the set's id or short name.
       num_tasks: at least 1.
       num_features: N, feature channels; see `make`.
-      purpose: `test` tasks are reported; by `validation` tasks training is stopped, and its
-        best parameters are chosen.
+      purpose: `test` for tasks that are reported, `validation` for tasks that stop training and
+        select parameters.
 
     Raises:
-      ValueError: naming the value and what is allowed.
+      ValueError: an argument is invalid; the message says what is allowed.
     """
     return fixed_tasks(make(name, num_features=num_features), task_set(name).id, num_tasks, purpose)
 
 
 def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = "test") -> State:
-    """As `evaluation_tasks`, for any environment; `name` sets its tasks apart from others'.
+    """Returns the evaluation tasks of any environment; other names give other tasks.
 
-    They are the tasks that `env.reset` draws from `evaluation_keys(name, B, purpose)` where
-    `jax_threefry_partitionable` is on, as JAX has it. Here it plays no part.
+    They are the tasks that `env.reset` draws from `evaluation_keys(name, B, purpose)` under
+    `jax_threefry_partitionable`, JAX's default, whatever the setting is here.
 
     Raises:
       ValueError: `num_tasks` is below 1, or `purpose` is unknown.
@@ -77,7 +77,7 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
 
 
 def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax.Array:
-    """The PRNG keys [B] of the evaluation tasks of the set with this id.
+    """Returns the PRNG keys [B] of the evaluation tasks of the set with this id.
 
     More tasks begin with the same ones. No key serves two purposes or sets.
 
@@ -92,14 +92,15 @@ def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax
 @functools.partial(jax.jit, static_argnums=2)
 def _keys(root: jax.Array, number: jax.typing.ArrayLike, num_tasks: int) -> jax.Array:
     set_key = jax.random.fold_in(jax.random.wrap_key_data(root, impl="threefry2x32"), number)
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(set_key, jnp.arange(num_tasks))
+    indices = jnp.arange(num_tasks, dtype=jnp.uint32)
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(set_key, indices)
 
 
 def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
-    """The layout i32[B] of each task, counted from 0; None unless the set has few.
+    """Numbers the layouts of tasks from 0, i32[B]; returns None unless the set has few.
 
     A layout is a state without its colours. A set other than the paper's has few if these tasks
-    hold at most `FEW_LAYOUTS` layouts, and one of them occurs twice or there is only one task.
+    have at most `FEW_LAYOUTS` layouts, and a layout occurs twice or there is only one task.
 
     Args:
       name: the set's short name.
@@ -115,7 +116,7 @@ def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
 
 
 def label(name: str) -> str:
-    """A registered set's name in the paper's notation; any other name as it is."""
+    """Returns a registered set's name in the paper's notation, any other name unchanged."""
     known = {entry.short: entry.label for entry in map(task_set, registered_ids())}
     return known.get(name, name)
 

@@ -316,6 +316,16 @@ class Constant:
         return jnp.broadcast_to(action, (len(observation), 2)), carry + 1
 
 
+class Broken:
+    """A policy whose memory becomes NaN, as under parameters that have diverged."""
+
+    def initial(self, batch):
+        return jnp.ones((batch, 4))
+
+    def act(self, observation, carry, key):
+        return Rightward().act(observation, 0, key)[0], carry * jnp.nan
+
+
 @pytest.mark.parametrize("tasks", [2, 3])
 def test_act_must_return_a_carry(near, tasks):
     class Carryless(Random):
@@ -333,5 +343,7 @@ def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     words = ["an invalid action", "(grasp, move)", "0 to 3"]
     for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):
         assert_refused(words, tt.score, action, ["near"], 20)
+    with pytest.raises(ValueError, match="act returned a carry with NaN on near"):
+        tt.score(Broken(), ["near"], 20)
     floats = Constant([0.0, 3.0])
     assert_refused(["integer[2]", "float32[2]"], tt.score, floats, ["near"], 20)
