@@ -14,7 +14,6 @@ spaces = gymnax.environments.spaces
 wrappers = pytest.importorskip("gymnax.wrappers")
 
 import purejaxrl_loop
-
 from trap_tube_jax.adapters import to_gymnax
 
 pytestmark = pytest.mark.interop
