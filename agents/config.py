@@ -298,9 +298,10 @@ def _check_value(field: dataclasses.Field, value: Any) -> None:
     low, high = field.metadata["limits"]
     whole = "int" in str(field.type)
     kind = "an integer" if whole else "a finite number"
-    for number in value if isinstance(value, tuple) else (value,):
+    numbers: tuple[Any, ...] = value if isinstance(value, tuple) else (value,)
+    for number in numbers:
         is_number = type(number) is int or (type(number) is float and not whole)
         if not is_number or not math.isfinite(number) or not low <= number <= high:
             raise ValueError(f"{field.name} must be {kind} in [{low:g}, {high:g}], got {value!r}")
-    if field.name == "filters" and len(value) != 2:
+    if field.name == "filters" and len(numbers) != 2:
         raise ValueError(f"filters must be two integers, got {value!r}")

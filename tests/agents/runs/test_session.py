@@ -97,7 +97,7 @@ def _raise(error):
 
 
 def test_a_request_saves_and_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr(session.processes, "agree", lambda number: 2)
+    monkeypatch.setattr(session.StopSignals, "request", lambda self: 2)
     with pytest.raises(Stopped):
         train_run(tmp_path / "x", small_run(), PLAIN)
     assert final_state(tmp_path / "x")[0] == 1
