@@ -1,66 +1,42 @@
-"""The names by which `Config` knows intrinsic rewards and encoders.
-
-Kept apart from the modules that fill them, `agents.curiosity` and `agents.networks`, because those
-import `Config`. A module of your own may add to them (agents/extending.md).
-"""
+"""Names of intrinsic rewards and encoders, filled by `agents.curiosity` and `agents.networks`."""
 
 from collections.abc import Callable
 from typing import Any
 
 from trap_tube_jax.checks import check_registered_name
-from trap_tube_jax.imports import registering_file
 
 
-class Registry:
-    """Factories of one kind, by name."""
+class Registry(dict[str, Callable[..., Any]]):
+    """Factories by name: the built-in ones, and those added by `register`."""
 
     def __init__(self, kind: str):
-        """An empty table; `kind` is what messages call an entry."""
-        self.kind = kind
-        self._factories: dict[str, Callable[..., Any]] = {}
-        self._files: dict[str, str] = {}  # by name: what has registered it
+        super().__init__()
+        self.kind = kind  # in messages
+        self.own: set[str] = set()
 
     def register(self, name: str, factory: Callable[..., Any]) -> None:
-        """Makes something known by a name.
-
-        The file or notebook that has registered a name may register it again; what it registers
-        last is made from then on.
-
-        Args:
-          name: what the settings call it: letters, digits, "_", "." and "-".
-          factory: the function or class that makes it from the settings.
+        """Adds a factory of yours, or replaces the one that you registered under this name.
 
         Raises:
-          ValueError: the name is taken by the project or by another file, or has other characters,
-            or `factory` cannot be called.
+          ValueError: the name is built in or has characters other than letters, digits, "_", "."
+            and "-", or `factory` is not callable.
         """
         check_registered_name(self.kind, name)
+        if name in self and name not in self.own:
+            raise ValueError(f"{self.kind} {name!r} is built in; names taken: {', '.join(self)}")
         if not callable(factory):
-            raise ValueError(
-                f"{self.kind} {name!r} needs a function that makes it, such as `lambda *_: made`, "
-                f"got {factory!r}"
-            )
-        file = registering_file()
-        if name in self._factories and self._files.get(name) != file:
-            known = ", ".join(self.names())
-            raise ValueError(f"{self.kind} {name!r} is registered already; taken: {known}")
-        self._factories[name] = factory
-        self._files[name] = file
-
-    def names(self) -> tuple[str, ...]:
-        """All names, in the order of registration."""
-        return tuple(self._factories)
+            raise ValueError(f"{self.kind} {name!r} needs a function, got {factory!r}")
+        self[name] = factory
+        self.own.add(name)
 
     def factory(self, name: str) -> Callable[..., Any]:
-        """What was registered under this name.
-
-        Raises:
-          ValueError: nothing was.
-        """
-        if name not in self._factories:
-            known = ", ".join(self.names())
-            raise ValueError(f"unknown {self.kind} {name!r}; allowed: {known}")
-        return self._factories[name]
+        """Returns the factory of this name; ValueError lists the names if there is none."""
+        if name not in self:
+            raise ValueError(
+                f"unknown {self.kind} {name!r}; allowed: {', '.join(self)}. If a module of yours "
+                "registers it, name the module: --import MODULE, or imports=[...] in Python"
+            )
+        return self[name]
 
 
 curiosities = Registry("curiosity")

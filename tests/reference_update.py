@@ -110,7 +110,7 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
     cells = replay(initial, action)
     features = jax.vmap(lambda image: agent.encode(params, image))(jnp.asarray(images))
     embedding = agent.unroll(params, features, action, reward)
-    outputs = agent.policy_and_value(params, embedding)
+    actions, value = agent.policy_and_value(params, embedding)
     return Trajectory(
         episodes=Episodes(
             layout=initial,
@@ -122,6 +122,6 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
         ),
         features=features,
         embedding=embedding,
-        log_prob=outputs.actions.log_prob(action),
-        value=jnp.concatenate([outputs.value, jnp.full_like(outputs.value[:1], jnp.nan)]),
+        log_prob=actions.log_prob(action),
+        value=jnp.concatenate([value, jnp.full_like(value[:1], jnp.nan)]),
     )

@@ -90,10 +90,7 @@ class Policy(NamedTuple):
         features = agent.encode(self.params, observation)
         reward_tm1 = jnp.zeros(len(observation))
         embedding = agent.step(self.params, carry.embedding, features, carry.action_tm1, reward_tm1)
-        outputs = agent.policy_and_value(self.params, embedding)
-        if key is None or self.greedy:
-            action = outputs.actions.mode()
-        else:
-            action = outputs.actions.sample(key)
+        actions, _ = agent.policy_and_value(self.params, embedding)
+        action = actions.mode() if key is None or self.greedy else actions.sample(key)
         after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first))
         return jax.vmap(Frame.original_action)(frame, action), after

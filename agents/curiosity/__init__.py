@@ -1,4 +1,4 @@
-"""Intrinsic rewards, one module each, by the names that `Config.curiosity` knows."""
+"""Intrinsic rewards, one module each, with the names that `Config.curiosity` allows."""
 
 from agents.curiosity.base import Curiosity, Experience
 from agents.curiosity.counts import Counts
@@ -15,12 +15,16 @@ __all__ = ["Curiosity", "Experience", "register"]
 
 register = curiosities.register
 
-register("icm", lambda config, env: ICM(config))
-register("icm-detached", lambda config, env: DetachedICM(config))
-register("rnd", lambda config, env: RND(config))
-register("noveld", lambda config, env: NovelD(config))
-register("ride", lambda config, env: RIDE(config))
-register("e3b", lambda config, env: E3B(config))
-register("effects", lambda config, env: Effects(config))
-register("counts", lambda config, env: Counts(env))
-register("none", lambda config, env: Curiosity())
+curiosities.update(
+    {
+        "icm": lambda config, env: ICM(config),
+        "icm-detached": lambda config, env: DetachedICM(config),
+        "rnd": lambda config, env: RND(config),
+        "noveld": lambda config, env: NovelD(config),
+        "ride": lambda config, env: RIDE(config),
+        "e3b": lambda config, env: E3B(config),
+        "effects": lambda config, env: Effects(config),
+        "counts": lambda config, env: Counts(env),
+        "none": lambda config, env: Curiosity(),
+    }
+)

@@ -26,7 +26,7 @@ def algorithms() -> dict[str, dict[str, Any]]:
     `ppo` is PPO alone. `+<curiosity>` adds that curiosity, with the preset's weight. `preset` is
     the preset as it is.
     """
-    named = {f"ppo+{name}": {"curiosity": name} for name in curiosities.names() if name != "none"}
+    named = {f"ppo+{name}": {"curiosity": name} for name in curiosities if name != "none"}
     return {"ppo": {"curiosity": "none"}, **named, PRESET: {}}
 
 

@@ -1,4 +1,4 @@
-"""The policy network; its encoders by the names that `Config.encoder` knows."""
+"""The policy network. Its encoders have the names that `Config.encoder` allows."""
 
 import flax.linen as nn
 
@@ -11,10 +11,10 @@ __all__ = ["make_encoder", "register"]
 
 register = encoders.register
 
-register("paper", lambda config: Encoder(config.filters))
-register("objects", lambda config: ObjectEncoder(config.filters))
+encoders["paper"] = lambda config: Encoder(config.filters)
+encoders["objects"] = lambda config: ObjectEncoder(config.filters)
 
 
 def make_encoder(config: Config) -> nn.Module:
-    """A new encoder of the kind `config.encoder`."""
+    """Makes an encoder of the kind `config.encoder`."""
     return encoders.factory(config.encoder)(config)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from agents.config import Config
 from agents.networks import make_encoder
-from agents.networks.core import Core, Heads, Outputs
+from agents.networks.actions import ActionDistribution
+from agents.networks.core import Core, Heads
 from agents.networks.layers import draw
 from agents.networks.windows import encode_rows
 from trap_tube_jax.objects import BOARD_SIZE
@@ -20,37 +21,29 @@ PARTS = ("encoder", "core", "heads")  # of the parameters of the policy network
 
 
 class Agent:
-    """The functions of the policy network; holds its modules, never parameters.
+    """Functions of the policy network; their parameters are a dictionary of `PARTS`.
 
-    Parameters are a dictionary of `PARTS`; other entries are ignored.
-
-    Attributes:
-      config: the settings. Whoever plays heeds `align_to_food` and `chunk`, which are not done here.
+    The rollout applies `align_to_food` and `encode_chunk_size`; these functions do not.
     """
 
     def __init__(self, config: Config):
+        self.config = config
         self.encoder = make_encoder(config)
         self.core = Core(config.hidden, config.embedding, config.recurrent)
         self.heads = Heads(config.num_value_heads)
-        self.config = config
 
     @functools.cached_property
     def width(self) -> int:
-        """F, how many features an observation is encoded to."""
-
-        def encode() -> Any:
-            return self.encoder.init_with_output(jax.random.key(0), self._board())[0]
-
-        return jax.eval_shape(encode).shape[-1]
+        """F, the number of features of an encoded observation."""
+        init = functools.partial(self.encoder.init_with_output, jax.random.key(0))
+        return jax.eval_shape(init, self._board())[0].shape[-1]
 
     def init(self, key: jax.Array) -> Params:
-        """Fresh parameters."""
-        # Layers of Flax in an encoder of your own draw with this key; those here leave that to
-        # `draw` and use no key.
-        encoder_key = jax.random.fold_in(key, 0)
-        features, encoder = self.encoder.init_with_output(encoder_key, self._board())
-        state = jnp.zeros((1, self.config.hidden))
-        action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
+        """Draws the parameters."""
+        # Only layers of Flax, in an encoder of your own, use the folded key; see `draw`.
+        features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), self._board())
+        state = jnp.zeros((1, self.config.hidden), jnp.float32)
+        action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
         params = {
             "encoder": encoder,
             "core": self.core.init(key, state, features, action, reward),
@@ -59,11 +52,11 @@ class Agent:
         return draw(key, params)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Features f32[M, F] of observations u8[M, 12, 12, N]; reads `params["encoder"]`."""
+        """Encodes observations u8[M, 12, 12, N] to f32[M, F]; reads `params["encoder"]` alone."""
         return _apply(self.encoder, params["encoder"], observation)
 
     def encode_rows(self, params: Params, observation: jax.Array, remembered: Any = None) -> Any:
-        """The same by the fast path; a row function, see `chunks.RowFn`."""
+        """Does the same by the fast path; see `windows.encode_rows`."""
         return encode_rows(self.encoder, params["encoder"], observation, remembered)
 
     def step(
@@ -74,39 +67,29 @@ class Agent:
         action_tm1: jax.Array,
         reward_tm1: jax.Array,
     ) -> jax.Array:
-        """The GRU's state f32[..., hidden] after a step.
-
-        Args:
-          params: the parameters.
-          state: f32[..., hidden], the state before it.
-          features: f32[..., F], the encoded observation.
-          action_tm1: i32[..., 2], the previous (grasp, move); zeros at the first step.
-          reward_tm1: f32[...], the previous reward; 0 at the first step.
-        """
+        """Returns the GRU's state f32[..., hidden] after a step; see `Core.inputs`."""
         return _apply(self.core, params["core"], state, features, action_tm1, reward_tm1)
 
     def initial_state(self, params: Params, batch: int) -> jax.Array:
-        """The GRU's state f32[batch, hidden] before the first step."""
+        """Returns the GRU's state f32[batch, hidden] before the first step."""
         return _apply(self.core, params["core"], batch, method=Core.initial_state)
 
-    def policy_and_value(self, params: Params, embedding: jax.Array) -> Outputs:
-        """Distribution of actions and value of an embedding f32[..., hidden]."""
-        return _apply(self.heads, params["heads"], embedding)
+    def policy_and_value(
+        self, params: Params, state: jax.Array
+    ) -> tuple[ActionDistribution, jax.Array]:
+        """Returns actions and values f32[..., V] at states f32[..., hidden] of the GRU."""
+        return _apply(self.heads, params["heads"], state)
 
     def embed_action(self, params: Params, action: jax.Array) -> jax.Array:
-        """The embeddings f32[..., E] of actions i32[..., 2]."""
+        """Embeds actions i32[..., 2] to f32[..., 2 * embedding]."""
         return _apply(self.core, params["core"], action, method=Core.embed_action)
 
     def unroll(
         self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
     ) -> jax.Array:
-        """The GRU's outputs h at every step, f32[T, B, hidden].
+        """Returns the GRU's outputs h at every step, f32[T, B, hidden].
 
-        Args:
-          params: the parameters.
-          features: f32[T + 1, B, F].
-          action: i32[T, B, 2].
-          reward: f32[T, B].
+        Features are f32[T + 1, B, F], actions i32[T, B, 2], rewards f32[T, B].
         """
         inputs = self._unroll_inputs(params, features, action, reward)[:-1]
         return _apply(self.core, params["core"], inputs, method=Core.unroll)
@@ -114,43 +97,32 @@ class Agent:
     def unroll_both(
         self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The GRU's outputs h at every step and h' after it, each f32[T, B, hidden].
+        """Returns h at every step and h' after it, each f32[T, B, hidden].
 
         h' starts from the initial state at the second observation, with the action and reward
         just taken as the previous ones (agents/agent.md, "Curiosity").
-
-        Args:
-          params: the parameters.
-          features: f32[T + 1, B, F].
-          action: i32[T, B, 2].
-          reward: f32[T, B].
         """
         inputs = self._unroll_inputs(params, features, action, reward)
         both = jnp.concatenate([inputs[:-1], inputs[1:]], axis=1)
-        embeddings = _apply(self.core, params["core"], both, method=Core.unroll)
-        now, after = jnp.split(embeddings, 2, axis=1)
+        now, after = jnp.split(_apply(self.core, params["core"], both, method=Core.unroll), 2, 1)
         return now, after
-
-    def _board(self) -> jax.Array:
-        """An observation, which stands for any other."""
-        return jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
 
     def _unroll_inputs(
         self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
     ) -> jax.Array:
-        """The GRU's inputs at all observations, f32[T + 1, B, 3 * hidden]."""
-        action_tm1 = jnp.concatenate([jnp.zeros_like(action[:1]), action])
-        reward_tm1 = jnp.concatenate([jnp.zeros_like(reward[:1]), reward])
-        return _apply(
-            self.core, params["core"], features, action_tm1, reward_tm1, method=Core.inputs
-        )
+        """Returns the GRU's inputs at all observations, f32[T + 1, B, 3 * hidden]."""
+        tm1 = [jnp.concatenate([jnp.zeros_like(x[:1]), x]) for x in (action, reward)]
+        return _apply(self.core, params["core"], features, *tm1, method=Core.inputs)
+
+    def _board(self) -> jax.Array:
+        """Returns an observation, for its shape."""
+        return jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
 
 
 def num_parameters(params: Params) -> int:
-    """The number of scalars in `params`."""
+    """Returns the number of scalars in `params`."""
     return sum(leaf.size for leaf in jax.tree.leaves(params))
 
 
 def _apply(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
-    """`module.apply`, whose static type says nothing of what it returns."""
-    return module.apply(*args, **kwargs)
+    return module.apply(*args, **kwargs)  # typed as anything

@@ -1,56 +1,39 @@
-"""A function of rows, computed chunk by chunk for as many rows as there are, with a derivative.
+"""Fast path: `map_rows` computes a function of rows for the first of them alone, and its gradient.
 
-The encoder is a function of the observation alone, takes nearly all of the time, and observations
-repeat. So distinct observations are put first, and only those are encoded: in chunks of fixed
-size, whose number depends on the data. Loops of varying length have no derivative in JAX;
-`map_rows` brings its own, and remembers for it what is costly to compute.
+Observations repeat, and encoding them takes nearly all of the time. So distinct observations are
+put first, and only those are encoded, in chunks of fixed size whose number depends on the data.
+JAX does not differentiate loops of varying length; `map_rows` does it here, and remembers for it
+results that are costly to compute (20 % of a gradient step).
 """
 
 import functools
 import math
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-REMEMBERED_BYTES = 2**26  # by one `map_rows`; changes speed and nothing else
+REMEMBERED_BYTES = 2**26  # by one `map_rows`; affects speed alone
 
-
-class RowFn(Protocol):
-    """What `map_rows` maps: rows to features, row by row."""
-
-    def __call__(self, params: Any, rows: Any, remembered: Any, /) -> tuple[Any, Any]:
-        """Maps rows, arrays [chunk, ...], to features and what to remember of them.
-
-        Args:
-          params: any pytree.
-          rows: pytree of arrays [chunk, ...].
-          remembered: None, or what an earlier call with the same arguments returned, to save
-            computing it again (`recall`).
-
-        Returns:
-          A pytree of arrays [chunk, ...], the features; and a pytree of arrays, or None where
-          there is nothing to remember.
-        """
-        ...
+RowFn = Callable[[Any, Any, Any], tuple[Any, Any]]  # see `map_rows`
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
-    """`fn` on the first `count` rows, a chunk at a time; zeros below.
-
-    Differentiable with respect to `params` only. What `fn` wants remembered is, as far as
-    `REMEMBERED_BYTES` go; for the rows after that, the derivative calls it once more.
+    """Applies `fn` to the first `count` rows, a chunk at a time; differentiable by `params` only.
 
     Args:
-      fn: see `RowFn`.
+      fn: maps (params, rows, remembered), rows being arrays [chunk, ...], to features, a pytree of
+        arrays [chunk, ...], and to what to remember of these rows, a pytree of arrays or None.
+        `remembered` is None, or an earlier result for the same arguments, to `recall`.
       chunk: rows per call of `fn`; M where there are fewer.
       params: any pytree.
       rows: pytree of arrays [M, ...].
       count: i32[], at most M.
 
     Returns:
-      The features, a pytree of arrays [M, ...].
+      The features, a pytree of arrays [M, ...]; zeros from the end of the last chunk on.
     """
     return _map_rows_forward(fn, chunk, params, rows, count)[0]
 
@@ -58,21 +41,19 @@ def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) ->
 def _map_rows_forward(
     fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array
 ) -> tuple[Any, Any]:
-    num_rows = len(jax.tree.leaves(rows)[0])
-    chunk = min(chunk, num_rows)
-    padded = _pad_rows(rows, chunk)
-    num_chunks = len(jax.tree.leaves(padded)[0]) // chunk
-    shapes = jax.eval_shape(fn, params, _take(padded, 0, chunk), None)
+    parts, num_chunks, chunk = _cut(rows, chunk)
+    shapes = jax.eval_shape(fn, params, _at(parts, 0), None)
     num_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes[1]))
     num_remembered = min(REMEMBERED_BYTES // max(num_bytes, 1), num_chunks)
 
-    def body(index: jax.Array, outputs: tuple[Any, Any]) -> tuple[Any, Any]:
-        features, memory = fn(params, _take(padded, index, chunk), None)
-        place = jnp.minimum(index, num_remembered)  # one more place, for all that are not kept
-        return _put(outputs[0], index, features), _put(outputs[1], place, memory)
+    def body(index: jax.Array, tables: tuple[Any, Any]) -> tuple[Any, Any]:
+        features, memory = fn(params, _at(parts, index), None)
+        place = jnp.minimum(index, num_remembered)  # the last place is for all others
+        return _put(tables[0], index, features), _put(tables[1], place, memory)
 
-    outputs = _zeros(num_chunks, shapes[0]), _zeros(num_remembered + 1, shapes[1])
-    features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, outputs)
+    zeros = _zeros(num_chunks, shapes[0]), _zeros(num_remembered + 1, shapes[1])
+    features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, zeros)
+    num_rows = len(jax.tree.leaves(rows)[0])
     features = jax.tree.map(lambda x: jax.lax.collapse(x, 0, 2)[:num_rows], features)
     return features, (params, rows, count, memory)
 
@@ -81,20 +62,17 @@ def _map_rows_backward(
     fn: RowFn, chunk: int, residuals: Any, cotangent: Any
 ) -> tuple[Any, None, None]:
     params, rows, count, memory = residuals
-    chunk = min(chunk, len(jax.tree.leaves(rows)[0]))
-    rows, cotangent = _pad_rows((rows, cotangent), chunk)
+    (parts, cotangents), num_chunks, chunk = _cut((rows, cotangent), chunk)
     num_remembered = min((len(kept) - 1 for kept in jax.tree.leaves(memory)), default=math.inf)
 
     def body(index: jax.Array, gradient: Any) -> Any:
-        part = _take(rows, index, chunk)
-        remembered = jax.tree.map(lambda kept: kept[index], memory)
-        if num_remembered < len(jax.tree.leaves(rows)[0]) // chunk:
+        part, remembered = _at(parts, index), _at(memory, index)
+        if num_remembered < num_chunks:
             remembered = jax.lax.cond(
                 index < num_remembered, lambda: remembered, lambda: fn(params, part, None)[1]
             )
         _, pullback = jax.vjp(lambda p: fn(p, part, remembered)[0], params)
-        (contribution,) = pullback(_take(cotangent, index, chunk))
-        return jax.tree.map(jnp.add, gradient, contribution)
+        return jax.tree.map(jnp.add, gradient, *pullback(_at(cotangents, index)))
 
     zero = jax.tree.map(jnp.zeros_like, params)
     return jax.lax.fori_loop(0, _num_chunks(count, chunk), body, zero), None, None
@@ -105,7 +83,7 @@ map_rows.defvjp(_map_rows_forward, _map_rows_backward)
 
 @jax.custom_jvp
 def recall(value: jax.Array, remembered: jax.Array) -> jax.Array:
-    """`remembered` in place of the equal `value`, which is differentiated but not computed."""
+    """Returns `remembered` for the equal `value`, which is differentiated but not computed."""
     return remembered
 
 
@@ -116,7 +94,7 @@ def _(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
 
 @jax.custom_batching.custom_vmap
 def shared_maximum(x: jax.Array) -> jax.Array:
-    """The maximum of a scalar over all vmapped axes, the same in every batch element.
+    """Returns the maximum of a scalar over all vmapped axes, unbatched.
 
     A loop whose trip count differs between batch elements has to carry both outcomes of
     every element through selects; one that runs as long as the longest does not.
@@ -133,19 +111,24 @@ def _num_chunks(count: jax.Array, chunk: int) -> jax.Array:
     return shared_maximum((count + chunk - 1) // chunk)
 
 
-def _pad_rows(rows: Any, chunk: int) -> Any:
-    """Adds zero rows up to a multiple of `chunk`."""
+def _cut(rows: Any, chunk: int) -> tuple[Any, int, int]:
+    """Cuts arrays [M, ...] into [num_chunks, chunk, ...], padded with zeros.
 
-    def pad(x: jax.Array) -> jax.Array:
-        return jnp.pad(x, [(0, -len(x) % chunk)] + [(0, 0)] * (x.ndim - 1))
+    Also returns num_chunks, and chunk, which is M if there are fewer rows.
+    """
+    num_rows = len(jax.tree.leaves(rows)[0])
+    chunk = min(chunk, num_rows)
+    num_chunks = -(-num_rows // chunk)
 
-    return jax.tree.map(pad, rows)
+    def cut(x: jax.Array) -> jax.Array:
+        x = jnp.pad(x, [(0, num_chunks * chunk - num_rows)] + [(0, 0)] * (x.ndim - 1))
+        return x.reshape(num_chunks, chunk, *x.shape[1:])
+
+    return jax.tree.map(cut, rows), num_chunks, chunk
 
 
-def _take(rows: Any, index: jax.Array | int, chunk: int) -> Any:
-    return jax.tree.map(
-        lambda x: jax.lax.dynamic_slice_in_dim(x, index * chunk, chunk, axis=0), rows
-    )
+def _at(tree: Any, index: jax.Array | int) -> Any:
+    return jax.tree.map(lambda x: x[index], tree)
 
 
 def _put(table: Any, place: jax.Array, rows: Any) -> Any:

@@ -1,13 +1,12 @@
-"""The agent's network beyond its encoder: the recurrent core and the heads.
+"""The recurrent core and the heads of the policy network.
 
-The parts are separate modules because they are evaluated separately: the encoder once per
-distinct observation, the core once per step, the heads where action or value is needed.
+They are apart from the encoder because it runs once per distinct observation, the core once per
+step, and the heads where an action or a value is needed.
 
 Source: paper, section "Results"; agents/agent.md, "Network".
 """
 
 import functools
-from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -18,29 +17,17 @@ from agents.networks.layers import as_row, dense, hidden_init, output_dense
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
-class Outputs(NamedTuple):
-    """What the heads yield.
-
-    Attributes:
-      actions: the policy's distribution of actions, leading axes [...].
-      value: f32[..., V], of each stream of rewards.
-    """
-
-    actions: ActionDistribution
-    value: jax.Array
-
-
 class Core(nn.Module):
-    """The recurrent part: mixes features, previous action and previous reward; then a GRU.
+    """Mixes features, previous action and previous reward, and feeds them to a GRU.
 
-    The GRU is of the "reset after" form, with a bias on either side:
-      z, r, n = x W + b_0 and z', r', n' = h R + b_1, split in three;
+    The GRU is of the "reset after" form, with two biases:
+      z, r, n = x W + b_0 and z', r', n' = h R + b_1, each split in three;
       h_t = s(z + z') h_tm1 + (1 - s(z + z')) tanh(n + s(r + r') n').
 
     Attributes:
       hidden: units of the GRU and of the layer before it.
       embedding: units of each action embedding and of the reward's.
-      recurrent: whether the state lasts; without, every step begins with the first one.
+      recurrent: keeps the state between steps; otherwise every step begins with the initial one.
     """
 
     hidden: int
@@ -59,27 +46,24 @@ class Core(nn.Module):
         gates = 3 * self.hidden
         self.input_kernel = self.param("input_kernel", hidden_init, (self.hidden, gates))
         self.state_kernel = self.param("state_kernel", hidden_init, (self.hidden, gates))
-        self.bias = self.param("bias", nn.initializers.zeros, (2, gates))
-        self.initial = self.param("initial", nn.initializers.zeros, (self.hidden,))
+        self.bias = self.param("bias", nn.initializers.zeros, (2, gates), jnp.float32)
+        self.initial = self.param("initial", nn.initializers.zeros, (self.hidden,), jnp.float32)
 
     def __call__(
         self, state: jax.Array, features: jax.Array, action_tm1: jax.Array, reward_tm1: jax.Array
     ) -> jax.Array:
-        """The state f32[..., hidden] after one step; see `inputs` and `advance`."""
+        """Returns the state f32[..., hidden] after one step; see `inputs` and `advance`."""
         return self.advance(state, self.inputs(features, action_tm1, reward_tm1))
 
     def inputs(
         self, features: jax.Array, action_tm1: jax.Array, reward_tm1: jax.Array
     ) -> jax.Array:
-        """The GRU's input side, for any number of steps at once.
+        """Computes x W + b_0, f32[..., 3 * hidden], for any number of steps at once.
 
         Args:
           features: f32[..., F], the encoded observation.
           action_tm1: i32[..., 2], the previous (grasp, move); zeros at the first step.
           reward_tm1: f32[...], the previous reward; 0 at the first step.
-
-        Returns:
-          f32[..., 3 * hidden].
         """
         reward = nn.swish(self.reward_embedding(reward_tm1[..., None]))
         parts = [features, self.embed_action(action_tm1), reward]
@@ -87,16 +71,16 @@ class Core(nn.Module):
         return x @ self.input_kernel + as_row(self.bias[0], x.ndim)
 
     def embed_action(self, action: jax.Array) -> jax.Array:
-        """The embeddings f32[..., 2 * embedding] of an action i32[..., 2]."""
+        """Embeds actions i32[..., 2] to f32[..., 2 * embedding]."""
         grasp = self.grasp_embedding(action[..., 0])
         return jnp.concatenate([grasp, self.move_embedding(action[..., 1])], axis=-1)
 
     def initial_state(self, *batch: int) -> jax.Array:
-        """The learned state before the first step, f32[*batch, hidden]."""
+        """Returns the learned state before the first step, f32[*batch, hidden]."""
         return jnp.broadcast_to(self.initial, (*batch, self.hidden))
 
     def advance(self, state: jax.Array, inputs: jax.Array) -> jax.Array:
-        """One step of the GRU: f32[..., hidden], f32[..., 3 * hidden] -> f32[..., hidden]."""
+        """Returns the state f32[..., hidden] after a step with inputs f32[..., 3 * hidden]."""
         if not self.recurrent:
             state = self.initial_state(*state.shape[:-1])
         recurrent = state @ self.state_kernel + as_row(self.bias[1], state.ndim)
@@ -108,7 +92,7 @@ class Core(nn.Module):
         return update * state + (1 - update) * candidate
 
     def unroll(self, inputs: jax.Array) -> jax.Array:
-        """The GRU over time from the initial state: f32[T, B, 3 * hidden] -> f32[T, B, hidden]."""
+        """Runs the GRU from the initial state: f32[T, B, 3 * hidden] to f32[T, B, hidden]."""
 
         def body(state: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
             state = self.advance(state, x)
@@ -118,18 +102,14 @@ class Core(nn.Module):
 
 
 class Heads(nn.Module):
-    """Grasp logits, move logits and values, each one layer from the embedding.
+    """Grasp logits, move logits and V values, each one layer from the GRU's state."""
 
-    Attributes:
-      streams: V, how many streams of rewards have a value each.
-    """
-
-    streams: int = 1
+    num_values: int = 1
 
     @nn.compact
-    def __call__(self, embedding: jax.Array) -> Outputs:
-        """Maps f32[..., hidden] to `Outputs`."""
-        grasp = output_dense(NUM_DIRECTIONS, name="grasp")(embedding)
-        move = output_dense(NUM_DIRECTIONS, name="move")(embedding)
-        value = output_dense(self.streams, name="value")(embedding)
-        return Outputs(ActionDistribution(grasp, move), value)
+    def __call__(self, state: jax.Array) -> tuple[ActionDistribution, jax.Array]:
+        """Maps f32[..., hidden] to the distribution of actions and the values f32[..., V]."""
+        grasp = output_dense(NUM_DIRECTIONS, name="grasp")(state)
+        move = output_dense(NUM_DIRECTIONS, name="move")(state)
+        value = output_dense(self.num_values, name="value")(state)
+        return ActionDistribution(grasp, move), value

@@ -27,7 +27,9 @@ class Encoder(nn.Module):
     def __call__(self, observation: jax.Array) -> jax.Array:
         """Encodes u8[M, 12, 12, N] to f32[M, filters[1]]."""
         first, later = self.filters
-        x = scaled_with_coordinates(observation)
+        cells = jnp.asarray(coordinates_of_cells())
+        cells = jnp.broadcast_to(cells, (*observation.shape[:-1], cells.shape[-1]))
+        x = jnp.concatenate([scaled(observation), cells], axis=-1)
         x = nn.swish(Conv(first, 2, name="conv1")(x))
         x = nn.swish(Conv(later, 2, name="conv2")(x))
         x = max_pool(x)
@@ -38,11 +40,7 @@ class Encoder(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """x + conv3x3(swish(conv3x3(swish(x)))), channels kept.
-
-    Attributes:
-      channels: C.
-    """
+    """x + conv3x3(swish(conv3x3(swish(x)))), for `channels` channels."""
 
     channels: int
 
@@ -53,24 +51,16 @@ class ResidualBlock(nn.Module):
         return x + Conv(self.channels, 3, name="conv2")(nn.swish(y))
 
 
-def scaled_with_coordinates(observation: jax.Array) -> jax.Array:
-    """u8[M, 12, 12, N] to f32[M, 12, 12, N + 3], all in [-1, 1].
-
-    The channels after the N features are column, row and their Euclidean norm, each
-    divided by its maximum and rescaled.
-    """
-    coordinates = jnp.asarray(coordinates_of_cells())
-    shape = (*observation.shape[:-1], coordinates.shape[-1])
-    return jnp.concatenate([scaled(observation), jnp.broadcast_to(coordinates, shape)], axis=-1)
-
-
 def scaled(observation: jax.Array) -> jax.Array:
-    """u8[...] to f32[...] in [-1, 1]."""
+    """Maps u8[...] to f32[...] in [-1, 1]."""
     return observation.astype(jnp.float32) / 127.5 - 1
 
 
 def coordinates_of_cells() -> np.ndarray:
-    """f32[12, 12, 3]: column, row and their norm at every cell, all in [-1, 1]."""
+    """Returns column, row and their Euclidean norm at every cell, f32[12, 12, 3].
+
+    Each is divided by its maximum and rescaled to [-1, 1].
+    """
     row, column = np.indices((BOARD_SIZE, BOARD_SIZE)) / (BOARD_SIZE - 1)
     radius = np.hypot(row, column)
     coordinates = 2 * np.stack([column, row, radius / radius.max()], axis=-1) - 1

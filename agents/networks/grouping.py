@@ -1,4 +1,4 @@
-"""Which of many elements or rows are equal, and hashes of rows."""
+"""Groups of equal elements or rows, and hashes of rows."""
 
 import functools
 from typing import NamedTuple
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-GROUPING_BITS = 16  # of a hash, in the table that `group_rows` looks up
+GROUPING_BITS = 16  # of a hash, in the table of `group_rows`
 
 
 class Groups(NamedTuple):
@@ -17,7 +17,7 @@ class Groups(NamedTuple):
     Attributes:
       number: i32[M], the group of every element, counted from 0.
       representative: i32[M], an element of each group; only the first `total` count.
-      total: i32[], how many groups there are.
+      total: i32[], the number of groups.
     """
 
     number: jax.Array
@@ -30,9 +30,9 @@ def group(*keys: jax.Array) -> Groups:
     chex.assert_rank(keys, 1)
     chex.assert_equal_shape(keys)
     size = keys[0].size
-    *ordered, element = jax.lax.sort((*keys, jnp.arange(size)), num_keys=len(keys))
-    first = functools.reduce(jnp.logical_or, (_differs_from_previous(key) for key in ordered))
-    number = jnp.cumsum(first, dtype=jnp.int32) - 1
+    *ordered, element = jax.lax.sort((*keys, jnp.arange(size, dtype=jnp.int32)), num_keys=len(keys))
+    differs = [jnp.concatenate([jnp.ones(1, bool), key[1:] != key[:-1]]) for key in ordered]
+    number = jnp.cumsum(functools.reduce(jnp.logical_or, differs), dtype=jnp.int32) - 1
     zeros = jnp.zeros(size, jnp.int32)
     return Groups(
         number=zeros.at[element].set(number, unique_indices=True),
@@ -42,12 +42,12 @@ def group(*keys: jax.Array) -> Groups:
 
 
 def group_rows(content: jax.Array) -> Groups:
-    """Groups rows integer[M, K] that agree everywhere.
+    """Groups rows integer[M, K] that agree everywhere, faster than `group` but not completely.
 
     Each row is compared with one row of the same hash, and joins its group if the two are equal.
     Different rows are never in one group. Equal rows may be in two if hashes collide.
     """
-    own = jnp.arange(len(content))
+    own = jnp.arange(len(content), dtype=jnp.int32)
     slot = slots(content, GROUPING_BITS)
     known = jnp.zeros(2**GROUPING_BITS, jnp.int32).at[slot].max(own)[slot]
     known = jnp.where(jnp.all(content[known] == content, axis=1), known, own)
@@ -62,17 +62,12 @@ def group_rows(content: jax.Array) -> Groups:
 
 
 def slots(content: jax.Array, bits: int) -> jax.Array:
-    """A hash i32[...] of rows integer[..., K], below 2**bits, to look them up in a table by."""
-    return (hash_rows(content) >> (32 - bits)).astype(jnp.int32)
+    """Hashes rows integer[..., K] to i32[...] below 2**bits, places in a table."""
+    return (hash_rows(content) >> np.uint32(32 - bits)).astype(jnp.int32)
 
 
 def hash_rows(content: jax.Array) -> jax.Array:
-    """A hash u32[...] of every row of integer[..., K]; its high bits are the best."""
+    """Hashes rows integer[..., K] to u32[...]; the high bits are the best."""
     weights = np.random.default_rng(0).integers(1, 2**32, content.shape[-1], np.uint32)
     weights = weights.reshape((1,) * (content.ndim - 1) + (-1,))
     return jnp.sum(content.astype(jnp.uint32) * weights, axis=-1, dtype=jnp.uint32)
-
-
-def _differs_from_previous(key: jax.Array) -> jax.Array:
-    """bool[M]: whether an element differs from the one before it; true at the first."""
-    return jnp.concatenate([jnp.ones(1, bool), key[1:] != key[:-1]])

@@ -161,7 +161,7 @@ def test_encoders_of_a_curiosity_are_of_the_kind_of_the_policys(name):
 
 
 def test_every_name_makes_a_curiosity():
-    names = registry.curiosities.names()
+    names = registry.curiosities
     assert {"noveld", "ride", "e3b"} <= set(names)
     for name in names:
         assert isinstance(learner_of(name).curiosity, curiosity.Curiosity)

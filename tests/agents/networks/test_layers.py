@@ -1,164 +1,63 @@
-"""What imports what: downward only, and little at the top."""
+"""Initial parameters: their scale, their independence, and layers of Flax among them."""
 
-import ast
-import graphlib
-import json
-import os
-import pathlib
-import subprocess
-import sys
+from typing import Any
 
-import pytest
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
 
-from paths import ROOT
-
-MAY_IMPORT = {
-    "trap_tube_jax": {"trap_tube_jax"},
-    "agents": {"agents", "trap_tube_jax"},
-    "benchmarks": {"benchmarks", "agents", "trap_tube_jax"},
-}
-# Lower rooms never import higher ones. Modules of a package itself are rooms of their own. The
-# environment's rooms are those of CONTRIBUTING.md, and so are the agents'.
-ENVIRONMENT = (
-    ("_version", "checks", "imports", "command_line", "tables"),
-    ("objects", "geometry", "prng"),
-    ("state", "positions"),
-    ("dynamics", "layouts", "transfers", "graded", "observation"),
-    ("environment", "wrappers", "vector"),
-    ("controls", "registry"),
-    ("rendering", "solver"),
-    ("scoring",),
-    ("adapters", "contact_sheet", "gallery", "play"),
-)
-AGENTS = (
-    ("registry",),
-    ("config",),
-    ("parallel",),
-    ("networks",),
-    ("acting",),
-    ("curiosity",),
-    ("ppo",),
-    ("pretrained", "runs", "evaluate"),
-    ("train",),
-    ("experiments",),
-    ("profiles",),
-    ("profile",),
-    ("sweep", "examples"),
-)
-LEARNING = ("registry", "config", "parallel", "networks", "acting", "curiosity", "ppo")
-SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
-# The project's other dependencies, and what only its extras install.
-HEAVY = {"PIL", "chex", "gymnasium", "gymnax", "matplotlib", "optax", "orbax", "tyro"}
+from agents import Config
+from agents.curiosity.icm import ForwardModel, InverseModel
+from agents.networks import make_encoder
+from agents.networks.core import Core, Heads
+from agents.networks.layers import dense, draw, init_module, output_dense
 
 
-def module_name(path: pathlib.Path) -> str:
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+def test_kernels_have_the_variance_of_their_layer_and_biases_are_zero():
+    for layer, scale in ((dense(300), 2.0), (output_dense(300), 1.0)):
+        params = init_module(layer, jax.random.key(0), jnp.zeros((1, 200)))["params"]
+        std = np.sqrt(scale / 200)
+        np.testing.assert_allclose(np.std(params["kernel"]), std, rtol=0.02)
+        assert np.abs(params["kernel"]).max() < 2 * std / 0.879
+        np.testing.assert_array_equal(params["bias"], 0)
 
 
-MODULES = {module_name(path) for path in SOURCES}
+def scales(module: nn.Module, *inputs: Any) -> dict[str, float]:
+    """Returns by path each parameter's standard deviation times the root of its fan-in."""
+    found = {}
+    params = module.init(jax.random.key(0), *inputs)["params"]
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        (scale,) = set(np.ravel(leaf * np.sqrt(np.prod(leaf.shape[:-1]))).tolist())
+        found["/".join(part.key for part in path)] = round(float(scale), 4)
+    return found
 
 
-def imported_modules(path: pathlib.Path, tree: ast.AST) -> set[str]:
-    """Absolute names of the imported modules, with relative imports resolved."""
-    package = module_name(path).split(".")
-    if path.name != "__init__.py":
-        package = package[:-1]
-    names = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            above = package[: len(package) - node.level + 1] if node.level else []
-            module = ".".join([*above, *([node.module] if node.module else [])])
-            for alias in node.names:
-                submodule = f"{module}.{alias.name}"
-                names.add(submodule if submodule in MODULES else module)
-    return names
+def test_every_layer_has_the_scale_of_the_table_in_agent_md():
+    h, a = jnp.zeros((1, 64)), jnp.zeros((1, 16))
+    board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
+    core = scales(Core(64, 8), h, h, jnp.zeros((1, 2), jnp.int32), jnp.zeros(1))
+    encoder = scales(make_encoder(Config()), board)
+    forward, inverse = scales(ForwardModel(), h, a), scales(InverseModel(64), h, h)
+    biases = ("bias", "initial")
+    for part in (core, encoder, forward, inverse, heads := scales(Heads(), h)):
+        for name in [name for name in part if name.endswith(biases)]:
+            assert part.pop(name) == 0
+    assert set(core.values()) == set(encoder.values()) == {1.4142}
+    assert set(heads.values()) == set(forward.values()) == {1}
+    assert list(inverse.values()) == [1.4142, 1, 1]
 
 
-class WithoutFunctions(ast.NodeTransformer):
-    """Leaves what runs on import; functions import later."""
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        del node
+def test_parameters_of_the_same_shape_differ():
+    one, other = draw(jax.random.key(0), [np.ones(9, np.float32), np.ones(9, np.float32)])
+    assert not np.any(np.isclose(one, other))
 
 
-def test_the_sources_are_found():
-    assert {"trap_tube_jax.dynamics", "agents", "benchmarks"} <= MODULES
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=module_name)
-def test_imports_run_downward(path):
-    package = module_name(path).split(".")[0]
-    own = {name.split(".")[0] for name in imported_modules(path, ast.parse(path.read_text()))}
-    assert own & set(MAY_IMPORT) <= MAY_IMPORT[package]
-
-
-def room(module: str) -> str:
-    return module.split(".")[1] if "." in module else ""
-
-
-@pytest.mark.parametrize(
-    ("package", "rooms"),
-    [("trap_tube_jax", ENVIRONMENT), ("agents", AGENTS)],
-    ids=["env", "agents"],
-)
-def test_rooms_import_downward(package, rooms):
-    level = {name: height for height, names in enumerate(rooms) for name in names}
-    for path in SOURCES:
-        own = module_name(path)
-        if own.startswith(f"{package}."):
-            for name in imported_modules(path, ast.parse(path.read_text())) & MODULES:
-                if name.startswith(f"{package}."):
-                    assert level[room(name)] <= level[room(own)], (own, name)
-
-
-def test_training_imports_no_command_line(tmp_path):
-    """Nor tyro or matplotlib: learning needs arrays alone."""
-    program = "import json, sys, agents; print(json.dumps(sorted(sys.modules)))"
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path}
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        env=environment, cwd=tmp_path, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    modules = set(json.loads(result.stdout))
-    rooms = {room(name) for name in modules if name.startswith("agents.")}
-    assert rooms == set(LEARNING)
-    assert not modules & {"tyro", "matplotlib"}
-
-
-def test_no_module_needs_itself():
-    graph = {}
-    for path in SOURCES:
-        tree = WithoutFunctions().visit(ast.parse(path.read_text()))
-        graph[module_name(path)] = imported_modules(path, tree) & MODULES - {module_name(path)}
-    graphlib.TopologicalSorter(graph).prepare()
-
-
-def test_importing_the_environment_is_light(tmp_path):
-    """Checked in a fresh interpreter: what JAX, Flax and NumPy import themselves is free."""
-    program = """
-import json, sys
-import jax, numpy
-from flax import struct
-sys.modules["gymnasium"] = None  # which importing the environment registers with
-before = set(sys.modules)
-import trap_tube_jax
-print(json.dumps([sorted(before), sorted(set(sys.modules) - before)]))
-"""
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        env=os.environ | {"PYTHONPATH": path},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    before, added = ({name.split(".")[0] for name in names} for names in json.loads(result.stdout))
-    assert "trap_tube_jax" in added
-    assert added - before - set(sys.stdlib_module_names) == {"trap_tube_jax"}
-    assert not added & HEAVY
-    assert not before & {"agents", "benchmarks"}
+def test_layers_of_flax_start_as_flax_initialises_them():
+    mixed = nn.Sequential([dense(4), nn.LayerNorm(), nn.Dense(4)])
+    keys = jax.random.split(jax.random.key(0))
+    one, other = (init_module(mixed, key, jnp.ones((1, 3)))["params"] for key in keys)
+    np.testing.assert_array_equal(one["layers_1"]["scale"], 1)
+    assert not np.any(np.isclose(one["layers_2"]["kernel"], other["layers_2"]["kernel"]))
+    own: Any = nn.Dense(4).init(keys[0], jnp.ones((1, 4)))["params"]["kernel"]
+    np.testing.assert_allclose(np.std(one["layers_2"]["kernel"]), np.std(own), rtol=0.5)

@@ -1,4 +1,4 @@
-"""What the object encoder is told of a board."""
+"""The object encoder's description of a board, against one found cell by cell."""
 
 import jax
 import jax.numpy as jnp
@@ -62,8 +62,8 @@ def test_objects_are_where_they_are(tasks):
         np.testing.assert_array_equal(place, expected_place)
 
 
-def test_colours_are_not_told(tasks):
-    """A structural transfer may only change which tubes look alike, and base tubes do."""
+def test_colours_are_left_out(tasks):
+    """A structural transfer of the base board recolours tubes and nothing else."""
     keys = jax.random.split(jax.random.key(4), 32)
     plain = jax.vmap(tt.perceptual)(
         keys, jax.tree.map(lambda x: jnp.stack([x] * 32), tt.base_state())
@@ -74,7 +74,7 @@ def test_colours_are_not_told(tasks):
         np.testing.assert_array_equal(one, other)
 
 
-def test_what_cannot_be_seen_is_nowhere():
+def test_invisible_agent_and_food_have_no_place():
     board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
     features, exists, places = describe(board)
     assert exists[0].tolist() == [True] + [False] * (MAX_OBJECTS - 1)
