@@ -1,4 +1,4 @@
-"""What imports what: downward only, and little at the top."""
+"""Imports run downward only, and the top imports little."""
 
 import ast
 import graphlib
@@ -31,19 +31,17 @@ ENVIRONMENT = (
     ("adapters", "contact_sheet", "gallery", "play"),
 )
 AGENTS = (
-    ("registry",),
+    ("arrays", "command_line", "registry"),
     ("config",),
     ("parallel",),
     ("networks",),
     ("acting",),
     ("curiosity",),
     ("ppo",),
-    ("pretrained", "runs", "evaluate"),
+    ("pretrained", "runs"),
     ("train",),
-    ("experiments",),
-    ("profiles",),
-    ("profile",),
-    ("sweep", "examples"),
+    ("experiments", "profiles"),
+    ("evaluate", "examples", "profile", "sweep"),
 )
 LEARNING = ("registry", "config", "parallel", "networks", "acting", "curiosity", "ppo")
 SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))

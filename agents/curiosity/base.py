@@ -1,4 +1,4 @@
-"""What an intrinsic reward is: one object with a few functions.
+"""The interface of intrinsic rewards.
 
 To add one, subclass `Curiosity`, override what it needs, and register it: agents/extending.md.
 
@@ -16,14 +16,14 @@ Params = Any
 
 
 class Experience(NamedTuple):
-    """What a curiosity may look at: episodes, and what the policy network made of them.
+    """Episodes, and what the networks computed from them.
 
     Step t leads from observation t to observation t + 1.
 
     Attributes:
       episodes: B episodes of T steps.
       observation_id: i32[T + 1, B], equal only for equal observations.
-      features: f32[T + 1, B, F], what `Curiosity.encode` makes of the observations.
+      features: f32[T + 1, B, F], the observations encoded by `Curiosity.encode`.
       embedding: f32[T, B, H], the GRU's output h at the step; None unless `needs_embeddings`.
       next_embedding: f32[T, B, H], h', the GRU's output after the step; likewise.
       action_embedding: f32[T, B, E], the policy's embedding of the action; likewise.
@@ -38,22 +38,28 @@ class Experience(NamedTuple):
 
 
 class Curiosity:
-    """An intrinsic reward. This base class pays nothing, trains nothing, remembers nothing.
+    """An intrinsic reward. This base class pays 0 and has no parameters and no memory.
 
-    All methods are pure functions of arrays.
+    All methods are pure functions of arrays. Attributes are settings and modules, never arrays.
 
     Attributes:
-      needs_embeddings: whether the experience is to hold the embeddings, which cost a second
-        pass of the GRU.
+      needs_embeddings: computes the embeddings of `Experience`, which takes a second pass of the
+        GRU.
     """
 
     needs_embeddings = False
 
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
     def init(self, key: jax.Array, board: jax.Array) -> Params:
-        """Parameters that are trained beside the policy's; {} if there are none.
+        """Draws parameters, trained together with the policy's; {} if there are none.
 
         Args:
-          key: PRNG key. `networks.layers.init_module` initialises modules of the layers there.
+          key: PRNG key, for `networks.layers.init_module`.
           board: u8[1, 12, 12, N], an observation, for its shape.
         """
         return {}
@@ -66,19 +72,19 @@ class Curiosity:
         return ()
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Features of its own, f32[M, F], of observations u8[M, 12, 12, N]; F = 0 if none."""
-        return jnp.zeros((len(observation), 0))
+        """Encodes observations u8[M, 12, 12, N] to features f32[M, F]; F = 0 if there are none."""
+        return jnp.zeros((len(observation), 0), jnp.float32)
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
-        """The intrinsic reward f32[T, B] of every step, before scaling, and the new memory.
+        """Returns the reward f32[T, B] of every step, before scaling, and the new memory.
 
-        Values after an episode's end are ignored, whatever they are.
+        Values after an episode's end are ignored.
         """
         return jnp.zeros_like(experience.episodes.reward), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
-        """Terms of the loss by name, f32[T, B] each, finite also after an episode's end.
+        """Returns terms of the loss, f32[T, B] each; {} if nothing is trained.
 
-        {} if nothing is trained. Names end in `_loss`.
+        Names end in `_loss`. Values must be finite after an episode's end, too.
         """
         return {}

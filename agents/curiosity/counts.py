@@ -1,4 +1,4 @@
-"""Visit counts: an observation pays by how seldom training has seen it.
+"""Visit counts: the reward decreases with the number of visits in all of training.
 
 Source: Tang et al. (2017).
 """
@@ -19,19 +19,15 @@ VISIT_BITS = 20  # of an observation's hash, in the table of visits
 class Counts(Curiosity):
     """reward: n^(-1/2), n the visits of the next observation so far, this iteration's included.
 
-    Visits are counted in a table of 2^20 slots, by a hash of the observation; observations with
-    the same hash share a count. While n observations are known, a new one shares with
-    probability n / 2^20: 5 % at 50,000.
-
-    Counts tell something only where tasks recur: base (1 layout) and {Sy} (5 layouts).
-    `perceptual` and `structural` draw so many tasks that hardly any observation is met again, and
-    the table would fill with what never returns. So they are refused.
+    Visits are counted in a table of 2^20 slots by a hash of the observation. Observations of one
+    hash share a count: a new one does with probability n / 2^20 if n are known, 5 % at 50,000.
 
     Args:
-      env: the environment.
+      env: the environment; its tasks must recur, as in base (1 layout) and {Sy} (5 layouts).
 
     Raises:
-      ValueError: the environment draws tasks by anything but `symbolic`.
+      ValueError: the environment has transfers other than `symbolic`. They draw so many tasks that
+        hardly any observation returns, and the table would fill up.
     """
 
     def __init__(self, env: Environment):
@@ -43,19 +39,19 @@ class Counts(Curiosity):
             )
 
     def memory(self) -> jax.Array:
-        """No visits yet, f32[2^20]."""
-        return jnp.zeros(2**VISIT_BITS)
+        """Returns no visits, f32[2^20]."""
+        return jnp.zeros(2**VISIT_BITS, jnp.float32)
 
     def reward(
         self, params: Params, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
-        """The bonus of the next observation, and the visits with this iteration's."""
+        """Returns the bonus of the next observation, and the visits so far."""
         episodes = experience.episodes
         return visit_bonus(memory, observation_slots(episodes)[1:], episodes.mask)
 
 
 def observation_slots(episodes: Episodes) -> jax.Array:
-    """i32[T + 1, B]: the slot of every observation."""
+    """Returns the slot i32[T + 1, B] of every observation."""
     position = position_ids(episodes)
     layout = jnp.broadcast_to(layout_hashes(episodes.layout), position.shape)
     rows = jnp.stack([layout, position.astype(jnp.uint32)], axis=-1)
@@ -63,7 +59,7 @@ def observation_slots(episodes: Episodes) -> jax.Array:
 
 
 def visit_bonus(visits: jax.Array, slot: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Pays observations by the inverse root of how often they have been seen.
+    """Adds a batch of observations to the visits, and returns the bonus of each.
 
       n(o) <- n(o) + visits of o in this batch,  bonus = n(o)^(-1/2).
 

@@ -1,4 +1,4 @@
-"""Effects: what the agent brings about, or meets, for the first time in an episode.
+"""Effects: the reward of an episode's first changes to food and tool, and of its first grasps.
 
 Source: own. Relatives: visits counted within an episode, in NGU (Badia et al., 2020) and NovelD
 (Zhang et al., 2021); change as a reward, in C-BET (Parisi et al., 2021); the impact of actions,
@@ -17,65 +17,64 @@ from agents.networks.grouping import hash_rows
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 
 NUM_KINDS = 3
-OFF_BOARD = np.uint32(2**32 - 1)  # in place of the hash of a look; 0 is that of black
-LOWEST_RATE = 1e-4  # effects a step, below which an effect does not pay more
+OFF_BOARD = np.uint32(2**32 - 1)  # in place of a colour's hash; 0 is the hash of black
+LOWEST_RATE = 1e-4  # effects per step; effects of a lower rate do not pay more
 
 
 class Effects(Curiosity):
     """reward_t = sum over kinds k of new_k(o_0, a_0, ..., a_t, o_{t+1}) / rate_k.
 
-    `new` is a function of one episode's observations and actions (`new_effects`). There are three
-    kinds of effects: on the food, on anything else but the agent's body, and on the hand. Each
-    pays the inverse of its rate, a moving mean of how often it happens in a step. So all kinds
-    pay the same in total, a rare one more each time, and one that the agent learns to bring about
-    ever less.
+    `new_effects` computes `new` from one episode's observations and actions, for three kinds:
+    changes of the food, changes of anything else but the agent's body, and grasps. Each kind pays
+    the inverse of its rate, a moving average of its effects per step. So all kinds pay the same in
+    total, a rare effect pays more, and a kind pays less as the agent learns it.
 
-    It assumes that the agent knows its own colour and the food's, which no transfer changes.
+    The agent's and the food's colours must be known; no transfer changes them.
 
     Args:
-      config: the settings, of which `reward_ema_decay` counts.
+      config: settings, of which `reward_ema_decay` counts.
     """
 
     def __init__(self, config: Config):
-        self._keep = config.reward_ema_decay
+        self._decay = config.reward_ema_decay
 
     def memory(self) -> jax.Array:
-        """The rates f32[3]; each is 0 until it is first above 0, and is then taken as it is."""
-        return jnp.zeros(NUM_KINDS)
+        """Returns the first rates, f32[3]; a rate of 0 takes its first positive value at once."""
+        return jnp.zeros(NUM_KINDS, jnp.float32)
 
     def reward(
         self, params: Params, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
-        """What the new effects of every step pay, and the rates with this iteration's."""
+        """Returns the reward of every step's new effects, and the rates."""
         mask = experience.episodes.mask
         new = new_effects(experience.episodes) * mask[None]
         rate = jnp.sum(new, axis=(1, 2)) / jnp.sum(mask)
-        rate = jnp.where(memory > 0, self._keep * memory + (1 - self._keep) * rate, rate)
+        rate = jnp.where(memory > 0, self._decay * memory + (1 - self._decay) * rate, rate)
         return jnp.tensordot(1 / jnp.maximum(rate, LOWEST_RATE), new, axes=1), rate
 
 
 def new_effects(episodes: Episodes) -> jax.Array:
-    """f32[3, T, B]: 1 where a step brings about something that is new to the episode.
+    """Returns f32[3, T, B], 1 where a step has an effect that is new to the episode.
 
-    Food and tool: it comes to a cell where it has not been. The tool is all that moves beside
-    agent and food. So its cell is new exactly where the board without these two looks as it has
-    not looked before in the episode. A tool that has the colour of what it moves over is the
-    exception: its moves pay and are not seen.
+    Food and tool: it moves to a cell where it has not been. The tool is all that moves besides
+    agent and food, so its cell is new exactly where the board without these two has not looked the
+    same before in the episode. A tool of the colour of what it moves over is the exception: its
+    moves pay although they are invisible.
 
-    Hand: the grasp is at something, or at ground, of a look that the hand has not met.
+    Grasp: the grasped cell has a colour that the episode has not grasped before.
     """
     cell = episodes.cells.astype(jnp.int32)
     cell = cell[..., 0] * BOARD_SIZE + cell[..., 1]
     moved = [first_visits(cell[..., thing])[1:] for thing in (CELL_FOOD, CELL_TOOL)]
-    return jnp.stack([*moved, new_touches(episodes)])
+    return jnp.stack([*moved, new_grasps(episodes)])
 
 
-def new_touches(episodes: Episodes) -> jax.Array:
-    """f32[T, B]: 1 where the cell that is grasped at shows a look new to the episode's grasps."""
+def new_grasps(episodes: Episodes) -> jax.Array:
+    """Returns f32[T, B], 1 where the grasped cell has a colour new to the episode's grasps."""
     hand = episodes.cells[:-1, :, CELL_AGENT].astype(jnp.int32)
     hand = hand + jnp.asarray(DIRECTIONS)[episodes.action[..., 0]]
     on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
     hand = jnp.clip(hand, 0, BOARD_SIZE - 1)
-    time, episode = jnp.indices(hand.shape[:2])
-    look = episodes.observations()[time, episode, hand[..., 0], hand[..., 1]]
-    return first_visits(jnp.where(on_board, hash_rows(look), OFF_BOARD)) * on_board
+    time, episode = np.indices(hand.shape[:2], np.int32)
+    color = episodes.observations()[time, episode, hand[..., 0], hand[..., 1]]
+    return first_visits(jnp.where(on_board, hash_rows(color), OFF_BOARD)) * on_board

@@ -1,17 +1,42 @@
-"""The paper's curiosity: how badly the next output of the policy's GRU is predicted.
+"""ICM, the paper's curiosity: the error in predicting the next output of the policy's GRU.
 
-Source: paper, section "Results"; Pathak et al. (2017); agents/agent.md, "Curiosity".
+Source: paper, section "Results"; Pathak et al. (2017); agents/agent.md, "Network", "Curiosity".
 """
 
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.curiosity.models import ForwardModel, InverseModel
-from agents.networks.layers import draw
+from agents.networks.actions import ActionDistribution
+from agents.networks.layers import dense, draw, output_dense
+from trap_tube_jax.objects import NUM_DIRECTIONS
+
+
+class ForwardModel(nn.Module):
+    """Predicts the next embedding from the present one and the action: h + dense([h, action])."""
+
+    @nn.compact
+    def __call__(self, embedding: jax.Array, action: jax.Array) -> jax.Array:
+        """Maps f32[..., H] and f32[..., E] to f32[..., H]."""
+        x = jnp.concatenate([embedding, action], axis=-1)
+        return embedding + output_dense(embedding.shape[-1])(x)
+
+
+class InverseModel(nn.Module):
+    """Predicts the action between two embeddings, by one layer of `hidden` units and two heads."""
+
+    hidden: int
+
+    @nn.compact
+    def __call__(self, embedding: jax.Array, next_embedding: jax.Array) -> ActionDistribution:
+        """Maps two embeddings f32[..., H] to the distribution of the action."""
+        x = nn.swish(dense(self.hidden)(jnp.concatenate([embedding, next_embedding], axis=-1)))
+        grasp = output_dense(NUM_DIRECTIONS, name="grasp")(x)
+        return ActionDistribution(grasp, output_dense(NUM_DIRECTIONS, name="move")(x))
 
 
 class ICM(Curiosity):
@@ -19,7 +44,7 @@ class ICM(Curiosity):
 
     reward: the forward model's squared error, summed over units. losses: its mean over units,
     and the negative log-likelihood of the action under the inverse model. No gradient is
-    stopped, so both losses shape the policy's encoder.
+    stopped, so both losses train the policy's encoder.
     """
 
     needs_embeddings = True
@@ -29,8 +54,8 @@ class ICM(Curiosity):
         self._widths = (config.hidden, 2 * config.embedding)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
-        """The parameters of both models; `board` is not looked at."""
-        embedding, action = (jnp.zeros((1, width)) for width in self._widths)
+        """Draws the parameters of both models; `board` is not used."""
+        embedding, action = (jnp.zeros((1, width), jnp.float32) for width in self._widths)
         params = {
             "forward": self._forward.init(key, embedding, action),
             "inverse": self._inverse.init(key, embedding, embedding),
@@ -38,12 +63,12 @@ class ICM(Curiosity):
         return draw(key, params)
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
-        """The sum over units of the forward model's squared errors."""
+        """Returns the sum over units of the forward model's squared errors."""
         error, _ = self.predict(params, experience)
         return jnp.sum(error, axis=-1), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
-        """The mean over units of the same errors, and -log p(action)."""
+        """Returns the mean over units of the same errors, and -log p(action)."""
         error, action = self.predict(params, experience)
         return {
             "forward_loss": jnp.mean(error, axis=-1),
@@ -51,7 +76,7 @@ class ICM(Curiosity):
         }
 
     def predict(self, params: Params, experience: Experience) -> Any:
-        """The squared errors f32[T, B, H] of h' as predicted, and the inferred action."""
+        """Returns the squared errors f32[T, B, H] of predicted h', and the inferred action."""
         here, there = experience.embedding, experience.next_embedding
         predicted: Any = self._forward.apply(params["forward"], here, experience.action_embedding)
         inferred = self._inverse.apply(params["inverse"], here, there)

@@ -1,7 +1,7 @@
 """ICM with an encoder of its own, which the inverse loss alone trains.
 
-The forward model sees the features but does not move them, so they cannot collapse to what is
-easily predicted, and the policy's encoder serves the policy only.
+The forward loss does not train the features, so they cannot collapse to easily predicted ones,
+and the policy's encoder serves the policy only.
 
 Source: own; Burda et al. (2019a) discuss which features to predict.
 """
@@ -23,7 +23,7 @@ class DetachedICM(ICM):
     """Forward and inverse models over features of its own; reward and losses are those of `ICM`.
 
     Attributes:
-      detached: whether the forward model's error stops at the features.
+      detached: stops the gradient of the forward model's error at the features.
     """
 
     needs_embeddings = False
@@ -34,14 +34,14 @@ class DetachedICM(ICM):
         self._encoder = make_encoder(config)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
-        """The parameters of the encoder and of both models."""
-        # As in `Agent.init`: only layers of Flax draw with this key.
+        """Draws the parameters of the encoder and of the models."""
+        # As in `Agent.init`, only layers of Flax use the folded key.
         encoder_key = jax.random.fold_in(key, 0)
         features, encoder = self._encoder.init_with_output(encoder_key, board)
         return draw(key, {"encoder": encoder, **self.init_models(key, features)})
 
     def init_models(self, key: jax.Array, features: jax.Array) -> Params:
-        """What is trained on the features f32[1, F], still to be drawn."""
+        """Returns parameters of the models on features f32[1, F], for `draw`."""
         action = _one_hot(jnp.zeros((1, 2), jnp.int32))
         return {
             "forward": self._forward.init(key, features, action),
@@ -49,12 +49,12 @@ class DetachedICM(ICM):
         }
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Features of its own encoder, f32[M, F]."""
+        """Encodes observations by its own encoder to f32[M, F]."""
         features: Any = self._encoder.apply(params["encoder"], observation)
         return features
 
     def predict(self, params: Params, experience: Experience) -> Any:
-        """The squared errors f32[T, B, F] of the predicted features, and the inferred action."""
+        """Returns squared errors f32[T, B, F] of predicted features, and the inferred action."""
         action = _one_hot(experience.episodes.action)
         seen = experience.features[:-1], experience.features[1:]
         here, there = jax.lax.stop_gradient(seen) if self.detached else seen
@@ -64,5 +64,6 @@ class DetachedICM(ICM):
 
 
 def _one_hot(action: jax.Array) -> jax.Array:
-    """f32[..., 8] of an action i32[..., 2]."""
-    return jax.nn.one_hot(action, NUM_DIRECTIONS).reshape(*action.shape[:-1], -1)
+    """Encodes actions i32[..., 2] as f32[..., 8]."""
+    flags = jax.nn.one_hot(action, NUM_DIRECTIONS, dtype=jnp.float32)
+    return flags.reshape(*action.shape[:-1], -1)

@@ -1,4 +1,4 @@
-"""NovelD: a step pays where it leads from what is known to what is new.
+"""NovelD: the reward of a step from a familiar observation to a novel one.
 
 Source: Zhang et al. (2021); novelty by Burda et al. (2019b).
 """
@@ -18,12 +18,11 @@ ALPHA = 0.5  # of the paper
 class NovelD(RND):
     """reward_t = max(n(o_{t+1}) - 0.5 n(o_t), 0), if o_{t+1} is new in its episode, else 0.
 
-    n is the novelty of `rnd`: the Euclidean norm of the error in imitating a random network.
-    The predictor's loss is that of `rnd`.
+    n is the Euclidean norm of the prediction error of `rnd`; the loss is that of `rnd`.
     """
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
-        """The rise of novelty, paid at first visits."""
+        """Returns the rise of novelty, at first visits."""
         novelty = jnp.linalg.norm(experience.features, axis=-1)
         rise = jnp.maximum(novelty[1:] - ALPHA * novelty[:-1], 0.0)
         return rise * first_visits(experience.observation_id)[1:], memory

@@ -1,4 +1,4 @@
-"""Random network distillation: the error in imitating a fixed random encoder.
+"""Random network distillation: the error in predicting a fixed random encoder.
 
 Source: Burda et al. (2019b).
 """
@@ -16,12 +16,12 @@ from agents.networks.layers import dense, init_module, output_dense
 
 
 class Models(nn.Module):
-    """A fixed random target, and the predictor that imitates it.
+    """A fixed random target, and its predictor.
 
     Attributes:
       hidden: units of the layer between the predictor's encoder and its output.
-      target: an encoder, u8[M, 12, 12, N] to f32[M, F].
-      predictor: the predictor's own.
+      target: encoder, u8[M, 12, 12, N] to f32[M, F].
+      predictor: the predictor's own encoder.
     """
 
     hidden: int
@@ -30,7 +30,7 @@ class Models(nn.Module):
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """The difference of prediction and target, f32[M, F]."""
+        """Returns the difference of prediction and target, f32[M, F]."""
         target: Any = jax.lax.stop_gradient(self.target(observation))
         x = nn.swish(dense(self.hidden, name="hidden")(self.predictor(observation)))
         return output_dense(target.shape[-1], name="output")(x) - target
@@ -43,18 +43,18 @@ class RND(Curiosity):
         self._models = Models(config.hidden, make_encoder(config), make_encoder(config))
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
-        """The parameters of target and predictor; the target's get no gradient."""
+        """Draws the parameters of target and predictor; the target's get no gradient."""
         return init_module(self._models, key, board)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """The difference of prediction and target, f32[M, F]."""
+        """Returns the difference of prediction and target, f32[M, F]."""
         difference: Any = self._models.apply(params, observation)
         return difference
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
-        """The sum over units of the squared error at the next observation."""
+        """Returns the sum over units of the squared errors at the next observation."""
         return jnp.sum(jnp.square(experience.features[1:]), axis=-1), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
-        """The mean over units of the same errors."""
+        """Returns the mean over units of the same errors."""
         return {"forward_loss": jnp.mean(jnp.square(experience.features[1:]), axis=-1)}

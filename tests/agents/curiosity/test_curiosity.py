@@ -1,247 +1,147 @@
-"""Intrinsic rewards: the registry of names, a curiosity from outside, visit counts."""
+"""The built-in rewards by hand, their losses and encoders, and that all can be copied."""
 
+import copy
+import pickle
 from typing import Any
 
+import cloudpickle
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents import Config, make_train, registry
+import trap_tube_jax as tt
+from agents import Config
 from agents.acting.episodes import Episodes
-from agents.acting.identity import observation_ids
-from agents.curiosity import Curiosity, counts, register
-from agents.curiosity.checks import check_curiosity, shapes_of
-from agents.curiosity.counts import observation_slots, visit_bonus
-from refusal import assert_refused
+from agents.curiosity import Curiosity, Experience
+from agents.curiosity.e3b import elliptical_bonus
+from agents.networks import make_encoder
+from agents.networks.layers import draw
+from agents.registry import curiosities
 
-TINY = Config(
-    env_id="sy",
-    max_steps=4,
-    episodes_per_iteration=4,
-    minibatch_size=2,
-    epochs=1,
-    filters=(2, 3),
-    hidden=4,
-    embedding=2,
-    encode_chunk_size=4,
-    curiosity="none",
-).to_dict()
+SETTINGS = Config(env_id="sy", filters=(2, 3), hidden=4, embedding=2).to_dict()
+BOARD = jnp.zeros((1, 12, 12, 3), jnp.uint8)
 
 
-class Corners(Curiosity):
-    """Pays where the agent comes to a corner, and counts its calls."""
-
-    def memory(self):
-        return jnp.zeros((), jnp.int32)
-
-    def reward(self, params, memory, experience):
-        agent = experience.episodes.cells[1:, :, 0]
-        return jnp.all(agent % 11 == 0, axis=-1).astype(jnp.float32), memory + 1
+def make(name: str, **settings: Any) -> Any:
+    config = Config.from_dict({**SETTINGS, "curiosity": name, **settings})
+    return curiosities.factory(name)(config, tt.make("sy"))
 
 
-class Plain(Curiosity):
-    """Encodes without parameters, pays NaN after an episode's end, and has a loss of any name."""
-
-    def __init__(self, loss="value_loss"):
-        self.loss = loss
-
-    def encode(self, params, observation):
-        return observation.reshape(len(observation), -1)[:, :3] / 255.0
-
-    def reward(self, params, memory, experience):
-        mask = experience.episodes.mask
-        return experience.features[1:, :, 0] * 0 + 1 / mask - jnp.where(mask, 0.0, jnp.inf), memory
-
-    def losses(self, params, experience):
-        return {self.loss: experience.episodes.mask}
+def reward_of(name: str, features: Any, observation_id: Any) -> np.ndarray:
+    """Computes rewards [T, B] from features [T + 1, B, F]."""
+    episodes: Any = None  # which these rewards do not use
+    features = jnp.array(features, jnp.float32)
+    experience = Experience(episodes, jnp.array(observation_id), features)
+    return np.asarray(make(name).reward({}, (), experience)[0])
 
 
-@pytest.fixture(scope="module")
-def trajectory():
-    """Random episodes of {Sy}, 40 of 4 steps."""
-    learner = make_train(Config.from_dict({**TINY, "episodes": 40}))
-    params = jax.jit(learner.init_params)(jax.random.key(0))
-    reset_keys = jax.random.split(jax.random.key(1), 40)
-    return jax.jit(learner.play)(params, reset_keys, jax.random.key(2))
+ROOT = 2**-0.5
+BY_HAND = {
+    # The squared error at the next observation.
+    "rnd": ([[[3, 4]], [[1, 0]], [[6, 8]]], [[0], [1], [2]], [[1], [100]]),
+    # Errors of norms 5, 1, 10, 10 and 2, 4, 1, 9; the last observation of both has been seen.
+    "noveld": (
+        [[[3, 4], [2, 0]], [[1, 0], [0, 4]], [[6, 8], [1, 0]], [[6, 8], [0, 9]]],
+        [[0, 5], [1, 6], [2, 7], [2, 5]],
+        [[0, 4 - 1], [10 - 0.5, 0], [0, 0]],
+    ),
+    "ride": (
+        [[[0, 0]], [[3, 4]], [[0, 0]], [[0, 0]], [[6, 8]]],
+        [[0], [1], [0], [0], [1]],
+        [[5], [5 * ROOT], [0], [10 * ROOT]],
+    ),
+    "e3b": (
+        [[[1, 0]], [[1, 0]], [[0, 2]], [[1, 0]], [[1, 2]]],
+        np.zeros((5, 1)),
+        [[1 / 1.1], [4 / 0.1], [1 / 2.1], [1 / 3.1 + 4 / 4.1]],
+    ),
+}
 
 
-@pytest.fixture(autouse=True)
-def own_table(monkeypatch):
-    monkeypatch.setattr(registry.curiosities, "_factories", dict(registry.curiosities._factories))
+@pytest.mark.parametrize("name", BY_HAND)
+def test_rewards_are_those_computed_by_hand(name):
+    features, observation_id, expected = BY_HAND[name]
+    np.testing.assert_allclose(reward_of(name, features, observation_id), expected, rtol=1e-5)
 
 
-def test_a_curiosity_of_ones_own_is_trained_with(trajectory):
-    register("corners", lambda config, env: Corners())
-    train = make_train(Config.from_dict({**TINY, "curiosity": "corners"}))
-    start = jax.jit(train.init)(jax.random.key(0))
-    episodes = trajectory.episodes
-    cells = episodes.cells.at[1, 0, 0].set(jnp.array([11, 0], jnp.uint8))
-    trajectory = trajectory._replace(episodes=episodes._replace(cells=cells))
-    reward, memory = jax.jit(train.intrinsic_reward)(start, trajectory)
-    corner = np.isin(np.asarray(cells[1:, :, 0]), [0, 11]).all(-1)
-    np.testing.assert_array_equal(reward, corner)
-    assert reward[0, 0] == 1
-    assert memory == 1
+@pytest.mark.parametrize("name", BY_HAND)
+def test_an_episodes_reward_does_not_depend_on_other_episodes(name):
+    features = np.random.default_rng(0).normal(size=(6, 8, 3))
+    ids = np.random.default_rng(1).integers(0, 4, size=(6, 8))
+    whole = reward_of(name, features, ids)
+    np.testing.assert_array_equal(reward_of(name, features[:, 4:], ids[:, 4:]), whole[:, 4:])
+    assert np.std(whole) > 0
 
 
-def test_a_curiosity_without_parameters_encodes_and_may_pay_anything_after_the_end(trajectory):
-    register("plain", lambda config, env: Plain())
-    train = make_train(Config.from_dict({**TINY, "curiosity": "plain"}))
-    episodes = trajectory.episodes
-    episodes = episodes._replace(mask=episodes.mask.at[2:, 0].set(0.0))
-    start = jax.jit(train.init)(jax.random.key(0))
-    shortened = trajectory._replace(episodes=episodes)
-    reward, _ = jax.jit(train.intrinsic_reward)(start, shortened)
-    np.testing.assert_array_equal(reward, episodes.mask)
+def test_elliptical_bonus_is_that_of_the_inverse_matrix():
+    features = np.random.default_rng(0).normal(size=(9, 3, 4))
+    bonus = elliptical_bonus(jnp.array(features, jnp.float32))
+    for episode in range(3):
+        matrix = 0.1 * np.eye(4)
+        for time in range(9):
+            f = features[time, episode]
+            expected = f @ np.linalg.inv(matrix) @ f
+            np.testing.assert_allclose(bonus[time, episode], expected, rtol=1e-3)
+            matrix += np.outer(f, f)
 
 
-@pytest.mark.parametrize("name", ["value_loss", "success", "greedy_mine"])
-def test_losses_called_like_metrics_are_refused(name):
-    register("plain", lambda config, env: Plain(name))
-    train = make_train(Config.from_dict({**TINY, "curiosity": "plain"}))
-    start = jax.eval_shape(train.init, jax.random.key(0))
-    with pytest.raises(ValueError, match=f"need names of their own, got {name}"):
-        jax.eval_shape(train.iterate, start)
+def test_rnd_trains_the_predictor_alone():
+    curiosity = make("rnd")
+    board = jax.random.randint(jax.random.key(0), (3, 12, 12, 3), 0, 256).astype(jnp.uint8)
+    params = curiosity.init(jax.random.key(1), board)
+
+    def loss(params):
+        features = curiosity.encode(params, board)[:, None]
+        experience = Experience(None, None, features)  # pyright: ignore
+        return jnp.sum(curiosity.losses(params, experience)["forward_loss"])
+
+    features = curiosity.encode(params, board)[1:]
+    np.testing.assert_allclose(loss(params), jnp.sum(jnp.mean(features**2, axis=-1)), rtol=1e-5)
+    gradient = jax.grad(loss)(params)["params"]
+    assert not any(np.any(x) for x in jax.tree.leaves(gradient.pop("target")))
+    assert all(np.any(x) for x in jax.tree.leaves(gradient["output"]))
+    assert np.any(jax.tree.leaves(gradient["predictor"])[0])
 
 
-def test_names_are_checked_against_the_registry():
-    with pytest.raises(ValueError, match=r"unknown curiosity 'rdn'; allowed: icm, .*counts, none"):
-        Config(curiosity="rdn")
-    with pytest.raises(ValueError, match="curiosity 'icm' is registered already"):
-        register("icm", lambda config, env: Curiosity())
+@pytest.mark.parametrize(("name", "trained"), [("icm-detached", False), ("ride", True)])
+def test_the_forward_loss_trains_the_features_of_ride_alone(name, trained):
+    curiosity = make(name)
+    action = jnp.zeros((2, 1, 2), jnp.int32)
+    features = jax.random.normal(jax.random.key(0), (3, 1, 3))
+    params = draw(jax.random.key(1), curiosity.init_models(jax.random.key(2), features[:1, 0]))
+    episodes = Episodes(tt.base_state(), action, action, action, action, action)
+
+    def loss(features, name):
+        experience = Experience(episodes, jnp.zeros((3, 1)), features)
+        return jnp.sum(curiosity.losses(params, experience)[name])
+
+    assert bool(np.any(jax.grad(loss)(features, "forward_loss"))) == trained
+    assert np.any(jax.grad(loss)(features, "inverse_loss"))
 
 
-def test_the_same_file_may_register_a_name_again():
-    register("mine", lambda config, env: Corners())
-    register("mine", lambda config, env: Plain())
-    assert isinstance(registry.curiosities.factory("mine")(None, None), Plain)
-    with pytest.raises(ValueError, match="curiosity 'mine' is registered already"):
-        exec('register("mine", print)', {"register": register, "__name__": "elsewhere"})
+@pytest.mark.parametrize("name", ["icm-detached", "rnd", "noveld", "ride", "e3b"])
+def test_encoders_of_a_curiosity_are_of_the_policys_kind(name):
+    encoder = make_encoder(Config.from_dict({**SETTINGS, "encoder": "objects"}))
+    wanted, found = (
+        jax.tree.map(jnp.shape, jax.eval_shape(init, jax.random.key(0), BOARD))
+        for init in (encoder.init, make(name, encoder="objects").init)
+    )
+    parts = [found["encoder"]] if "encoder" in found else []
+    parts = parts or [{"params": found["params"][part]} for part in ("target", "predictor")]
+    assert all(part == wanted for part in parts)
 
 
-@pytest.mark.parametrize(
-    ("name", "factory", "words"),
-    [
-        ("mine", Corners(), ["curiosity 'mine' needs a function", "Corners object"]),
-        ("a+b, c", Corners, ["curiosity names consist of letters, digits", "'a+b, c'"]),
-        (7, Corners, ["curiosity names consist of letters, digits", "got 7"]),
-    ],
-)
-def test_instances_and_names_that_cannot_be_typed_are_refused(name, factory, words):
-    assert_refused(words, register, name, factory)
-
-
-class Scalar(Corners):
-    def reward(self, params, memory, experience):
-        return jnp.sum(experience.episodes.reward), memory
-
-
-class Alone(Corners):
-    def reward(self, params, memory, experience):
-        return experience.episodes.reward
-
-
-class Drifting(Corners):
-    def reward(self, params, memory, experience):
-        return experience.episodes.reward, memory + 0.5
-
-
-class Forgetful(Corners):
-    def reward(self, params, memory, experience):
-        return experience.embedding.sum(-1), memory
-
-
-class ForgetfulLoss(Corners):
-    def losses(self, params, experience):
-        return {"own": experience.next_embedding.sum(-1)}
-
-
-class Embedded(Corners):
-    needs_embeddings = True
-
-    def reward(self, params, memory, experience):
-        both = (experience.embedding + experience.next_embedding).sum(-1)
-        return both + experience.action_embedding.sum(-1), memory
-
-
-@pytest.mark.parametrize(
-    ("kind", "words"),
-    [
-        (Scalar, ["Scalar.reward must return (reward f32[T, B], memory)", "got (float32[], int32"]),
-        (Alone, ["(float32[4, 4], int32[]), got float32[4, 4]"]),
-        (Drifting, ["(float32[4, 4], int32[]), got (float32[4, 4], float32[])"]),
-        (Forgetful, ["Forgetful.reward failed", "unless needs_embeddings = True"]),
-        (ForgetfulLoss, ["ForgetfulLoss.losses failed", "unless needs_embeddings = True"]),
-        (lambda: Corners, ["'mine' must be an agents.curiosity.Curiosity, got <class"]),
-    ],
-)
-def test_curiosities_that_break_their_contract_are_refused(kind, words):
-    register("mine", lambda config, env: kind())
-    assert_refused(words, make_train, Config.from_dict({**TINY, "curiosity": "mine"}))
-
-
-def test_the_contract_is_checked_with_the_shapes_of_training(trajectory):
-    """Those of what an iteration gives, and with every curiosity of the project."""
-    register("mine", lambda config, env: Embedded())
-    for name in ("mine", "icm", "rnd", "effects", "counts", "none"):
-        config = Config.from_dict({**TINY, "episodes_per_iteration": 40, "curiosity": name})
-        train = make_train(config)
-        check_curiosity(train.curiosity, config, train.env)
-        params = jax.eval_shape(train.init_params, jax.random.key(0))
-        given = jax.eval_shape(train.acting_experience, params, trajectory)
-        checked = shapes_of(train.curiosity, params["curiosity"], config, train.env)
-        assert jax.tree.map(lambda x: (x.shape, x.dtype), given) == jax.tree.map(
-            lambda x: (x.shape, x.dtype), checked
-        )
-
-
-@pytest.mark.parametrize("env_id", ["base", "sy"])
-def test_counts_are_for_tasks_that_return(env_id):
-    make_train(Config.preset("fast", env_id=env_id, curiosity="counts"))
-
-
-@pytest.mark.parametrize("env_id", ["p", "st", "pstsy"])
-def test_counts_are_refused_where_tasks_do_not_return(env_id):
-    with pytest.raises(ValueError, match=r"'counts' needs tasks that return: base or Sy"):
-        make_train(Config.preset("fast", env_id=env_id, curiosity="counts"))
-
-
-def test_visits_are_counted_and_pay_by_their_root():
-    slot = jnp.array([[3, 3], [5, 3]])
-    mask = jnp.array([[1.0, 1.0], [1.0, 0.0]])
-    bonus, visits = visit_bonus(jnp.zeros(8).at[5].set(3.0), slot, mask)
-    np.testing.assert_allclose(bonus, [[2**-0.5, 2**-0.5], [0.5, 0.0]], rtol=1e-6)
-    np.testing.assert_array_equal(visits, [0, 0, 0, 2, 0, 4, 0, 0])
-
-
-def test_few_observations_share_a_slot(trajectory):
-    """No more of 4000 positions on each layout of {Sy} than chance would have it, here 1 %."""
-    cells = jax.random.randint(jax.random.key(2), (4000, 1, 3, 2), 0, 12).astype(jnp.uint8)
-    cells = jnp.broadcast_to(cells, (4000, 40, 3, 2))
-    episodes = trajectory.episodes._replace(cells=cells)
-    slot, identity = (jax.jit(of)(episodes) for of in (observation_slots, observation_ids))
-    distinct = int(identity.max()) + 1
-    assert distinct > 19_900
-    assert 0.98 * distinct < len(np.unique(slot)) <= distinct
-
-
-def test_layouts_of_near_hashes_share_few_slots(trajectory, monkeypatch):
-    """Of 40 layouts with 144 positions in a row, again no more than chance would have it."""
-    near: Any = lambda layout: jnp.arange(40, dtype=jnp.uint32)  # noqa: E731
-    monkeypatch.setattr(counts, "layout_hashes", near)
-    food = jnp.stack(jnp.divmod(jnp.arange(144), 12), axis=-1)
-    cells = jnp.zeros((144, 40, 3, 2), jnp.uint8).at[:, :, 2].set(food[:, None].astype(jnp.uint8))
-    slot = jax.jit(observation_slots)(trajectory.episodes._replace(cells=cells))
-    assert len(np.unique(slot)) > 0.98 * slot.size
-
-
-def test_every_observation_keeps_its_slot(trajectory):
-    episodes = trajectory.episodes
-    slot = np.asarray(jax.jit(observation_slots)(episodes))
-    boards = np.asarray(jax.jit(Episodes.observations)(episodes)).reshape(slot.size, -1)
-    cells = np.asarray(episodes.cells).reshape(slot.size, -1)
-    _, same = np.unique(np.concatenate([boards, cells], axis=1), axis=0, return_inverse=True)
-    assert same.max() + 1 < slot.size
-    for number in range(same.max() + 1):
-        assert len(set(slot.reshape(-1)[same.reshape(-1) == number].tolist())) == 1
+@pytest.mark.parametrize("name", curiosities)
+def test_copies_are_equal(name):
+    curiosity = make(name)
+    assert isinstance(curiosity, Curiosity)
+    for copied in (
+        copy.deepcopy(curiosity),
+        pickle.loads(pickle.dumps(curiosity)),
+        cloudpickle.loads(cloudpickle.dumps(curiosity)),
+    ):
+        assert copied == curiosity
+        assert hash(copied) == hash(curiosity)
+    others = [make(other) for other in curiosities if other != name]
+    assert curiosity not in others

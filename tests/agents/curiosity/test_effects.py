@@ -1,4 +1,4 @@
-"""Effects: what is new in an episode, outside the agent's own body."""
+"""Effects: changes and grasps that are new to their episode, outside the agent's own body."""
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +9,14 @@ import trap_tube_jax as tt
 from agents import Config
 from agents.acting.episodes import Episodes, cells_of
 from agents.curiosity import Experience
-from agents.curiosity.effects import Effects, new_effects, new_touches
+from agents.curiosity.effects import Effects, new_effects, new_grasps
 from trap_tube_jax.objects import DIRECTIONS, LEFT, UP
 
 STEPS, BATCH = 40, 48
 
 
 def random_episodes(env: tt.Environment) -> Episodes:
-    """Episodes of an agent that repeats its actions, so that it moves things about."""
+    """Plays with actions that often repeat, so that things move."""
 
     def play(key):
         reset_key, action_key, keep_key = jax.random.split(key, 3)
@@ -42,9 +42,9 @@ def random_episodes(env: tt.Environment) -> Episodes:
 def read_off(
     boards: np.ndarray, grasps: np.ndarray, ground: np.ndarray, own: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """What is new, i64[3, T], by the boards u8[T + 1, 12, 12, N] and grasps of one episode alone.
+    """Finds new effects i64[3, T] from one episode's boards u8[T + 1, 12, 12, N] and grasps.
 
-    The agent stands on ground wherever it is, and so does food outside its tube.
+    Assumes that agent and food stand on ground.
     """
     is_agent = np.asarray(np.all(boards == own["agent"], axis=-1))
     is_food = np.asarray(np.all(boards == own["food"], axis=-1))
@@ -60,9 +60,9 @@ def read_off(
     met, new = set(), []
     for board, place, grasp in zip(boards, is_agent, grasps, strict=False):
         hand = np.argwhere(place)[0] + DIRECTIONS[grasp]
-        look = board[tuple(hand)].tobytes() if np.all((hand >= 0) & (hand < 12)) else None
-        new.append(look is not None and look not in met)
-        met.add(look)
+        color = board[tuple(hand)].tobytes() if np.all((hand >= 0) & (hand < 12)) else None
+        new.append(color is not None and color not in met)
+        met.add(color)
     return np.array([*found, new])
 
 
@@ -88,7 +88,7 @@ def test_effects_can_be_read_off_the_observations(short):
 
 @pytest.fixture
 def by_hand() -> Episodes:
-    """Two episodes: columns of agent, tool and food at 5 times; the second ends after 2 steps."""
+    """Builds two episodes from columns of agent, tool and food; the second ends after 2 steps."""
     first = [(0, 1, 5), (0, 2, 5), (1, 1, 5), (1, 2, 6), (2, 3, 5)]
     second = [(0, 4, 7), (1, 4, 7), (1, 5, 8), (1, 6, 9), (1, 7, 10)]
     column = jnp.array([first, second]).swapaxes(0, 1)
@@ -99,13 +99,13 @@ def by_hand() -> Episodes:
     return Episodes(layout, cells, action, jnp.zeros((4, 2)), jnp.ones((4, 2)), mask)
 
 
-def test_what_returns_to_where_it_was_is_not_new(by_hand):
+def test_a_return_is_not_new(by_hand):
     food, tool, _ = np.asarray(new_effects(by_hand) * by_hand.mask[None])
     np.testing.assert_array_equal(tool.T, [[1, 0, 0, 1], [0, 1, 0, 0]])
     np.testing.assert_array_equal(food.T, [[0, 0, 1, 0], [0, 1, 0, 0]])
 
 
-def test_the_hand_meets_every_look_once(by_hand):
+def test_the_first_grasp_of_every_colour_is_new(by_hand):
     state = tt.base_state()  # the tool above the agent, on ground
     agent = jnp.array([[9, 1], [8, 1], [8, 1], [8, 1], [8, 1]])
     things = jnp.broadcast_to(jnp.stack([state.tool, state.food]), (5, 2, 2))
@@ -115,7 +115,7 @@ def test_the_hand_meets_every_look_once(by_hand):
         cells=jnp.stack([cells, cells], axis=1),
         action=jnp.zeros((4, 2, 2), jnp.int32).at[:, :, 0].set(grasp[:, None]),
     )
-    np.testing.assert_array_equal(new_touches(episodes).T, [[1, 1, 0, 0]] * 2)
+    np.testing.assert_array_equal(new_grasps(episodes).T, [[1, 1, 0, 0]] * 2)
 
 
 def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
@@ -124,7 +124,7 @@ def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)
     np.testing.assert_allclose(memory, [2 / 6, 3 / 6, 0], rtol=1e-6)
     np.testing.assert_allclose(pay.T, [[2, 0, 3, 2], [0, 5, 0, 0]], rtol=1e-6)
-    # Later the rates move slowly.
+    # Rates above 0 are moving averages.
     _, memory = curiosity.reward({}, jnp.array([0.5, 0.1, 0.2]), experience)
     expected = [0.75 * 0.5 + 0.25 / 3, 0.75 * 0.1 + 0.25 / 2, 0.75 * 0.2]
     np.testing.assert_allclose(memory, expected, rtol=1e-6)
