@@ -1,0 +1,120 @@
+"""Draws the pictures of README.md and environment.md: python -m benchmarks.pictures --help."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import trap_tube_jax as tt
+from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.imports import needs_extra
+from trap_tube_jax.rendering import episode_frames
+
+with needs_extra("pictures"):
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+FIGURES = Path(__file__).parent / "results" / "figures"
+DPI = 200  # twice the pixels of a page that shows 830
+CELL = 40  # pixels of a cell before scaling
+# Okabe and Ito's colours, told apart by all kinds of colour vision, by object code.
+PALETTE = jnp.array(
+    [
+        (221, 221, 221),  # ground: grey
+        (213, 94, 0),  # trap: vermilion
+        (230, 159, 0),  # exit: orange
+        (86, 180, 233),  # tube1: sky blue
+        (86, 180, 233),  # tube2
+        (204, 121, 167),  # food: reddish purple
+        (0, 158, 115),  # tool: bluish green
+        (0, 114, 178),  # agent: blue
+    ],
+    jnp.uint8,
+)
+# By object: its cell on the board after two steps, and where its name is written, in cells.
+NAMES = {
+    "tool (a stick)": ((4, 2), (2.2, 1.8)),
+    "food": ((5, 5), (2.2, 5.2)),
+    "exit": ((5.5, 7), (4.5, 10.0)),
+    "trap": ((6, 4), (9.2, 4.4)),
+    "tube": ((7, 6), (9.2, 7.0)),
+    "hand": ((7.5, 2), (6.5, 0.4)),
+    "agent": ((8, 2), (9.8, 1.6)),
+}
+STEPS = {  # of the shortest plan
+    0: "walk to the tool",
+    1: "grasp the tool",
+    4: "carry it to the tube",
+    6: "push the food",
+    8: "let go of the tool",
+    11: "reach the food",
+}
+SHOWN = slice(2 * CELL, 11 * CELL), slice(0, 10 * CELL)  # of the board, in the six steps
+
+
+def draw_board() -> Figure:
+    """Draws the base task with the names of its objects, and its shortest plan in six steps."""
+    state = tt.base_state().replace(palette=PALETTE)
+    plan = tt.solve(state)
+    frames = episode_frames(state, plan.actions[: plan.length], CELL)
+    figure = Figure(figsize=(8.3, 3.6), layout="constrained")
+    parts: Any = figure.subfigures(1, 2, width_ratios=(3.4, 4.9))
+    large, steps = parts
+    axis = large.subplots()
+    _show(axis, frames[2])
+    for name, (cell, text) in NAMES.items():
+        at, to = ((np.array(place)[::-1] + 0.5) * CELL for place in (cell, text))
+        arrow = {"arrowstyle": "-", "color": "black", "linewidth": 1.2}
+        box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "black"}
+        axis.annotate(name, at, to, ha="center", arrowprops=arrow, bbox=box)
+    for axis, (step, caption) in zip(steps.subplots(2, 3).flat, STEPS.items(), strict=True):
+        _show(axis, frames[step][SHOWN])
+        axis.set_xlabel(f"step {step}: {caption}", fontsize=8)
+    return figure
+
+
+def draw_symbolic() -> Figure:
+    """Draws the five tasks of {Sy}: with signs, as `render` does, and as the agent sees them."""
+    base = tt.base_state().replace(palette=PALETTE)
+    keys = jax.random.split(jax.random.key(0), 64)
+    states = jax.vmap(tt.symbolic, in_axes=(0, None))(keys, base)
+    pictures = np.asarray(jax.vmap(lambda state: tt.render(state, CELL))(states))
+    _, first = np.unique(pictures.reshape(len(keys), -1), axis=0, return_index=True)
+    figure = Figure(figsize=(8.3, 3.5), layout="constrained")
+    rows: Any = figure.subplots(2, 5)
+    for (shown, seen), index in zip(rows.T, sorted(first), strict=True):
+        _show(shown, pictures[index])
+        _show(seen, np.asarray(tt.render(jax.tree.map(lambda x, i=index: x[i], states), 1)))
+    for axis, title in zip(rows[:, 0], ("you see", "the agent sees"), strict=True):
+        axis.set_ylabel(title)
+    return figure
+
+
+def _show(axis: Any, picture: np.ndarray) -> None:
+    axis.imshow(picture, interpolation="nearest" if len(picture) < CELL else "antialiased")
+    axis.set(xticks=[], yticks=[])
+
+
+PICTURES = {"board": draw_board, "symbolic": draw_symbolic}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line; `arguments` are those of the process if None."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.pictures", description="Draw board.png and symbolic.png."
+    )
+    parser.add_argument("--output", type=Path, default=FIGURES, help="folder of the pictures")
+    options = parser.parse_args(arguments)
+    with plain_errors(), mpl.rc_context({"font.size": 10}):
+        options.output.mkdir(parents=True, exist_ok=True)
+        for name, draw in PICTURES.items():
+            draw().savefig(options.output / f"{name}.png", dpi=DPI)
+            print(options.output / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()
