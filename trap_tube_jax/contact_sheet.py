@@ -32,17 +32,17 @@ def contact_sheet(
     cell_size: int = 16,
     seed: int = 0,
 ) -> Image.Image:
-    """Task sets with some of their tasks each, and a legend of the objects.
+    """Draws task sets with some of their tasks each, and a legend of the objects.
 
     Args:
       ids: the task sets, at least one; the paper's eight if absent.
-      tasks: the most tasks per set, at least 2. They all differ; there are fewer where 64
-        draws hold fewer. The base has one: the legend takes the place of the others.
+      tasks: most tasks per set, at least 2: the first different ones of 64 draws. The base has
+        one task, and the legend fills its row.
       cell_size: pixels per cell and side, at least 8.
-      seed: which tasks are drawn, 0 to 2**32 - 1.
+      seed: seed of the tasks, 0 to 2**32 - 1.
 
     Raises:
-      ValueError: naming the value and what is allowed.
+      ValueError: an argument is invalid; the message says what is allowed.
     """
     tasks = check_integer("tasks", tasks, 2)
     cell_size = check_integer("cell_size", cell_size, 8)
@@ -62,7 +62,7 @@ def contact_sheet(
 
 
 def _panel(entry: TaskSet, tasks: int, cell_size: int, seed: int) -> Image.Image:
-    """A title and a row of tasks; for a set with one task, that and the legend."""
+    """Draws a title and a row of tasks, or of the only task and the legend."""
     tile, gap, header = BOARD_SIZE * cell_size, cell_size // 2, 3 * cell_size
     width = tasks * (tile + gap) - gap
     panel = Image.new("RGB", (width, header + tile), BACKGROUND)
@@ -80,10 +80,10 @@ def _panel(entry: TaskSet, tasks: int, cell_size: int, seed: int) -> Image.Image
 
 
 def _distinct_tasks(entry: TaskSet, tasks: int, cell_size: int, seed: int) -> np.ndarray:
-    """u8[K, 12 s, 12 s, 3]: the first K <= `tasks` different tasks among `DRAWS`."""
+    """Draws the first K <= `tasks` different tasks among `DRAWS`, u8[K, 12 s, 12 s, 3]."""
     keys = jax.random.split(jax.random.key(seed), DRAWS)
     states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
-    # Not the observations: the symbolic swap leaves the colours where they were.
+    # Observations would not do: the symbolic swap leaves all colours in place.
     looks = [
         jax.vmap(visible_objects)(states).reshape(DRAWS, -1),
         states.palette.reshape(DRAWS, -1),
@@ -97,7 +97,7 @@ def _distinct_tasks(entry: TaskSet, tasks: int, cell_size: int, seed: int) -> np
 def _draw_legend(
     draw: ImageDraw.ImageDraw, panel: Image.Image, corner: tuple[int, int], size: tuple[int, int]
 ) -> None:
-    """The eight objects in two columns of four, into the box at `corner` of `size`."""
+    """Draws the eight objects in two columns of four into the box at `corner` of `size`."""
     column_width, row_height = size[0] // 2, size[1] // 4
     swatch = round(0.7 * row_height)
     for code in range(NUM_OBJECTS):

@@ -20,7 +20,7 @@ SOLVED_SETS = ("base", "p", "st", "sy", "pstsy")
 
 
 def solved_episode(state: State, cell_size: int = 20) -> np.ndarray:
-    """The pictures of a shortest solution, the hand shown: u8[L + 1, 12 s, 12 s, 3].
+    """Draws a shortest solution with the agent's hand, u8[L + 1, 12 s, 12 s, 3].
 
     Args:
       state: one unbatched state.

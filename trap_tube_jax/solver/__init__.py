@@ -1,13 +1,13 @@
 """The oracle: exact shortest plans and distances, by search over the public step.
 
 A task is a deterministic graph. Its nodes are the positions of agent, tool and food, its
-edges the 16 actions. The search runs on the host. It takes its edges from `dynamics.step`, a
-whole frontier at a time, so that there is one set of rules.
+edges the 16 actions. The search runs on the host, and `dynamics.step` computes the edges of a
+whole frontier at a time, so there is one set of rules.
 
     search.py      breadth-first search; shortest plans
     distance.py    distances from the start and to the goal, for every reachable state
-    survey.py      the figures of a task set
-    pictures.py    what the command line draws as PNG
+    survey.py      statistics of a task set
+    pictures.py    distances and histograms as PNG
     __main__.py    the command line: python -m trap_tube_jax.solver --help
 """
 

@@ -17,15 +17,15 @@ UNKNOWN = -1
 class Distances(struct.PyTreeNode):
     """Shortest distances in one task, in steps. NumPy arrays.
 
-    Both are addressed by the food's, the tool's (its top-left cell's) and the agent's
-    row and column, in this order: `to_goal[(*state.food, *state.tool)]` is a picture
-    i16[12, 12] over the agent's cells. They hold for the task's board and tool only.
+    The indices of both are row and column of the food, of the tool's top-left cell and of the
+    agent: `to_goal[(*state.food, *state.tool)]` is i16[12, 12] over the agent's cells. The
+    distances hold for the task's board and tool alone.
 
     Attributes:
-      from_start: i16[12, 12, 12, 12, 12, 12], steps from the task's first state; -1
-        where it cannot be reached.
-      to_goal: i16[12, 12, 12, 12, 12, 12], fewest steps until the reward: 0 where the
-        task is solved; -1 where it cannot be solved any more, or not be reached.
+      from_start: i16[12, 12, 12, 12, 12, 12], steps from the task's first state; -1 for
+        unreachable states.
+      to_goal: i16[12, 12, 12, 12, 12, 12], fewest steps until the reward; 0 for solved states,
+        -1 for states that are unreachable or have no way to the goal.
     """
 
     from_start: np.ndarray
@@ -33,28 +33,27 @@ class Distances(struct.PyTreeNode):
 
     @property
     def num_reachable(self) -> int:
-        """The number of distinct states that the task can reach, solved ones included."""
+        """Number of distinct reachable states, solved ones included."""
         return int(np.count_nonzero(self.from_start != UNKNOWN))
 
     def lookup(self, states: State) -> np.ndarray:
-        """i16[...]: `to_goal` of states of this task, with any leading axes."""
+        """Returns `to_goal` i16[...] of states of this task, with any leading axes."""
         cells = (np.asarray(cell) for cell in (states.food, states.tool, states.agent))
         return self.to_goal[tuple(axis for cell in cells for axis in np.moveaxis(cell, -1, 0))]
 
 
 def distances(state: State) -> Distances:
-    """Distances for every state that can be reached from `state`. Host side.
+    """Computes the distances of every state that is reachable from `state`. Host side.
 
     d(s) = 0 if s is solved, else 1 + min over the 16 actions a of d(step(s, a)).
 
-    It explores the whole graph, up to two million states, in seconds. `solve` stops at the
-    goal.
+    Exploring the whole graph, up to two million states, takes seconds. `solve` stops at the goal.
 
     Args:
       state: one unbatched state, at any time of an unfinished episode.
 
     Raises:
-      ValueError: as `solve`.
+      ValueError: see `solve`.
     """
     from_start, nodes, successors = _explore(checked(state))
     to_goal = _distances_to_goal(from_start, nodes, successors)
@@ -62,13 +61,13 @@ def distances(state: State) -> Distances:
 
 
 def _by_cells(table: np.ndarray) -> np.ndarray:
-    """A table by position as one by the cells of food, tool and agent, in this order."""
+    """Reorders a table by position to the cells of food, tool and agent."""
     by_agent_first = table.reshape((BOARD_SIZE,) * 6)
     return by_agent_first.transpose(4, 5, 2, 3, 0, 1)
 
 
 def count_reachable(state: State) -> int:
-    """`distances(state).num_reachable`, in less time and memory."""
+    """Computes `distances(state).num_reachable` in less time and memory."""
     num_open = 0
     solved = []
     for level in levels(checked(state)):
@@ -78,7 +77,7 @@ def count_reachable(state: State) -> int:
 
 
 def _explore(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`from_start` i16[144^3] by node, the unsolved nodes i32[n], their successors i32[n, 16]."""
+    """Returns `from_start` i16[144^3], the unsolved nodes i32[n], their successors i32[n, 16]."""
     from_start = np.full(NUM_POSITIONS, UNKNOWN, np.int16)
     nodes, successors = [], []
     for depth, level in enumerate(levels(state)):
@@ -93,7 +92,7 @@ def _explore(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _distances_to_goal(
     from_start: np.ndarray, nodes: np.ndarray, successors: np.ndarray
 ) -> np.ndarray:
-    """`to_goal` i16[144^3] by node: breadth-first, backward from the solved nodes."""
+    """Computes `to_goal` i16[144^3], breadth-first, backward from the solved nodes."""
     to_goal = np.where(from_start == UNKNOWN, np.int16(UNKNOWN), np.int16(0))
     to_goal[nodes] = UNKNOWN
     for distance in range(1, NUM_POSITIONS):

@@ -1,4 +1,4 @@
-"""What the solver's command line draws with matplotlib: distances and lengths as PNG."""
+"""Distances in a task and lengths of plans, drawn with matplotlib as PNG."""
 
 import os
 from collections.abc import Sequence
@@ -27,13 +27,13 @@ def save_distances(
 ) -> None:
     """Writes a PNG of the distance to the goal over the board, at moments of a plan.
 
-    A picture shows one place of tool and food. The number in a cell is how many steps
-    are left if the agent is there; no number: it cannot be there.
+    Tool and food stay in place within a picture. The number in a cell counts the steps that are
+    left if the agent is there. The agent cannot be in a cell without a number.
 
     Args:
       state: the task's first state.
-      plan: its plan; of an unsolvable task only the first moment is shown.
-      distances: its distances.
+      plan: the task's plan; an unsolvable task has one picture.
+      distances: the task's distances.
       path: the file to write.
     """
     states = replay(state, plan)
@@ -72,11 +72,11 @@ def save_histogram(surveys: Sequence[Survey], path: str | os.PathLike[str]) -> N
 
 
 def _draw_distances(axis: Axes, state: State, steps: np.ndarray, scale: Normalize) -> None:
-    """Draws the board, and over it steps i16[12, 12] by the agent's cell."""
+    """Draws the board, and steps i16[12, 12] by the agent's cell on top."""
     extent = (-0.5, BOARD_SIZE - 0.5, BOARD_SIZE - 0.5, -0.5)
     axis.imshow(np.asarray(render(state, CELL_SIZE)), extent=extent)
     shown = np.ma.masked_less(steps, 0)
-    shown[tuple(np.asarray(state.agent))] = np.ma.masked  # the agent's picture stays in sight
+    shown[tuple(np.asarray(state.agent))] = np.ma.masked  # keeps the agent visible
     axis.imshow(shown, norm=scale, cmap="viridis_r", extent=extent, alpha=0.8)
     for row, column in np.argwhere(~np.ma.getmaskarray(shown)):
         value = steps[row, column]

@@ -1,4 +1,4 @@
-"""Breadth-first search over a task's graph, and the shortest plans that it finds.
+"""Breadth-first search over a task's graph, and shortest plans.
 
 A node of the graph is a position, as `trap_tube_jax.positions` numbers them.
 
@@ -22,24 +22,22 @@ from trap_tube_jax.state import State, validate
 
 Record = TypeVar("Record")
 
-# Frontiers are padded to one of few sizes, since each size is compiled once.
+# Frontiers are padded to one of few sizes, because each size compiles once.
 CHUNK_SIZES = (256, 1024, 4096)
 
 
 class Plan(struct.PyTreeNode):
     """A shortest plan, or the result that there is none. NumPy arrays.
 
-    Of several shortest plans it is the first in the order of their action indices
-    (4 * grasp + move), compared step by step.
+    Ties go to the first plan in the order of action indices (4 * grasp + move), compared step by
+    step.
 
     Attributes:
-      actions: i32[L, 2], the (grasp, move) of every step. In a batch i32[B, L, 2], L
-        being the longest length. Shorter plans end in (-1, -1), which moves nothing, though
-        in an unsolved task it counts as a step. `Environment.step` raises ValueError for it
-        where its numbers are concrete.
-      length: i32[] or i32[B], the number of steps, which may exceed a step limit; -1 if
-        unsolvable.
-      solvable: bool[] or bool[B], whether any sequence of actions leads to the goal.
+      actions: i32[L, 2], the (grasp, move) of every step. In a batch i32[B, L, 2] with the
+        longest length L; shorter plans end in (-1, -1), which moves nothing. Outside jit
+        `Environment.step` refuses this padding.
+      length: i32[] or i32[B], number of steps, which may exceed a step limit; -1 if unsolvable.
+      solvable: bool[] or bool[B], some sequence of actions leads to the goal.
     """
 
     actions: np.ndarray
@@ -48,14 +46,14 @@ class Plan(struct.PyTreeNode):
 
 
 class Level(NamedTuple):
-    """All nodes at one distance from the start, and what follows them.
+    """All nodes at one distance from the start, and their successors.
 
     Attributes:
       nodes: i32[n], in the order of the first shortest plan that leads to each.
       successors: i32[n, 16], the node after each action.
-      solved: bool[n, 16], whether that action solves the task.
-      origin: i64[n], the flat index into the previous level's `successors` at which
-        each node was found first; empty at the start.
+      solved: bool[n, 16], the action solves the task.
+      origin: i64[n], flat index of each node's first occurrence in the previous level's
+        `successors`; empty at the start.
     """
 
     nodes: np.ndarray
@@ -65,7 +63,7 @@ class Level(NamedTuple):
 
 
 def solve(state: State) -> Plan:
-    """The shortest plan of one task, exact, for any valid state, own layouts included.
+    """Finds the shortest plan of one task, exactly, for any valid state.
 
     Runs on the host, outside jit and vmap. Colours and the step limit play no part.
 
@@ -73,7 +71,7 @@ def solve(state: State) -> Plan:
       state: one unbatched state, at any time of an unfinished episode.
 
     Returns:
-      The plan; replaying it through `Environment.step` pays the reward at its last step.
+      The plan, whose last step earns the reward of `Environment.step`.
 
     Raises:
       ValueError: the state is invalid (see `validate`), done, batched or traced.
@@ -82,7 +80,7 @@ def solve(state: State) -> Plan:
 
 
 def solve_batch(states: State) -> Plan:
-    """The shortest plans of many tasks, each exactly as `solve` finds it.
+    """Finds the shortest plans of many tasks, as `solve` does for each.
 
     Args:
       states: states with one leading axis B, as from `jax.vmap(env.reset)`.
@@ -91,10 +89,10 @@ def solve_batch(states: State) -> Plan:
       The plans with a leading axis B, padded to the longest (see `Plan`).
 
     Raises:
-      ValueError: `states` is not a batch, or a state is refused by `solve`; the message
-        names its index.
+      ValueError: `states` is not a batch, or `solve` refuses a state, whose index the message
+        names.
     """
-    # Many tasks of a set may be the same one; each is solved once.
+    # Tasks of a set may recur; each is solved once.
     found: dict[bytes, np.ndarray | None] = {}
     plans = []
     for state in _unbatched(states):
@@ -110,7 +108,7 @@ def solve_batch(states: State) -> Plan:
 
 
 def replay(state: State, plan: Plan) -> list[State]:
-    """The L + 1 states of a plan, the first included."""
+    """Returns the L + 1 states of a plan, the first included."""
     states = [state]
     for action in plan.actions:
         states.append(_step(states[-1], jnp.asarray(action)))
@@ -121,20 +119,20 @@ _step = jax.jit(dynamics.step)
 
 
 def checked(state: State) -> State:
-    """Returns a valid state as NumPy arrays; raises ValueError as `solve` does."""
+    """Returns a valid state as NumPy arrays; raises the errors of `solve`."""
     return validate(_to_host(state))
 
 
 def take(batch: Record, index: Any) -> Record:
-    """A tree of arrays at an index of their first axis: an integer, a slice or integers."""
+    """Indexes the first axis of a tree of arrays with an integer, a slice or integers."""
     return jax.tree.map(lambda field: field[index], batch)
 
 
 def levels(state: State) -> Iterator[Level]:
-    """The task's nodes by distance from the start, none twice, from distance 0 on.
+    """Yields the task's nodes by distance from the start, each node once.
 
-    Solved nodes end an episode: they appear as successors only. The search goes on until
-    no node is new; stop iterating to stop it earlier.
+    Solved nodes end an episode, so they appear as successors alone. The search ends where no
+    node is new; stop iterating to end it earlier.
 
     Args:
       state: a checked state.
@@ -149,7 +147,7 @@ def levels(state: State) -> Iterator[Level]:
         successors, solved = _expand_all(layout, nodes)
         yield Level(nodes, successors, solved, origin)
         new = np.flatnonzero(~(is_known[successors] | solved))
-        # Of equal entries the first counts, and the order is kept: `Plan` promises a tie-break.
+        # Keeping first occurrences in their order gives the tie-break that `Plan` promises.
         _, first = np.unique(successors.reshape(-1)[new], return_index=True)
         origin = new[np.sort(first)]
         nodes = successors.reshape(-1)[origin]
@@ -157,7 +155,7 @@ def levels(state: State) -> Iterator[Level]:
 
 
 def _shortest_actions(state: State) -> np.ndarray | None:
-    """i32[L]: the action indices of the first shortest plan; None if there is no plan."""
+    """Returns the action indices i32[L] of the first shortest plan, or None."""
     origins = []
     for level in levels(state):
         origins.append(level.origin)
@@ -167,7 +165,7 @@ def _shortest_actions(state: State) -> np.ndarray | None:
 
 
 def _trace_back(origins: Sequence[np.ndarray], last: int) -> np.ndarray:
-    """i32[L]: the actions on the way to entry `last` of the last level's `successors`."""
+    """Returns the action indices i32[L] that lead to entry `last` of the last `successors`."""
     actions = [last % NUM_ACTIONS]
     for origin in origins[:0:-1]:
         last = int(origin[last // NUM_ACTIONS])
@@ -176,7 +174,7 @@ def _trace_back(origins: Sequence[np.ndarray], last: int) -> np.ndarray:
 
 
 def _expand_all(layout: State, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The successors i32[n, 16] of nodes i32[n], and where they are solved bool[n, 16]."""
+    """Expands nodes as `_expand` does, in chunks of few sizes."""
     parts = []
     for start in range(0, len(nodes), CHUNK_SIZES[-1]):
         chunk = nodes[start : start + CHUNK_SIZES[-1]]
@@ -189,7 +187,7 @@ def _expand_all(layout: State, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 @jax.jit
 def _expand(layout: State, nodes: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The successors i32[n, 16] of nodes i32[n], and where they are solved bool[n, 16]."""
+    """Returns the successors i32[n, 16] of nodes i32[n], and bool[n, 16] where solved."""
     actions = action_from_index(jnp.arange(NUM_ACTIONS))
 
     def expand_node(node: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -201,7 +199,7 @@ def _expand(layout: State, nodes: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _state_at(layout: State, node: jax.Array) -> State:
-    """The state that a node i32[] is, on the board and with the tool of `layout`."""
+    """Returns the state of a node i32[], on the board and with the tool of `layout`."""
     agent, tool, food = cells_at(node).astype(jnp.int32)
     return layout.replace(agent=agent, tool=tool, food=food)
 
@@ -217,7 +215,6 @@ def _to_plan(indices: np.ndarray | None) -> Plan:
 
 
 def _unbatched(states: State) -> Iterator[State]:
-    """The checked states of a batch."""
     states = _to_host(states)
     if np.ndim(states.time) != 1 or not len(states.time):
         raise ValueError(
@@ -232,7 +229,7 @@ def _unbatched(states: State) -> Iterator[State]:
 
 
 def _fingerprint(state: State) -> bytes:
-    """Equal for two states exactly if they are the same task, whatever their colours."""
+    """Returns bytes that are equal exactly for states of the same task, colours aside."""
     fields = (state.board, state.tool_extent, state.food, state.tool, state.agent)
     return b"".join(np.asarray(field).tobytes() for field in fields)
 

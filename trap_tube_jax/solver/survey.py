@@ -26,8 +26,8 @@ class Survey:
     Attributes:
       task_set: the set.
       seed: the seed of the tasks.
-      length: i32[T], the shortest plan of every task; -1 if unsolvable.
-      reachable: i32[G], the distinct reachable states of each of the first G tasks.
+      length: i32[T], length of every task's shortest plan; -1 if unsolvable.
+      reachable: i32[G], number of distinct reachable states of each of the first G tasks.
     """
 
     task_set: TaskSet
