@@ -1,16 +1,14 @@
 """Play by hand in a terminal: `python -m trap_tube_jax.play PerceptualTrapTube-v0 --seed 3`.
 
 `press` maps a game and a key to the next game, and `screen` turns a game into coloured text.
-Only `_run` and `_draw` use the terminal.
 """
 
 import argparse
 import contextlib
 import dataclasses
-import functools
+import os
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
@@ -35,17 +33,13 @@ from trap_tube_jax.rendering import rgb
 from trap_tube_jax.solver import solve
 from trap_tube_jax.state import State
 
-Color = tuple[int, ...]  # red, green, blue
-Piece = tuple[str, Color | None]  # text and its background, or None for the terminal's own
-
-WIDTH = 66  # of the screen, in characters
 SIGNS = ["  ", "><", "()", "//", "\\\\", "@@", "||", "/\\"]  # by object code
 HORIZONTAL_TOOL = "=="
 AGENT_SIGNS = ("/\\", "\\/", "<-", "->")  # by grasp direction
 
-MOVE_KEYS = {"KEY_UP": 0, "KEY_DOWN": 1, "KEY_LEFT": 2, "KEY_RIGHT": 3} | {
-    key: direction for direction, key in enumerate("kjhl")
-}
+CLEAR_SCREEN = "\x1b[2J\x1b[H"
+ARROWS = {f"\x1b{mode}{code}": index for mode in "[O" for index, code in enumerate("ABDC")}
+MOVE_KEYS = ARROWS | {key: direction for direction, key in enumerate("kjhl")}
 GRASP_KEYS = {key: direction for direction, key in enumerate("wsad")}
 NEXT_TASK_KEYS = {"r": 0, "n": 1}  # by how much the seed grows
 HINT_KEY = "?"
@@ -98,7 +92,7 @@ def press(game: Game, key: str) -> Game:
 
     Args:
       game: the game.
-      key: its name in curses, such as "KEY_UP" or "w".
+      key: the characters that the terminal sends for it.
     """
     if key in GRASP_KEYS:
         return dataclasses.replace(game, grasp=GRASP_KEYS[key], message="")
@@ -118,8 +112,8 @@ def press(game: Game, key: str) -> Game:
     return dataclasses.replace(game, state=state, message=message)
 
 
-def screen(game: Game) -> list[list[Piece]]:
-    """Returns the lines of the screen: the board next to the keys and signs, and a message."""
+def screen(game: Game) -> str:
+    """Returns the board next to the keys and signs, and the message, as coloured text."""
     holds = "holds the tool" if holds_tool(game.state, game.grasp) else "empty"
     signs = [f"{SIGNS[code]} {OBJECT_NAMES[code]:<9}" for code in range(NUM_OBJECTS)]
     panel = (
@@ -130,11 +124,8 @@ def screen(game: Game) -> list[list[Piece]]:
         "",
         *map("".join, zip(signs[:4], signs[4:], strict=True)),
     )
-    return [
-        [(f"{game.name}   seed {game.seed}", None)],
-        *([*row, (f"   {text}", None)] for row, text in zip(_board(game), panel, strict=True)),
-        [(game.message, None)],
-    ]
+    lines = (f"{row}   {text}" for row, text in zip(_board(game), panel, strict=True))
+    return "\n".join([f"{game.name}   seed {game.seed}", *lines, game.message])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -177,84 +168,52 @@ def _outcome(state: State) -> str:
     return f"not solved in {state.time} steps.  r: restart" if state.truncated else ""
 
 
-def _board(game: Game) -> list[list[Piece]]:
+def _board(game: Game) -> list[str]:
     """Draws the board, two characters a cell, inside a frame."""
-    colors = list(map(tuple, np.asarray(rgb(game.state.palette)).tolist()))
     signs = SIGNS.copy()
     signs[AGENT] = AGENT_SIGNS[game.grasp]
     if game.state.tool_extent[1] > 1:
         signs[TOOL] = HORIZONTAL_TOOL
-    edge: list[Piece] = [("+" + "--" * BOARD_SIZE + "+", None)]
+    colors = np.asarray(rgb(game.state.palette)).tolist()
+    cells = [_colored(sign, color) for sign, color in zip(signs, colors, strict=True)]
+    edge = "+" + "--" * BOARD_SIZE + "+"
     rows = np.asarray(visible_objects(game.state)).tolist()
-    cells = [[(signs[code], colors[code]) for code in row] for row in rows]
-    return [edge, *([("|", None), *row, ("|", None)] for row in cells), edge]
+    return [edge, *(f"|{''.join(cells[code] for code in row)}|" for row in rows), edge]
+
+
+def _colored(text: str, color: Sequence[int]) -> str:
+    """Writes black or white on the nearest of xterm's 6 x 6 x 6 colours, 16 to 231."""
+    background = 16 + int(np.rint(np.array(color) / 51) @ (36, 6, 1))
+    ink = 231 if np.dot(color, LUMA) < 128 else 16
+    return f"\x1b[1;38;5;{ink};48;5;{background}m{text}\x1b[0m"
 
 
 def _play(game: Game) -> None:
-    """Plays, or raises ValueError where there is no terminal to play in."""
+    """Draws and reads keys until the player quits; raises ValueError without a terminal."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise ValueError("play needs a terminal; its input or output is not one")
+    with _single_keys(sys.stdin.fileno()) as terminal, contextlib.suppress(KeyboardInterrupt):
+        key = " "
+        while key not in ("q", ""):  # nothing is read where the terminal is closed
+            print(CLEAR_SCREEN + screen(game), flush=True)
+            key = os.read(terminal, 8).decode(errors="replace")
+            if key == HINT_KEY:
+                print("thinking ...", flush=True)  # the search takes a moment
+            game = press(game, key)
+
+
+@contextlib.contextmanager
+def _single_keys(terminal: int) -> Iterator[int]:
+    """Lets a terminal send keys at once and unseen, inside the `with` block."""
+    import termios  # noqa: PLC0415  absent on Windows
+    import tty  # noqa: PLC0415
+
+    before = termios.tcgetattr(terminal)
+    tty.setcbreak(terminal)
     try:
-        import curses  # noqa: PLC0415 - absent on Windows
-    except ImportError:
-        raise ValueError("needs the module curses: pip install windows-curses") from None
-    try:
-        if not (sys.stdin.isatty() and sys.stdout.isatty()):
-            raise curses.error("its input or output is not a terminal")
-        curses.setupterm()
-        if not curses.tigetstr("cup"):
-            raise curses.error("the terminal cannot place its cursor")
-        curses.wrapper(_run, game)
-    except curses.error as error:
-        raise ValueError(f"play needs a terminal: {error}") from None
-
-
-def _run(window: Any, game: Game) -> None:
-    """Draws and reads keys until the player quits."""
-    import curses  # noqa: PLC0415 - absent on Windows
-
-    if curses.has_colors():
-        curses.use_default_colors()
-    with contextlib.suppress(curses.error):  # a terminal that cannot hide its cursor
-        curses.curs_set(0)
-    key = ""
-    while key != "q":
-        _draw(window, game)
-        try:
-            key = window.getkey()
-        except (KeyboardInterrupt, curses.error):
-            return
-        if key == HINT_KEY:  # the search takes a moment
-            _draw(window, dataclasses.replace(game, message="thinking ..."))
-        game = press(game, key)
-
-
-def _draw(window: Any, game: Game) -> None:
-    """Draws the screen, or the size that it needs."""
-    height, width = window.getmaxyx()
-    lines = screen(game)
-    if height < len(lines) or width < WIDTH:
-        text = f"{width} x {height} is too small: play needs {WIDTH} x {len(lines)}"
-        lines = [[(text[: max(width - 1, 0)], None)]]
-    window.erase()
-    for row, line in enumerate(lines):
-        window.move(row, 0)
-        for text, color in line:
-            window.addstr(text, 0 if color is None else _attribute(color))
-    window.refresh()
-
-
-@functools.cache
-def _attribute(color: Color) -> int:
-    """Returns curses' attribute for black or white on a colour; 0 where there are too few."""
-    import curses  # noqa: PLC0415 - absent on Windows
-
-    if not curses.has_colors() or curses.COLORS < 256:
-        return 0
-    # Of xterm's colours 16 to 231, a 6 x 6 x 6 cube. Each is the number of a pair too, since some
-    # terminals have no more than 256 pairs.
-    background = 16 + int(np.rint(np.array(color) / 51) @ (36, 6, 1))
-    is_dark = np.dot(color, LUMA) < 128
-    curses.init_pair(background, 231 if is_dark else 16, background)
-    return curses.color_pair(background) | curses.A_BOLD
+        yield terminal
+    finally:
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
 
 if __name__ == "__main__":
