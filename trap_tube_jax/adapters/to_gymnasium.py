@@ -8,7 +8,6 @@ Importing `trap_tube_jax` registers them where Gymnasium >= 1.1 is installed:
 Both take the keyword arguments of the classes below. The step limit is `max_steps`.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,9 +23,8 @@ from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe, render_ascii
 from trap_tube_jax.registry import make, registered_ids
 from trap_tube_jax.rendering import render
-from trap_tube_jax.state import TimeStep
 from trap_tube_jax.vector import VectorEnvironment, VectorState
-from trap_tube_jax.wrappers import AutoReset, AutoResetState, AutoResetTimeStep
+from trap_tube_jax.wrappers import AutoReset, AutoResetState
 
 with needs_extra("interop"):
     import gymnasium  # pyright: ignore[reportMissingImports]
@@ -38,6 +36,14 @@ NAMESPACE = "trap_tube_jax"
 RENDER_MODES = ("rgb_array", "ansi")
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}
 AUTORESET_MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+
+# Equal environments share their compiled programs.
+_reset = jax.jit(lambda env, key: env.reset(key), static_argnums=0)
+_observe = jax.jit(jax.vmap(observe))
+_step = jax.jit(Environment.step, static_argnums=0)
+_step_batch = jax.jit(
+    lambda batch, state, actions: batch.step(state, actions), static_argnums=0, donate_argnums=1
+)
 
 
 class TrapTubeEnv(gymnasium.Env):
@@ -86,6 +92,7 @@ class TrapTubeEnv(gymnasium.Env):
                 f"render_mode must be None or one of {', '.join(RENDER_MODES)}, got {render_mode!r}"
             )
         self.env = task_set
+        self._auto_reset = AutoReset(task_set)
         self.render_mode = render_mode
         self.cell_size = check_integer("cell_size", cell_size)
         spec = self.env.observation_spec
@@ -101,7 +108,7 @@ class TrapTubeEnv(gymnasium.Env):
         super().reset(seed=seed)
         state = self._state
         key = _keys([self.np_random_seed])[0] if seed is not None or state is None else state.key
-        self._state, timestep = _reset(self.env, key)
+        self._state, timestep = _reset(self._auto_reset, key)
         return np.array(timestep.observation), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -179,7 +186,8 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = one.action_space
         self.observation_space = batch_space(one.observation_space, num_envs)
         self.action_space = batch_space(one.action_space, num_envs)
-        self._is_same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
+        is_same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
+        self._batch = (VectorEnvironment if is_same_step else NextStepVectorEnvironment)(self.env)
         self._state: VectorState | None = None
 
     def reset(
@@ -204,7 +212,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         mask = (options or {}).get("reset_mask")
         if mask is None:
             keys = self._next_keys(seed)
-            self._state, timestep = _reset_batch(self._is_same_step, self.env, keys)
+            self._state, timestep = _reset(self._batch, keys)
             return np.array(timestep.observation), {}
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
@@ -212,9 +220,14 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
                 f"reset_mask must be bool[{self.num_envs}] with at least one true, got {mask}"
             )
         state = _started(self._state)
-        keys = self._next_keys(seed)
-        self._state, observations = _reset_some(self._is_same_step, self.env, state, keys, mask)
-        return np.array(observations), {}
+        fresh, _ = _reset(self._batch, self._next_keys(seed))
+        state = jax.tree.map(
+            lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+            fresh,
+            state,
+        )
+        self._state = state
+        return np.array(_observe(state.episodes.inner)), {}
 
     def step(
         self, actions: Any
@@ -227,10 +240,10 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         """
         state = _started(self._state)
         actions = _grasp_and_move(actions, self.single_action_space, self.num_envs)
-        self._state, timestep = _step_batch(self._is_same_step, self.env, state, actions)
+        self._state, timestep = _step_batch(self._batch, state, actions)
         terminations, truncations = np.array(timestep.terminated), np.array(timestep.truncated)
         infos: dict[str, Any] = {}
-        if self._is_same_step:
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
             infos = _final_infos(np.asarray(timestep.final_observation), terminations | truncations)
         return (
             np.array(timestep.observation),
@@ -291,49 +304,9 @@ def register() -> None:
             )
 
 
-# Equal environments share their compiled programs.
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _reset(env: Environment, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
-    return AutoReset(env).reset(key)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _step(env: Environment, state: Any, action: jax.Array) -> tuple[Any, TimeStep]:
-    return env.step(state, action)
-
-
-def _batch(same_step: bool, env: Environment) -> VectorEnvironment:
-    return VectorEnvironment(env) if same_step else NextStepVectorEnvironment(env)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _reset_batch(
-    same_step: bool, env: Environment, keys: jax.Array
-) -> tuple[VectorState, AutoResetTimeStep]:
-    return _batch(same_step, env).reset(keys)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _reset_some(
-    same_step: bool, env: Environment, state: VectorState, keys: jax.Array, mask: jax.Array
-) -> tuple[VectorState, jax.Array]:
-    """Resets the environments in a mask bool[B]; returns the states and all observations."""
-    fresh, _ = _batch(same_step, env).reset(keys)
-
-    def select(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-    state = jax.tree.map(select, fresh, state)
-    return state, jax.vmap(observe)(state.episodes.inner)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1), donate_argnums=2)
-def _step_batch(
-    same_step: bool, env: Environment, state: VectorState, actions: jax.Array
-) -> tuple[VectorState, AutoResetTimeStep]:
-    return _batch(same_step, env).step(state, actions)
+def _keys(seeds: Sequence[Any]) -> jax.Array:
+    """Returns one PRNG key per seed, modulo 2**32."""
+    return jax.vmap(jax.random.key)(np.array([seed % 2**32 for seed in seeds], np.uint32))
 
 
 def _started(state: Any) -> Any:
@@ -360,11 +333,6 @@ def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:
         raise ValueError(f"actions must be from 0 to {count - 1}, got {actions!r}")
     pairs = np.stack(np.divmod(array, NUM_DIRECTIONS), axis=-1) if is_flat else array
     return pairs.astype(np.int32)
-
-
-def _keys(seeds: Sequence[Any]) -> jax.Array:
-    """Returns one PRNG key per seed, modulo 2**32."""
-    return jax.vmap(jax.random.key)(np.array([seed % 2**32 for seed in seeds], np.uint32))
 
 
 def _final_infos(observations: np.ndarray, ended: np.ndarray) -> dict[str, Any]:
