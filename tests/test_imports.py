@@ -28,7 +28,7 @@ ENVIRONMENT = (
     ("controls", "registry"),
     ("rendering", "solver"),
     ("scoring",),
-    ("adapters", "contact_sheet", "gallery", "play"),
+    ("adapters", "gallery", "play"),
 )
 AGENTS = (
     ("arrays", "command_line", "registry"),

@@ -1,38 +1,77 @@
-"""Draws a contact sheet of the eight task sets, and solved episodes as GIFs.
+"""Draws tasks of the eight task sets in one picture, and solved episodes as GIFs.
 
 On the command line: `python -m trap_tube_jax.gallery --output figures --gifs`.
 """
 
 import argparse
+import os
 import pathlib
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
 
+from trap_tube_jax.checks import check_integer, check_seed
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.registry import make
-from trap_tube_jax.rendering import episode_frames, save_gif
+from trap_tube_jax.imports import needs_extra
+from trap_tube_jax.objects import NUM_OBJECTS, OBJECT_NAMES
+from trap_tube_jax.observation import visible_objects
+from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
+from trap_tube_jax.rendering import episode_frames, render, save_gif
 from trap_tube_jax.solver import solve
-from trap_tube_jax.state import State
+from trap_tube_jax.state import base_state
+from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
 
+CHANGES: dict[Transfer, str] = {
+    perceptual: "layout",
+    structural: "colours",
+    symbolic: "role of the tool",
+}
 SOLVED_SETS = ("base", "p", "st", "sy", "pstsy")
+DRAWS = 64  # tasks of which the first distinct ones are shown
+CELL_SIZE = 16  # pixels
+SIGN_SIZE = 48  # pixels
 
 
-def solved_episode(state: State, cell_size: int = 20) -> np.ndarray:
-    """Draws a shortest solution with the agent's hand, u8[L + 1, 12 s, 12 s, 3].
+def save_gallery(
+    path: str | os.PathLike[str],
+    ids: Sequence[str] = tuple(entry.id for entry in PAPER_TASK_SETS),
+    *,
+    tasks: int = 4,
+    seed: int = 0,
+) -> None:
+    """Writes a PNG of task sets with some of their tasks each, and a legend of the objects.
 
     Args:
-      state: one unbatched state.
-      cell_size: s >= 1, pixels per cell and side.
+      path: the file to write.
+      ids: the task sets, at least one; the paper's eight if absent.
+      tasks: most tasks per set, at least 2: the first distinct ones of 64 draws.
+      seed: seed of the tasks, 0 to 2**32 - 1.
 
     Raises:
-      ValueError: the task has no solution.
+      ValueError: an argument is invalid; the message says what is allowed.
+      ImportError: matplotlib is not installed.
     """
-    plan = solve(state)
-    if not plan.solvable:
-        raise ValueError("the task has no solution, so there is no episode to show")
-    return episode_frames(state, plan.actions, cell_size)
+    tasks, seed = check_integer("tasks", tasks, 2), check_seed(seed)
+    if isinstance(ids, str) or not ids:
+        raise ValueError(f"ids must name at least one task set, as in ('base', 'p'), got {ids!r}")
+    entries = [task_set(name) for name in ids]
+    with needs_extra("pictures"):
+        from matplotlib.figure import Figure  # noqa: PLC0415  importing stays light
+
+    rows = -(-len(entries) // 2)
+    figure = Figure(figsize=(2.8 * tasks + 1, 2 * rows + 0.7), layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=(2 * rows, 0.7))
+    sets, legend = parts
+    for panel, entry in zip(sets.subfigures(rows, 2, squeeze=False).flat, entries, strict=False):
+        panel.suptitle(_title(entry), x=0.02, ha="left")
+        _draw(panel.subplots(1, tasks), _distinct_tasks(entry, tasks, seed))
+    axes = legend.subplots(1, NUM_OBJECTS)
+    _draw(axes, _signs())
+    for axis, name in zip(axes, OBJECT_NAMES, strict=True):
+        axis.set_title(name, size="medium")
+    figure.savefig(path, format="png", dpi=130)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -44,30 +83,49 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     add = parser.add_argument
     add("--output", type=pathlib.Path, default=".", help="folder of gallery.png and the GIFs")
-    add("--tasks", type=int, default=4, help="different tasks per set, at least 2")
-    add("--cell-size", type=int, default=16, help="pixels per cell and side, at least 8")
+    add("--tasks", type=int, default=4, help="distinct tasks per set, at least 2")
     add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1")
-    add("--gifs", action="store_true", help="solve a task each of base, p, st, sy and pstsy")
+    add("--gifs", action="store_true", help="also solve a task each of base, p, st, sy and pstsy")
     options = parser.parse_args(arguments)
     with plain_errors():
-        for path in _save(options):
-            print(path)
+        options.output.mkdir(parents=True, exist_ok=True)
+        paths = [options.output / "gallery.png"]
+        save_gallery(paths[0], tasks=options.tasks, seed=options.seed)
+        for short in SOLVED_SETS if options.gifs else ():
+            state, _ = make(short).reset(jax.random.key(options.seed))
+            paths.append(options.output / f"solved_{short}.gif")
+            save_gif(episode_frames(state, solve(state).actions), paths[-1], fps=4)
+        print(*paths, sep="\n")
 
 
-def _save(options: argparse.Namespace) -> list[pathlib.Path]:
-    """Writes the pictures and returns their paths."""
-    from trap_tube_jax.contact_sheet import contact_sheet  # noqa: PLC0415  needs pillow
+def _title(entry: TaskSet) -> str:
+    changes = ", ".join(CHANGES.get(transfer, "own") for transfer in entry.transfers)
+    return f"{entry.id}\n{entry.label}: {f'changes {changes}' if changes else 'the base task'}"
 
-    folder = options.output
-    folder.mkdir(parents=True, exist_ok=True)
-    sheet = contact_sheet(tasks=options.tasks, cell_size=options.cell_size, seed=options.seed)
-    sheet.save(folder / "gallery.png", optimize=True)
-    paths = [folder / "gallery.png"]
-    for short in SOLVED_SETS if options.gifs else ():
-        state, _ = make(short).reset(jax.random.key(options.seed))
-        paths.append(folder / f"solved_{short}.gif")
-        save_gif(solved_episode(state), paths[-1], fps=4)
-    return paths
+
+def _draw(axes: np.ndarray, pictures: np.ndarray) -> None:
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, picture in zip(axes, pictures, strict=False):
+        axis.imshow(picture, interpolation="nearest")
+
+
+def _distinct_tasks(entry: TaskSet, tasks: int, seed: int) -> np.ndarray:
+    """Draws the first K <= `tasks` distinct tasks among `DRAWS`, u8[K, 12 s, 12 s, 3]."""
+    keys = jax.random.split(jax.random.key(seed), DRAWS)
+    states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
+    pictures = np.asarray(jax.vmap(lambda state: render(state, CELL_SIZE))(states))
+    _, first = np.unique(pictures.reshape(DRAWS, -1), axis=0, return_index=True)
+    return pictures[np.sort(first)[:tasks]]
+
+
+def _signs() -> np.ndarray:
+    """Cuts each object out of the base task, u8[8, s, s, 3]."""
+    state = base_state()
+    cells = np.asarray(render(state, SIGN_SIZE)).reshape(12, SIGN_SIZE, 12, SIGN_SIZE, 3)
+    objects = np.asarray(visible_objects(state))
+    places = [np.argwhere(objects == code)[0] for code in range(NUM_OBJECTS)]
+    return np.stack([cells[row, :, column] for row, column in places])
 
 
 if __name__ == "__main__":

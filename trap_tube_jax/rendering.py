@@ -23,7 +23,6 @@ from trap_tube_jax.geometry import unit_vector
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import (
     AGENT,
-    BASE_COLORS,
     BOARD_SIZE,
     EXIT,
     FOOD,
@@ -88,27 +87,6 @@ def rgb(features: jax.Array) -> jax.Array:
     if num_features == 2:
         return jnp.pad(features, [*[(0, 0)] * (features.ndim - 1), (0, 1)])
     return features[..., :3]
-
-
-def render_object(code: int, cell_size: int = 32) -> np.ndarray:
-    """Draws an object in its base colour with its sign, for legends. Host side.
-
-    Args:
-      code: the object's code, 0 to 7.
-      cell_size: s >= 1, pixels per side.
-
-    Returns:
-      u8[s, s, 3].
-
-    Raises:
-      ValueError: `code` or `cell_size` is out of range.
-    """
-    cell_size = check_integer("cell_size", cell_size)
-    if code not in range(NUM_OBJECTS):
-        raise ValueError(f"code must be an object code from 0 to {NUM_OBJECTS - 1}, got {code!r}")
-    color = np.broadcast_to(BASE_COLORS[code], (cell_size, cell_size, 3)).astype(np.float32)
-    sign = _signs(cell_size)[code]
-    return np.asarray(_to_pixels(_blend(color, _ink(color), sign * SIGN_OPACITY)))
 
 
 def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarray:

@@ -1,51 +1,67 @@
-"""The pictures of solved episodes, and the command line."""
+"""The gallery of task sets and its command line."""
+
+import sys
 
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 import trap_tube_jax as tt
+from refusal import refused
 from trap_tube_jax import gallery
+from trap_tube_jax.objects import OBJECT_NAMES
 
 
-def test_a_solved_episode_ends_on_the_food():
-    frames = gallery.solved_episode(tt.base_state(), 1)
-    assert len(frames) == 12
-    food, agent = tt.base_palette()[[5, 7]]
-    assert (frames[0] == food).all(-1).any()
-    assert not (frames[-1] == food).all(-1).any()
-    assert (frames[-1] == agent).all(-1).sum() == 1
+def test_the_gallery_shows_distinct_tasks_of_the_seed_and_a_legend(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: figures.append(figure))
+    gallery.save_gallery(tmp_path / "none.png", ("base", "sy"), tasks=5, seed=4)
+    base, sy, legend = np.split(np.array(figures[0].axes), [5, 10])
+    assert [len(axis.images) for axis in base] == [1, 0, 0, 0, 0]
+    np.testing.assert_array_equal(
+        base[0].images[0].get_array(), tt.render(tt.base_state(), gallery.CELL_SIZE)
+    )
+    pictures = [np.asarray(axis.images[0].get_array()) for axis in sy]
+    assert len({picture.tobytes() for picture in pictures}) == 5
+    keys = jax.random.split(jax.random.key(4), gallery.DRAWS)
+    state, _ = jax.jit(tt.make("sy").reset)(keys[0])
+    np.testing.assert_array_equal(pictures[0], tt.render(state, gallery.CELL_SIZE))
+    assert [axis.get_title() for axis in legend] == list(OBJECT_NAMES)
+    corners = [np.asarray(axis.images[0].get_array())[5, 1] for axis in legend]
+    np.testing.assert_array_equal(corners, tt.base_palette())
 
 
-def test_no_episode_of_an_unsolvable_task():
-    board = np.zeros((12, 12), np.uint8)
-    board[[0, 1, 1], [1, 0, 1]] = 3
-    state = tt.State.create(board=board, agent=(9, 9), tool=(5, 5), tool_extent=(1, 1), food=(0, 0))
-    with pytest.raises(ValueError, match="no solution"):
-        gallery.solved_episode(state, 1)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tasks": 1}, "tasks must be an integer >= 2, got 1"),
+        ({"seed": 2**32}, "seed must be an integer >= 0 and <= 4294967295, got 4294967296"),
+        ({"ids": ()}, "at least one task set"),
+        ({"ids": "base"}, r"at least one task set, as in \('base', 'p'\), got 'base'"),
+        ({"ids": ("nonesuch",)}, "unknown task set 'nonesuch'; allowed"),
+    ],
+)
+def test_the_gallery_refuses(options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        gallery.save_gallery(tmp_path / "none.png", **options)
 
 
 def test_the_command_line_writes_the_pictures(tmp_path, monkeypatch, capsys):
-    given, drawn = {}, []
-
-    def sheet(**options):
-        given.update(options)
-        return Image.new("RGB", (4, 4))
-
-    def episode(state):
-        drawn.append(state.tool)
-        return np.zeros((1, 4, 4, 3), np.uint8)
-
-    monkeypatch.setattr("trap_tube_jax.contact_sheet.contact_sheet", sheet)
-    monkeypatch.setattr(gallery, "solved_episode", episode)
-    monkeypatch.setattr(gallery, "SOLVED_SETS", ("sy",))
+    given = {}
+    monkeypatch.setattr(gallery, "save_gallery", lambda path, **options: given.update(options))
+    monkeypatch.setattr(gallery, "SOLVED_SETS", ("base",))
     folder = tmp_path / "new"
-    options = ["--tasks", "3", "--cell-size", "9", "--seed", "5", "--gifs"]
-    gallery.main(["--output", str(folder), *options])
-    assert given == {"tasks": 3, "cell_size": 9, "seed": 5}
-    state, _ = jax.jit(tt.make("sy").reset)(jax.random.key(5))
-    np.testing.assert_array_equal(drawn, [state.tool])
-    files = [folder / "gallery.png", folder / "solved_sy.gif"]
-    assert sorted(folder.iterdir()) == files
+    gallery.main(["--output", str(folder), "--tasks", "3", "--seed", "5", "--gifs"])
+    assert given == {"tasks": 3, "seed": 5}
+    with Image.open(folder / "solved_base.gif") as gif:
+        assert getattr(gif, "n_frames", 1) == 12
+    files = [folder / "gallery.png", folder / "solved_base.gif"]
     assert capsys.readouterr().out.splitlines() == [str(file) for file in files]
+
+
+def test_without_matplotlib_the_command_line_names_the_extra(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    words = refused(capsys, gallery.main, "--output", tmp_path)
+    assert "pip install 'trap-tube-jax[pictures]'" in words

@@ -129,24 +129,10 @@ def test_render_maps_over_batches():
     np.testing.assert_array_equal(batch[1], tt.render(moved, CELL, grasp=3))
 
 
-def test_legend_tiles_match_the_board():
-    tiles = cells(tt.render(tt.base_state(), CELL, grid=False))
-    for code, cell in ((objects.TRAP, (5, 4)), (objects.EXIT, (5, 7)), (objects.AGENT, (9, 1))):
-        np.testing.assert_array_equal(rendering.render_object(code, CELL), tiles[cell])
-    assert rendering.render_object(objects.TOOL, 3).shape == (3, 3, 3)
-
-
 @pytest.mark.parametrize("size", [0, -1, 2.5, True, "8"])
 def test_render_refuses_other_cell_sizes(size):
     with pytest.raises(ValueError, match="cell_size must be"):
         tt.render(tt.base_state(), size)
-    with pytest.raises(ValueError, match="cell_size must be"):
-        rendering.render_object(0, size)
-
-
-def test_render_object_refuses_unknown_codes():
-    with pytest.raises(ValueError, match="from 0 to 7, got 8"):
-        rendering.render_object(8)
 
 
 def test_episode_frames_show_every_state_and_grasp():
