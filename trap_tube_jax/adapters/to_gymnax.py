@@ -22,16 +22,7 @@ from jax.core import Tracer
 
 from trap_tube_jax.environment import Environment, action_from_index
 from trap_tube_jax.imports import needs_extra
-from trap_tube_jax.objects import (
-    BOARD_SIZE,
-    MAX_STEPS,
-    MAX_TOOL_LENGTH,
-    NO_DIRECTION,
-    NUM_ACTIONS,
-    NUM_DIRECTIONS,
-    NUM_OBJECTS,
-    STATIC_OBJECTS,
-)
+from trap_tube_jax.objects import MAX_STEPS, NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
 from trap_tube_jax.registry import make as make_environment
 from trap_tube_jax.registry import registered_ids
@@ -143,24 +134,6 @@ class _TrapTube(environment.Environment):
         del params
         return spaces.Box(0, 255, self._env.observation_spec.shape, jnp.uint8)
 
-    def state_space(self, params: EnvParams) -> Any:
-        """Returns a `Dict` with the fields of `trap_tube_jax.State`."""
-        cell = spaces.Box(0, BOARD_SIZE - 1, (2,), jnp.int32)
-        flag = spaces.Box(0, 1, (), jnp.bool_)
-        return spaces.Dict(
-            {
-                "board": spaces.Box(0, max(STATIC_OBJECTS), (BOARD_SIZE, BOARD_SIZE), jnp.uint8),
-                "palette": spaces.Box(0, 255, (NUM_OBJECTS, self._env.num_features), jnp.uint8),
-                "agent": cell,
-                "tool": cell,
-                "tool_extent": spaces.Box(1, MAX_TOOL_LENGTH, (2,), jnp.int32),
-                "food": cell,
-                "time": spaces.Box(0, params.max_steps_in_episode, (), jnp.int32),
-                "terminated": flag,
-                "truncated": flag,
-            }
-        )
-
     def _transition(self, state: State, action: Any, params: EnvParams) -> tuple[State, TimeStep]:
         """Takes the environment's step under the step limit in `params`."""
         state, timestep = self._env.step(state, _pair(action) if self.flat_actions else action)
@@ -188,22 +161,20 @@ class FiveValueTrapTube(_TrapTube):
         self,
         task_set: str | Environment = "TrapTube-v0",
         *,
-        flat_actions: bool = True,
-        num_features: int | None = None,
         final_observation: bool = False,
+        **options: Any,
     ):
         """Checks the arguments.
 
         Args:
           task_set: registered id or short name, or an `Environment` of your own.
-          flat_actions: takes 4 * grasp + move in place of (grasp, move).
-          num_features: N, the feature channels of the observation.
           final_observation: adds the observation before any reset to `info`.
+          **options: flat_actions and num_features, see `SixValueTrapTube`.
 
         Raises:
           ValueError: an argument is invalid; the message says what is allowed.
         """
-        super().__init__(task_set, flat_actions=flat_actions, num_features=num_features)
+        super().__init__(task_set, **options)
         self.final_observation = final_observation
 
     @functools.partial(jax.jit, static_argnames=("self",))

@@ -17,7 +17,7 @@ from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
 from trap_tube_jax.rendering import episode_frames, save_gif
-from trap_tube_jax.solver.distance import Distances, distances
+from trap_tube_jax.solver.distance import distances
 from trap_tube_jax.solver.search import Plan, replay, solve
 from trap_tube_jax.solver.survey import QUANTILES, Survey, survey
 from trap_tube_jax.state import State
@@ -108,9 +108,11 @@ def _distances(options: argparse.Namespace) -> None:
         "id": task_set(options.distances).id,
         "seed": options.seed,
         "length": int(plan.length),
-        **_counts(found),
+        "reachable": found.num_reachable,
+        "solvable": int(np.count_nonzero(found.to_goal >= 0)),
+        "farthest": int(found.to_goal.max()),
     }
-    _print(options, report, _distances_line(plan, found))
+    _print(options, report, "\n".join(f"{name}: {value}" for name, value in report.items()))
     print(f"picture: {path}", file=sys.stderr)
 
 
@@ -145,36 +147,15 @@ def _number(value: float | None, digits: int, unit: int = 1) -> str:
     return "-" if value is None else f"{value / unit:,.{digits}f}"
 
 
-def _counts(found: Distances) -> dict[str, int]:
-    """Counts reachable states and those with a way to the goal, and measures the longest way."""
-    return {
-        "reachable": found.num_reachable,
-        "solvable": int(np.count_nonzero(found.to_goal >= 0)),
-        "farthest": int(found.to_goal.max()),
-    }
-
-
-def _distances_line(plan: Plan, found: Distances) -> str:
-    reachable, solvable, farthest = _counts(found).values()
-    way = "none of them with a way to the goal"
-    if solvable:
-        way = f"{solvable:,} of them with a way to the goal, at most {farthest} steps"
-    return f"{reachable:,} reachable states, {way}; {_outcome(plan)} from the start"
-
-
 def _task(name: str, seed: int) -> State:
     return make(name).reset(jax.random.key(check_seed(seed)))[0]
 
 
 def _caption(plan: Plan, time: int) -> str:
-    if time == 0:
-        return f"start ({_outcome(plan)})"
-    grasp, move = (DIRECTION_NAMES[direction] for direction in plan.actions[time - 1])
-    return f"step {time}: grasp {grasp}, move {move}"
-
-
-def _outcome(plan: Plan) -> str:
-    return f"{plan.length} steps" if plan.solvable else "unsolvable"
+    if time:
+        grasp, move = (DIRECTION_NAMES[direction] for direction in plan.actions[time - 1])
+        return f"step {time}: grasp {grasp}, move {move}"
+    return f"start ({f'{plan.length} steps' if plan.solvable else 'unsolvable'})"
 
 
 if __name__ == "__main__":
