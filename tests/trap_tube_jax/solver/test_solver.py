@@ -359,7 +359,7 @@ def test_pictures_of_distances_count_the_steps_that_are_left(
     assert len(drawn) == pictures.MOMENTS
     for axis, state, steps in drawn:
         left, agent = found.lookup(state), tuple(np.asarray(state.agent).tolist())
-        assert axis.get_title() == f"{left} steps left"
+        assert axis.get_title() == f"steps left: {left}"
         assert steps[agent] == left
         numbers = {text.get_position()[::-1]: int(text.get_text()) for text in axis.texts}
         cells = {tuple(cell) for cell in np.argwhere(steps >= 0).tolist()}
