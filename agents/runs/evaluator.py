@@ -15,22 +15,21 @@ from trap_tube_jax.scoring.tasks import Purpose, evaluation_tasks
 
 
 class PeriodicEvaluator:
-    """Evaluates the seeds of a run every so many iterations and keeps the best parameters.
+    """Evaluates the seeds of a run as training goes and keeps the best parameters.
 
     Parameters are the best if they solve the highest mean fraction of the validation tasks over
     all sets; base, a single task, counts only where it is trained on.
     """
 
-    def __init__(self, folder: RunFolder, run: Run, sets: Sequence[str], every: int):
+    def __init__(self, folder: RunFolder, run: Run, sets: Sequence[str]):
         """Draws the tasks.
 
         Args:
           folder: the run's files.
           run: what is trained.
           sets: short names of the task sets.
-          every: iterations from one evaluation to the next.
         """
-        self._folder, self._every = folder, every
+        self._folder = folder
         trained_on_base = task_set(run.config.env_id).short == "base"
         self._ranked = [name for name in sets if name != "base" or trained_on_base] or list(sets)
         self._evaluator = make_evaluator(run, sets, run.config.eval_episodes, "validation")
@@ -45,10 +44,6 @@ class PeriodicEvaluator:
                 scores.setdefault(key, []).append(row["solved"] / row["tasks"])
         for (seed, _), shares in scores.items():
             self._best[seed] = max(self._best.get(seed, -1.0), float(np.mean(shares)))
-
-    def is_due(self, iteration: int) -> bool:
-        """Returns whether this iteration is evaluated."""
-        return iteration % self._every == 0
 
     def evaluate(self, seed: int, policy: Policy) -> list[Row]:
         """Plays with the policy of one seed; returns its rows of `evaluations.csv`."""

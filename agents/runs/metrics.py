@@ -5,6 +5,7 @@ iteration and task set.
 """
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,31 +31,30 @@ class CsvLog:
           last_iteration: iteration from which training continues; 0 starts anew.
         """
         self._path = path
-        kept = [row for row in read_rows(path) if row["iteration"] <= last_iteration]
-        self.rows: list[Row] = []
-        if path.exists():
-            write_text(path, "")
-            self.append(kept)
+        rows = read_rows(path)
+        self.rows: list[Row] = [row for row in rows if row["iteration"] <= last_iteration]
+        if rows:
+            write_text(path, self._lines(self.rows, header=True))
 
     def append(self, rows: Sequence[Row]) -> None:
         """Appends rows of the columns of the first row.
 
         Raises:
-          ValueError: a row has other columns.
+          ValueError: a row has a further column.
           OSError: the file cannot be written.
         """
-        if not rows:
-            return
         self.rows.extend(rows)
-        columns = list(self.rows[0])
         with self._path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
-            if not file.tell():
+            file.write(self._lines(rows, header=not file.tell()))
+
+    def _lines(self, rows: Sequence[Row], *, header: bool) -> str:
+        text = io.StringIO()
+        if self.rows:
+            writer = csv.DictWriter(text, list(self.rows[0]), lineterminator="\n")
+            if header:
                 writer.writeheader()
-            for row in rows:
-                if list(row) != columns:
-                    raise ValueError(f"{self._path} has columns {columns}, got {list(row)}")
-                writer.writerow(row)
+            writer.writerows(rows)
+        return text.getvalue()
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:

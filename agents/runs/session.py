@@ -170,7 +170,7 @@ class Session:
             self._say(f"{folder.metrics} has lost rows; learning curves lack these iterations.")
         self._tracker = None
         if options.evaluate_every and self.evaluations is not None:
-            self._tracker = PeriodicEvaluator(folder, run, self.sets, options.evaluate_every)
+            self._tracker = PeriodicEvaluator(folder, run, self.sets)
             self._tracker.resume(self.evaluations.rows)
 
     @property

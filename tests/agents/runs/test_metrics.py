@@ -49,7 +49,7 @@ def test_a_file_without_header_is_refused(tmp_path):
 def test_columns_never_change(tmp_path):
     log = CsvLog(tmp_path / "x.csv")
     log.append([row(1)])
-    with pytest.raises(ValueError, match=r"has columns .*'seconds'.*, got .*'more'"):
+    with pytest.raises(ValueError, match="fields not in fieldnames: 'more'"):
         log.append([row(2, more=1)])
 
 
