@@ -17,8 +17,7 @@ MAY_IMPORT = {
     "agents": {"agents", "trap_tube_jax"},
     "benchmarks": {"benchmarks", "agents", "trap_tube_jax"},
 }
-# Lower rooms never import higher ones. Modules of a package itself are rooms of their own. The
-# environment's rooms are those of CONTRIBUTING.md, and so are the agents'.
+# Lower rooms never import higher ones. Modules of a package itself are rooms of their own.
 ENVIRONMENT = (
     ("_version", "checks", "imports", "command_line", "tables"),
     ("objects", "geometry", "prng"),

@@ -19,8 +19,10 @@ from paths import ROOT
 PAGES = [*ROOT.glob("*.md")]
 for folder in ("trap_tube_jax", "agents", "benchmarks", "tests"):
     PAGES += ROOT.joinpath(folder).rglob("*.md")
-DONE = ("environment", "controls", "graded", "own_tasks", "protocol", "adapters/README")
-NAMES = ["README.md", *(f"trap_tube_jax/{name}.md" for name in DONE)]
+WAITING = {f"benchmarks/results/{name}_preset.md" for name in ("best", "fast")}
+WAITING |= {"benchmarks/results/curiosities.md"}
+NAMES = sorted({str(page.relative_to(ROOT)) for page in PAGES} - WAITING)
+BEING_REWRITTEN = ("agents.experiments", "agents.sweep", "benchmarks.")
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\n\n```text\n(.*?)^```$)?", re.DOTALL | re.MULTILINE)
@@ -123,7 +125,7 @@ def help_of(module: str, *rest: str) -> str:
 @pytest.mark.parametrize("command", commands())
 def test_commands_exist_with_their_options(command):
     module, *words = shlex.split(command)
-    if module == "agents.experiments":
+    if module.startswith(BEING_REWRITTEN):
         pytest.skip("being rewritten")
     assert importlib.util.find_spec(module)
     options = [word.partition("=")[0] for word in words if word.startswith("--")]
