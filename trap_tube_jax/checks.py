@@ -1,8 +1,10 @@
-"""Checks of arguments that several modules share."""
+"""Shared checks of arguments."""
 
 import re
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 LARGEST_SEED = 2**32 - 1  # `jax.random.key` drops what is beyond
@@ -12,7 +14,7 @@ def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None =
     """Returns `value` as an int if it is an integer within the bounds, both included.
 
     Raises:
-      ValueError: naming the argument, its value and the bounds. A bool is no integer.
+      ValueError: `value` is a bool, another type or out of bounds.
     """
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_integer or value < minimum or (maximum is not None and value > maximum):
@@ -21,14 +23,34 @@ def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None =
     return int(value)
 
 
-def check_registered_name(what: str, name: Any) -> None:
-    """Checks a name that command lines and file names are to hold; `what` is what it names.
+def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:
+    """Returns `value` as an array of integers of its own width; JAX would cut 64 bits to 32.
 
     Raises:
-      ValueError: it has other characters than letters, digits, "_", "." and "-".
+      ValueError: `value` is ragged or holds something else.
+    """
+    try:
+        array = value if isinstance(value, jax.Array) else np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name} must be a rectangular array of integers: {error}") from None
+    if not jnp.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name} must hold integers, got {described(array)}: {value!r}")
+    return array
+
+
+def described(array: Any) -> str:
+    """Returns dtype and shape for a message, such as "uint8[12, 12]"."""
+    return f"{array.dtype}{list(array.shape)}"
+
+
+def check_registered_name(kind: str, name: Any) -> None:
+    """Checks a name for command lines and files; `kind` is the kind of thing it names.
+
+    Raises:
+      ValueError: `name` has other characters than letters, digits, "_", "." and "-".
     """
     if not isinstance(name, str) or not re.fullmatch(r"[\w.-]+", name, re.ASCII):
-        raise ValueError(f"{what} names consist of letters, digits, '_', '.' and '-', got {name!r}")
+        raise ValueError(f"{kind} names consist of letters, digits, '_', '.' and '-', got {name!r}")
 
 
 def check_seed(seed: Any) -> int:
@@ -41,10 +63,10 @@ def check_seed(seed: Any) -> int:
 
 
 def check_own_state(state: Any, kind: type) -> None:
-    """Checks that `step` is given the kind of state that its own `reset` returns.
+    """Checks that `step` got the kind of state that `reset` returns.
 
     Raises:
-      ValueError: it is something else.
+      ValueError: `state` is of another type.
     """
     if not isinstance(state, kind):
         raise ValueError(

@@ -1,11 +1,12 @@
 """Controls of comparative psychology: layouts that tell understanding from rules of thumb.
 
-Each function lists the layouts of one control. Most differ from the base task in one thing, so
-that the two can be compared in pairs. The rules are the same as everywhere.
+Each function lists the layouts of one control. Most layouts differ from the base task in one
+thing, for comparison in pairs. The rules of the environment are unchanged.
 
 Source: controls.md, with the studies in full.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -31,7 +32,7 @@ def trap_turned() -> tuple[State, ...]:
 
 
 def trap_exchanged() -> tuple[State, ...]:
-    """Trap and exit have changed places, so that the food must go the other way.
+    """Trap and exit have changed places: the food must go the other way.
 
     Source: Limongelli, Boysen and Visalberghi (1995): the food in the middle of the tube, the trap
     left of it or right.
@@ -113,18 +114,32 @@ def food_outside() -> tuple[State, ...]:
 
 
 def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
-    """The transfer that draws one of the layouts, each with equal chance.
+    """Returns the transfer that draws one of the layouts, each with equal chance.
 
-    It keeps the state's palette, time and flags, so that it composes with the others.
+    The transfer keeps the state's palette, time and flags, and composes with the others.
 
     Args:
-      layouts: a named function of no arguments that lists at least one, as those of this
-        module.
-    """
+      layouts: a named function of no arguments that lists at least one layout, such as
+        `trap_turned`.
 
-    def transfer(key: jax.Array, state: State) -> State:
+    Raises:
+      ValueError: `layouts` is no such function.
+    """
+    if not callable(layouts) or not hasattr(layouts, "__name__"):
+        raise ValueError(f"layouts must be a named function that lists states, got {layouts!r}")
+    return LayoutDraw(layouts)
+
+
+@dataclasses.dataclass(frozen=True)
+class LayoutDraw:
+    """The transfer of `drawn_from`."""
+
+    layouts: Callable[[], tuple[State, ...]]
+
+    def __call__(self, key: jax.Array, state: State) -> State:
+        """Draws a layout."""
         check_state(state)
-        choices = layouts()
+        choices = self.layouts()
         index = jax.random.randint(loop_free(key), (), 0, len(choices), jnp.int32)
         fields = ("board", "agent", "tool", "tool_extent", "food")
         tables = {name: [np.asarray(getattr(each, name)) for each in choices] for name in fields}
@@ -132,15 +147,15 @@ def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
             **{name: jnp.asarray(np.stack(table))[index] for name, table in tables.items()}
         )
 
-    transfer.__name__ = layouts.__name__.replace("_", " ")
-    return transfer
+    @property
+    def __name__(self) -> str:
+        return self.layouts.__name__.replace("_", " ")
 
 
 def trap_and_exit_exchanged(state: State) -> State:
-    """The same task with trap and exit exchanged; also of a batch of states.
+    """Exchanges trap and exit of one state or a batch of states.
 
-    With the task itself it is a pair that differs in the trap alone. The twin of a task of {P}
-    is a task of {P}.
+    The task and its twin differ in the trap alone. The twin of a task of {P} is a task of {P}.
     """
     other = np.arange(NUM_OBJECTS, dtype=np.uint8)
     other[[TRAP, EXIT]] = EXIT, TRAP
@@ -166,7 +181,7 @@ _BASE_TUBE = ("....1111....", "....xF.e....", "....x..e....", "....2222....")
 def _layout(
     *tube: str, tool: Cell = (4, 1), extent: Cell = (4, 1), food: Cell | None = None
 ) -> State:
-    """The base task with other rows 4 to 7, another tool, or food that is not drawn."""
+    """Builds the base task with other rows 4 to 7, another tool, or food that is not drawn."""
     empty = OBJECT_CHARS[GROUND] * BOARD_SIZE
     below = BOARD_SIZE - FIRST_ROW - len(tube)
     rows = [*[empty] * FIRST_ROW, *tube, *[empty] * below]

@@ -1,4 +1,4 @@
-"""The rules of one step: food, tool, agent, task, in that order.
+"""Rules of one step: food, tool, agent, task, in that order.
 
 Source: paper, section "Trap-Tube Environments"; environment.md, "One step".
 """
@@ -16,14 +16,13 @@ from trap_tube_jax.state import State
 def step(state: State, action: jax.Array) -> State:
     """Moves food, tool and agent by one action and marks success.
 
-    Pure and deterministic. It is defined for every state, also for one with the agent on
-    the tool. A state that is done does not change. Time and the step limit belong to the
-    environment.
+    Pure, deterministic, and defined for every state, also with the agent on the tool. A state
+    that is done does not change. Time and the step limit belong to the environment.
 
     Args:
       state: one unbatched state.
-      action: i32[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Any other
-        number is no direction: that grasp holds nothing, that move goes nowhere.
+      action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. With any other
+        number the grasp holds nothing, or the move goes nowhere.
 
     Returns:
       The state after the step; `terminated` is set when agent and food share a cell.
@@ -31,7 +30,8 @@ def step(state: State, action: jax.Array) -> State:
     board, agent, food, tool = state.board, state.agent, state.food, state.tool
     extent = state.tool_extent
     on_tool = functools.partial(bar_covers, tool, extent)
-    move = unit_vector(action[1]) * ~(state.terminated | state.truncated)
+    is_over = state.terminated | state.truncated
+    move = jnp.where(is_over, 0, unit_vector(action[1]))
 
     grasped = holds_tool(state, action[0])
     agent_free = static_object(board, agent + move) == GROUND
@@ -40,17 +40,17 @@ def step(state: State, action: jax.Array) -> State:
     food_free = ((beyond_food == GROUND) | (beyond_food == EXIT)) & ~on_tool(food + move)
 
     food_moves = grasped & agent_free & food_ahead & food_free
-    new_food = food + move * food_moves
+    new_food = jnp.where(food_moves, food + move, food)
 
     tool_fits = is_on_board(tool + move) & is_on_board(tool + move + extent - 1)
     tool_moves = grasped & agent_free & (~food_ahead | food_moves) & tool_fits
-    new_tool = tool + move * tool_moves
+    new_tool = jnp.where(tool_moves, tool + move, tool)
 
     held = grasped & ~tool_moves
     reaches_food = same_cell(agent + move, new_food)
     blocked_by_tool = bar_covers(new_tool, extent, agent + move)
     agent_moves = ~held & ~blocked_by_tool & (agent_free | reaches_food)
-    new_agent = agent + move * agent_moves
+    new_agent = jnp.where(agent_moves, agent + move, agent)
 
     return state.replace(
         agent=new_agent,
@@ -61,12 +61,12 @@ def step(state: State, action: jax.Array) -> State:
 
 
 def holds_tool(state: State, direction: jax.Array | int) -> jax.Array:
-    """bool[]: whether the agent's hand in a direction is at the tool, and the agent not on it."""
+    """Tests whether the hand in a direction is at the tool, and the agent not on the tool."""
     on_tool = functools.partial(bar_covers, state.tool, state.tool_extent)
     return on_tool(state.agent + unit_vector(direction)) & ~on_tool(state.agent)
 
 
 def static_object(board: jax.Array, cell: jax.Array) -> jax.Array:
-    """i32[]: the static object's code at `cell` i32[2], -1 off the board u8[12, 12]."""
+    """Returns the code i32[] of the static object at `cell` i32[2], -1 off the board u8[12, 12]."""
     row, column = jnp.clip(cell, 0, BOARD_SIZE - 1)
     return jnp.where(is_on_board(cell), board[row, column].astype(jnp.int32), -1)

@@ -13,7 +13,8 @@ import numpy as np
 from jax.core import Tracer
 
 from trap_tube_jax import dynamics
-from trap_tube_jax.checks import check_integer
+from trap_tube_jax.by_value import ByValue
+from trap_tube_jax.checks import check_integer, described, integer_array
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     DIRECTION_NAMES,
@@ -24,11 +25,18 @@ from trap_tube_jax.objects import (
 )
 from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State, TimeStep, base_state, check_state, check_structure, validate
-from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
+from trap_tube_jax.transfers import (
+    Transfer,
+    compose,
+    perceptual,
+    structural,
+    symbolic,
+    transfer_name,
+)
 
 LARGEST_TIME = 2**31 - 1  # `State.time` is an i32
 
-_TRUSTED_TRANSFERS = (perceptual, structural, symbolic)
+_PAPER_TRANSFERS = (perceptual, structural, symbolic)  # need no trial
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,10 +44,10 @@ class ArraySpec:
     """Shape, dtype and inclusive bounds of an array.
 
     Attributes:
-      shape: its dimensions.
-      dtype: its NumPy dtype.
-      minimum: the smallest allowed element.
-      maximum: the largest allowed element.
+      shape: length of each dimension.
+      dtype: NumPy dtype of the elements.
+      minimum: smallest allowed element.
+      maximum: largest allowed element.
     """
 
     shape: tuple[int, ...]
@@ -48,11 +56,12 @@ class ArraySpec:
     maximum: int
 
 
-class Environment:
+class Environment(ByValue):
     """A distribution over tasks: a base state under a sequence of transfers.
 
-    `reset` and `step` are pure and unbatched: jit, vmap and scan them. An environment
-    holds no episode; everything that changes is in the `State`.
+    `reset` and `step` are pure and unbatched: jit, vmap and scan them. An environment holds no
+    episode; everything that changes is in the `State`. Environments with equal transfers, base
+    state and step limit are equal.
     """
 
     def __init__(
@@ -62,10 +71,9 @@ class Environment:
         base: State | None = None,
         max_steps: int = MAX_STEPS,
     ):
-        """Checks its arguments.
+        """Checks the arguments, and tries every transfer of your own once.
 
-        Transfers of your own are tried once, with one key, each on the state that those before
-        it return.
+        A trial jits the transfer and applies it to the state that the ones before it return.
 
         Args:
           transfers: functions (key, state) -> state, applied in order at every reset, each
@@ -84,8 +92,8 @@ class Environment:
         self.max_steps = check_integer("max_steps", max_steps, maximum=LARGEST_TIME)
         self.transfers = tuple(transfers)
         self.base = base_state() if base is None else _check_base(base)
-        self._transfer = compose(*self.transfers)
-        self._check_transfers()
+        self._draw = compose(*self.transfers)
+        self._try_transfers()
 
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """Draws a task.
@@ -99,7 +107,7 @@ class Environment:
         Raises:
           ValueError: `key` is not one PRNG key.
         """
-        state = self._transfer(_typed_key(key), self.base)
+        state = self._draw(key, self.base)
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:
@@ -108,20 +116,20 @@ class Environment:
         Args:
           state: one unbatched state.
           action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Under jit,
-            vmap and scan the numbers are not checked: any other one is no direction.
+            vmap and scan numbers are not checked: any other number is no direction.
 
         Returns:
           The next state, and a timestep with reward 1 if this step solved the task.
 
         Raises:
-          ValueError: `state` is not one unbatched state; the action's shape or dtype is wrong, or
-            its concrete numbers.
+          ValueError: `state` is not one unbatched state, the action's shape or dtype is wrong, or
+            a concrete number is out of range.
         """
         check_state(state)
-        action = _check_action(action)
+        action = check_actions(action, (2,))
         was_done = state.terminated | state.truncated
         state = dynamics.step(state, action)
-        time = state.time + ~was_done
+        time = jnp.where(was_done, state.time, state.time + 1)
         truncated = state.truncated | (~state.terminated & (time >= self.max_steps))
         state = state.replace(time=time, truncated=truncated)
         reward = (state.terminated & ~was_done).astype(jnp.float32)
@@ -129,61 +137,86 @@ class Environment:
 
     @property
     def num_features(self) -> int:
-        """N, the feature channels of the observation."""
+        """Number N of feature channels of the observation."""
         return self.base.palette.shape[-1]
 
     @property
     def num_actions(self) -> int:
-        """16, the number of (grasp, move) pairs."""
+        """Number of (grasp, move) pairs, 16."""
         return NUM_ACTIONS
 
     @property
     def observation_spec(self) -> ArraySpec:
-        """The observation: u8[12, 12, N] in 0 to 255."""
+        """Shape, dtype and bounds of the observation: u8[12, 12, N] in 0 to 255."""
         return ArraySpec((BOARD_SIZE, BOARD_SIZE, self.num_features), np.dtype(np.uint8), 0, 255)
 
     @property
     def action_spec(self) -> ArraySpec:
-        """The action: i32[2] = (grasp, move) in 0 to 3."""
+        """Shape, dtype and bounds of the action: i32[2] = (grasp, move) in 0 to 3."""
         return ArraySpec((2,), np.dtype(np.int32), 0, NUM_DIRECTIONS - 1)
 
     def __repr__(self) -> str:
-        names = ", ".join(getattr(transfer, "__name__", "?") for transfer in self.transfers)
-        return f"Environment(transfers=({names}), max_steps={self.max_steps})"
+        names = ", ".join(map(transfer_name, self.transfers))
+        return f"{type(self).__name__}(transfers=({names}), max_steps={self.max_steps})"
 
-    def _check_transfers(self) -> None:
+    def _try_transfers(self) -> None:
+        own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
         state, key = self.base, jax.random.key(0)
-        last = max(
-            (i for i, each in enumerate(self.transfers) if each not in _TRUSTED_TRANSFERS),
-            default=-1,
-        )
-        for transfer in self.transfers[: last + 1]:
-            if transfer in _TRUSTED_TRANSFERS:
-                state = jax.jit(transfer)(key, state)
-            else:
-                state = _try_transfer(transfer, key, state)
+        for transfer in self.transfers[: own[-1] + 1 if own else 0]:
+            state = _try_transfer(transfer, jax.random.clone(key), state)
 
 
-def action_from_index(index: jax.Array) -> jax.Array:
-    """The action i32[..., 2] = (grasp, move) of an integer[...] `4 * grasp + move` in 0 to 15.
+def action_from_index(index: jax.typing.ArrayLike) -> jax.Array:
+    """Converts `4 * grasp + move`, an integer[...] in 0 to 15, to actions i32[..., 2].
 
     Any other number becomes (-1, -1), which are no directions.
 
     Raises:
       ValueError: `index` does not hold integers.
     """
-    index = jnp.asarray(index)
-    if not jnp.issubdtype(index.dtype, jnp.integer):
-        raise ValueError(f"an action's index must be an integer, got {index.dtype}")
-    action = jnp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1).astype(jnp.int32)
+    index = integer_array("index", index)
     is_known = (index >= 0) & (index < NUM_ACTIONS)
+    index = jnp.asarray(index.astype(np.int32))
+    action = jnp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1)
     return jnp.where(is_known[..., None], action, NO_DIRECTION)
 
 
-def action_to_index(action: jax.Array) -> jax.Array:
-    """The integer i32[...] `4 * grasp + move` of an action integer[..., 2]."""
-    action = jnp.asarray(action)
-    return (action[..., 0] * NUM_DIRECTIONS + action[..., 1]).astype(jnp.int32)
+def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
+    """Converts actions integer[..., 2] to `4 * grasp + move`, i32[...] in 0 to 15.
+
+    A pair with another number than 0 to 3 becomes -1.
+
+    Raises:
+      ValueError: `action` does not hold pairs of integers.
+    """
+    action = integer_array("action", action)
+    if action.ndim == 0 or action.shape[-1] != 2:
+        raise ValueError(f"action must be integer[..., 2] = (grasp, move), got {described(action)}")
+    is_known = ((action >= 0) & (action < NUM_DIRECTIONS)).all(-1)
+    grasp, move = action[..., 0].astype(np.int32), action[..., 1].astype(np.int32)
+    return jnp.where(is_known, grasp * NUM_DIRECTIONS + move, NO_DIRECTION)
+
+
+def check_actions(actions: Any, shape: tuple[int, ...]) -> jax.Array:
+    """Returns actions as an integer array of any width after checking shape and numbers.
+
+    Raises:
+      ValueError: the dtype or the shape [..., 2] is wrong, or a concrete number is no direction.
+    """
+    actions = integer_array("action", actions)
+    if actions.shape != shape:
+        raise ValueError(
+            f"action must be integer{list(shape)}, (grasp, move) in the last axis, got "
+            f"{described(actions)}; action_from_index converts 4 * grasp + move, and jax.vmap "
+            "steps several environments"
+        )
+    if not isinstance(actions, Tracer):
+        concrete = np.asarray(actions)
+        wrong = concrete[((concrete < 0) | (concrete >= NUM_DIRECTIONS)).any(-1)].tolist()
+        if wrong:
+            allowed = ", ".join(f"{code} {name}" for code, name in enumerate(DIRECTION_NAMES))
+            raise ValueError(f"action {tuple(wrong[0])} is out of range; allowed: {allowed}")
+    return jnp.asarray(actions)
 
 
 def _timestep(state: State, reward: jax.Array) -> TimeStep:
@@ -196,45 +229,8 @@ def _timestep(state: State, reward: jax.Array) -> TimeStep:
     )
 
 
-def check_key(key: Any) -> jax.Array:
-    """Returns `key` if it is one PRNG key, typed or u32[2].
-
-    Raises:
-      ValueError: it is not.
-    """
-    is_typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    is_raw = getattr(key, "dtype", None) == jnp.uint32 and np.shape(key) == (2,)
-    if not is_raw and not (is_typed and key.shape == ()):
-        raise ValueError(
-            f"reset takes one PRNG key, got {type(key).__name__} of shape {np.shape(key)}; "
-            "make one with jax.random.key(seed), and jax.vmap over several"
-        )
-    return key
-
-
-def _typed_key(key: Any) -> jax.Array:
-    """One PRNG key as a typed one: transfers get this type, whatever `reset` was given."""
-    key = check_key(key)
-    return jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
-
-
-def _check_action(action: Any) -> jax.Array:
-    action = jnp.asarray(action)
-    if action.shape != (2,) or not jnp.issubdtype(action.dtype, jnp.integer):
-        raise ValueError(
-            f"an action is integer[2] = (grasp, move), got {action.dtype}{list(action.shape)}; "
-            "action_from_index converts 4 * grasp + move, and jax.vmap steps several"
-        )
-    if not isinstance(action, Tracer):
-        grasp, move = np.asarray(action).tolist()
-        if not (0 <= grasp < NUM_DIRECTIONS and 0 <= move < NUM_DIRECTIONS):
-            allowed = ", ".join(f"{code} {name}" for code, name in enumerate(DIRECTION_NAMES))
-            raise ValueError(f"action ({grasp}, {move}) is out of range; allowed: {allowed}")
-    return action.astype(jnp.int32)
-
-
 def _check_base(base: State) -> State:
-    """Returns `base` if an episode can start from it."""
+    """Returns `base` if it is a valid state at time 0."""
     validate(base)
     time = int(base.time)
     if time != 0:
@@ -246,8 +242,8 @@ def _check_base(base: State) -> State:
 
 
 def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
-    """The state that a transfer returns, which must be a valid one."""
-    name = getattr(transfer, "__name__", repr(transfer))
+    """Returns the state that a transfer returns, if it is a valid one."""
+    name = transfer_name(transfer)
     try:
         structure = jax.eval_shape(transfer, key, state)
     except (TypeError, ValueError) as error:

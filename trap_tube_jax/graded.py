@@ -1,12 +1,13 @@
-"""The perceptual and the structural transfer, from none of it to all of it.
+"""The perceptual and the structural transfer at strengths from 0 to 1.
 
-A strength s from 0 to 1 says how far from the base task the draws may go. At 0 nothing is changed
-from it. At 1 the draws are those of the paper's transfer. Draws are nested: a layout, or a
-direction of a feature point, that is possible at one strength is possible at every higher one.
+A strength bounds the distance of the draws from the base task. Strength 0 changes nothing,
+strength 1 is the paper's transfer. Draws are nested: a layout, or a direction of a feature point,
+that is possible at one strength is possible at every higher one.
 
 Source: graded.md; the paper, section "Structural", for interpolation on the sphere.
 """
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -26,12 +27,12 @@ TOLERANCE = 1e-9  # of a distance, against the rounding of strength * distance
 
 
 def graded_perceptual(strength: float) -> Transfer:
-    """The perceptual transfer with draws no farther from the base task than `strength` allows.
+    """Returns a perceptual transfer that draws no farther from the base task than `strength`.
 
-    Every choice of `perceptual` is uniform over those of its outcomes whose distance d from
-    the base task's satisfies d <= d_min + strength * (d_max - d_min), d_min and d_max being
-    the least and the greatest distance among the outcomes of this choice. See graded.md,
-    "Layouts", for the choices and their distances.
+    Every choice of `perceptual` becomes uniform over its outcomes at a distance
+    d <= d_min + strength * (d_max - d_min) from the base task, d_min and d_max being the least
+    and the greatest distance among the outcomes of the choice. graded.md, "Layouts", lists the
+    choices and their distances.
 
     Args:
       strength: 0, the base task's layout, to 1, `perceptual` itself.
@@ -43,32 +44,11 @@ def graded_perceptual(strength: float) -> Transfer:
       ValueError: `strength` is not a number from 0 to 1.
     """
     strength = _check_strength(strength)
-    if strength == 1:
-        return perceptual
-
-    near, full = near_layouts(strength), layout_tables()
-
-    def transfer(key: jax.Array, state: State) -> State:
-        check_state(state)
-        tables = jax.tree.map(jnp.asarray, near)
-        layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
-        frame, assignment = tables.layout[layout % len(tables.layout)]
-        food %= tables.num_food[frame]
-        tool %= tables.num_tools[frame]
-        agent %= tables.num_agents[frame, tool]
-        return state.replace(
-            board=jnp.asarray(full.board)[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
-            food=cell_of(tables.food[frame, food]),
-            tool=cell_of(tables.tool[frame, tool]),
-            tool_extent=jnp.asarray(full.extent)[frame],
-            agent=cell_of(tables.agent[frame, tool, agent]),
-        )
-
-    return _named(transfer, "perceptual", strength)
+    return perceptual if strength == 1 else GradedPerceptual(strength)
 
 
 def graded_structural(strength: float) -> Transfer:
-    """The structural transfer with features part of the way from the state's to the drawn ones.
+    """Returns a structural transfer that takes features part of the way to the drawn ones.
 
     `structural` draws a point u on the unit sphere for each kind of object. With r b the
     state's own features as a point, |b| = 1, and theta the angle between b and u, the new
@@ -76,7 +56,7 @@ def graded_structural(strength: float) -> Transfer:
 
         ((1 - s) r + s) (cos(s theta) b + sin(s theta) t)
 
-    t being the unit vector orthogonal to b in the plane of b and u, on the side of u. So the
+    t being the unit vector orthogonal to b in the plane of b and u, on the side of u. The
     direction goes the fraction s of the great circle from b to u. For N = 1, where there is
     no circle, the point is (1 - s) r b + s u; for r = 0, where there is no b, it is s u.
 
@@ -90,21 +70,58 @@ def graded_structural(strength: float) -> Transfer:
       ValueError: `strength` is not a number from 0 to 1.
     """
     strength = _check_strength(strength)
-    if strength == 1:
-        return structural
+    return structural if strength == 1 else GradedStructural(strength)
 
-    def transfer(key: jax.Array, state: State) -> State:
+
+@dataclasses.dataclass(frozen=True)
+class GradedPerceptual:
+    """The transfer of `graded_perceptual`, for strengths below 1."""
+
+    strength: float
+
+    def __call__(self, key: jax.Array, state: State) -> State:
+        """Draws a layout."""
+        check_state(state)
+        near, full = jax.tree.map(jnp.asarray, (near_layouts(self.strength), layout_tables()))
+        layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
+        frame, assignment = near.layout[layout % len(near.layout)]
+        food %= near.num_food[frame]
+        tool %= near.num_tools[frame]
+        agent %= near.num_agents[frame, tool]
+        return state.replace(
+            board=full.board[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
+            food=cell_of(near.food[frame, food]),
+            tool=cell_of(near.tool[frame, tool]),
+            tool_extent=full.extent[frame],
+            agent=cell_of(near.agent[frame, tool, agent]),
+        )
+
+    @property
+    def __name__(self) -> str:
+        return f"perceptual {self.strength:g}"
+
+
+@dataclasses.dataclass(frozen=True)
+class GradedStructural:
+    """The transfer of `graded_structural`, for strengths below 1."""
+
+    strength: float
+
+    def __call__(self, key: jax.Array, state: State) -> State:
+        """Draws a palette."""
         check_state(state)
         # The middle of the interval that floor maps to the feature, so that 0 changes nothing.
         own = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
         drawn = sphere_points(key, state.palette.shape[-1])
-        return recolor(state, points_between(own, drawn, strength))
+        return recolor(state, points_between(own, drawn, self.strength))
 
-    return _named(transfer, "structural", strength)
+    @property
+    def __name__(self) -> str:
+        return f"structural {self.strength:g}"
 
 
 def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Array:
-    """f32[K, N]: the points of `graded_structural`, from `own` r b and `drawn` u, [K, N] each."""
+    """Returns the points f32[K, N] of `graded_structural` between `own`, r b, and `drawn`, u."""
     if own.shape[-1] == 1:
         return (1 - strength) * own + strength * drawn
     radius = jnp.linalg.norm(own, axis=-1, keepdims=True)
@@ -120,7 +137,7 @@ def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Arr
 
 
 class NearLayouts(NamedTuple):
-    """The outcomes of `graded_perceptual`; otherwise as `LayoutTables`.
+    """The outcomes of `graded_perceptual`, laid out as in `LayoutTables`.
 
     Attributes:
       layout: i32[L, 2], the (frame, assignment) pairs.
@@ -143,7 +160,7 @@ class NearLayouts(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def near_layouts(strength: float) -> NearLayouts:
-    """Builds the tables of a strength, once per process."""
+    """Builds the tables of a strength, and keeps them for the process."""
     full, base = layout_tables(), base_state()
     foods, tools, agents = [], [], []
     for frame in range(NUM_FRAMES):
@@ -175,9 +192,9 @@ def near_layouts(strength: float) -> NearLayouts:
 
 
 def _layout_distances() -> np.ndarray:
-    """i64[32, 8]: cells that differ from the base task's, of the board and of the tool's shape.
+    """Counts the cells of board and tool, i64[32, 8], that differ from the base task's.
 
-    The tools are compared with their top-left cells laid upon each other.
+    Tools are compared with their top-left cells aligned.
     """
     full, base = layout_tables(), base_state()
     board = np.asarray(base.board).reshape(-1)
@@ -189,14 +206,14 @@ def _layout_distances() -> np.ndarray:
 
 
 def _nearest_cells(cells: np.ndarray, target: Any, strength: float) -> np.ndarray:
-    """Of flat indices, those near the cell `target`; distances count steps up, down and across."""
+    """Returns the flat indices near the cell `target`, by steps up, down and across."""
     row, column = np.asarray(target)
     distance = abs(cells // BOARD_SIZE - row) + abs(cells % BOARD_SIZE - column)
     return cells[_is_near(distance, strength)]
 
 
 def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
-    """bool[...]: whether a distance is at most d_min + strength * (d_max - d_min)."""
+    """Tests distances <= d_min + strength * (d_max - d_min), elementwise."""
     nearest, farthest = distance.min(), distance.max()
     return distance <= nearest + strength * (farthest - nearest) + TOLERANCE
 
@@ -206,9 +223,3 @@ def _check_strength(strength: Any) -> float:
     if isinstance(strength, bool) or not is_number or not 0 <= strength <= 1:
         raise ValueError(f"strength must be a number from 0 to 1, got {strength!r}")
     return float(strength)
-
-
-def _named(transfer: Any, name: str, strength: float) -> Transfer:
-    """Names the transfer as labels and messages show it."""
-    transfer.__name__ = f"{name} {strength:g}"
-    return transfer

@@ -1,4 +1,4 @@
-"""The task sets by name: the paper's eight, the controls, and your own.
+"""Task sets by name: the paper's eight, the controls, and your own.
 
 Source: paper, section "Experimental Setup"; environment.md, "Task sets"; controls.md.
 """
@@ -9,10 +9,9 @@ from collections.abc import Iterable
 from trap_tube_jax.checks import check_registered_name
 from trap_tube_jax.controls import CONTROLS, drawn_from
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.imports import registering_file
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.state import State, base_state, check_structure
-from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
+from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic, transfer_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,32 +19,50 @@ class TaskSet:
     """A named distribution over tasks.
 
     Attributes:
-      id: the name that `make` takes.
-      short: the name in tables and file names.
+      id: name that `make` takes.
+      short: name in tables and file names.
       transfers: the transfers, in the order in which they apply.
-      base: the state that they start from; None is the base task.
+      base: the state that the transfers start from; None is the base task.
       max_steps: steps after which an unsolved episode is truncated.
     """
 
     id: str
     short: str
     transfers: tuple[Transfer, ...]
-    base: State | None = dataclasses.field(default=None, compare=False, repr=False)
+    base: State | None = dataclasses.field(default=None, repr=False)
     max_steps: int = MAX_STEPS
 
     @property
     def label(self) -> str:
-        """The set in the paper's notation, as in "{P, St}"; without transfers, "base".
+        """The set in the paper's notation, such as "{P, St}" or, without transfers, "base".
 
-        The short name if the set has a base state or a step limit of its own.
+        A set with a base state or a step limit of its own has its short name as label.
         """
         if self.base is not None or self.max_steps != MAX_STEPS:
             return self.short
         symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
-        names = (
-            symbols.get(transfer, getattr(transfer, "__name__", "?")) for transfer in self.transfers
-        )
-        return "{" + ", ".join(names) + "}" if self.transfers else "base"
+        names = [symbols.get(each) or transfer_name(each) for each in self.transfers]
+        return "{" + ", ".join(names) + "}" if names else "base"
+
+    def make(
+        self,
+        *,
+        num_features: int | None = None,
+        base: State | None = None,
+        max_steps: int | None = None,
+    ) -> Environment:
+        """Makes the set's environment; see `trap_tube_jax.make`."""
+        base = self.base if base is None else base
+        if base is None:
+            base = base_state(3 if num_features is None else num_features)
+        check_structure(base)
+        if num_features not in (None, base.palette.shape[-1]):
+            raise ValueError(
+                f"num_features={num_features} contradicts the base state, whose palette has "
+                f"{base.palette.shape[-1]} features; give one of them"
+            )
+        max_steps = self.max_steps if max_steps is None else max_steps
+        return Environment(self.transfers, base=base, max_steps=max_steps)
 
 
 PAPER_TASK_SETS = (
@@ -59,7 +76,7 @@ PAPER_TASK_SETS = (
     TaskSet("PerceptualStructuralSymbolicTrapTube-v0", "pstsy", (perceptual, structural, symbolic)),
 )
 
-# "trap turned" is TrapTurnedControl-v0, in short trap-turned.
+# `trap_turned` becomes TrapTurnedControl-v0, in short trap-turned.
 CONTROL_TASK_SETS = tuple(
     TaskSet(
         id="".join(word.capitalize() for word in layouts.__name__.split("_")) + "Control-v0",
@@ -69,20 +86,20 @@ CONTROL_TASK_SETS = tuple(
     for layouts in CONTROLS
 )
 
-_task_sets = {entry.id: entry for entry in (*PAPER_TASK_SETS, *CONTROL_TASK_SETS)}
-_files: dict[str, str] = {}  # by id, of your own sets: what has registered them
+_BUILT_IN = {entry.id: entry for entry in (*PAPER_TASK_SETS, *CONTROL_TASK_SETS)}
+_task_sets = dict(_BUILT_IN)
 
 
 def registered_ids() -> tuple[str, ...]:
-    """The ids that `make` takes: the paper's eight, the controls, your own."""
+    """Returns the ids that `make` takes: the paper's eight, the controls, your own."""
     return tuple(_task_sets)
 
 
 def task_set(name: str) -> TaskSet:
-    """The task set with this id or short name.
+    """Returns the task set with this id or short name.
 
     Raises:
-      ValueError: there is none; the message lists all.
+      ValueError: no set has the name; the message lists all.
     """
     for candidate in _task_sets.values():
         if name in (candidate.id, candidate.short):
@@ -110,18 +127,7 @@ def make(
     Raises:
       ValueError: naming the value and what is allowed.
     """
-    entry = task_set(name)
-    base = entry.base if base is None else base
-    if base is None:
-        base = base_state(3 if num_features is None else num_features)
-    check_structure(base)
-    if num_features not in (None, base.palette.shape[-1]):
-        raise ValueError(
-            f"num_features={num_features} contradicts the base state, whose palette has "
-            f"{base.palette.shape[-1]} features; give one of them"
-        )
-    max_steps = entry.max_steps if max_steps is None else max_steps
-    return Environment(entry.transfers, base=base, max_steps=max_steps)
+    return task_set(name).make(num_features=num_features, base=base, max_steps=max_steps)
 
 
 def register(
@@ -134,13 +140,13 @@ def register(
 ) -> TaskSet:
     """Adds a task set to those that `make` knows, for this process.
 
-    The file or notebook that has registered an id may register it again; the new set then takes
-    the old one's place. Environments that are made already stay as they are.
+    A set of yours with the same id is replaced. Environments that exist already stay as they
+    are. `task_set(id)` returns the new entry, which differs from the old one.
 
     Args:
-      id: its name, not taken by the project or by another file.
+      id: name of the set, not one of the project's.
       transfers: functions (key, state) -> state, in the order in which they apply.
-      short: its name in tables and file names; the id if absent.
+      short: name in tables and file names; the id if absent.
       base: the state that the transfers start from, at time 0; the base task if absent.
       max_steps: steps after which an unsolved episode is truncated, 1 to 2**31 - 1.
 
@@ -149,17 +155,13 @@ def register(
         "-", a transfer is not a function or not hashable, or the base state or the step limit is
         invalid; the message says what is allowed.
     """
-    short, file = id if short is None else short, registering_file()
-    for name in (id, short):
-        check_registered_name("task set", name)
-    others = [
-        entry for entry in _task_sets.values() if (entry.id, _files.get(entry.id)) != (id, file)
-    ]
+    short = id if short is None else short
+    others = [entry for entry in _task_sets.values() if entry.id != id or id in _BUILT_IN]
     taken = {name for entry in others for name in (entry.id, entry.short)}
     for name in (id, short):
+        check_registered_name("task set", name)
         if name in taken:
             raise ValueError(f"the name {name!r} is taken; taken are: {', '.join(sorted(taken))}")
     env = Environment(transfers, base=base, max_steps=max_steps)
-    _files[id] = file
     _task_sets[id] = TaskSet(id, short, env.transfers, base, env.max_steps)
     return _task_sets[id]

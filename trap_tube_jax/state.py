@@ -1,4 +1,4 @@
-"""The state of one task, and how to build one from arrays or from a picture.
+"""The state of one task, built from arrays or from a picture.
 
 Source: environment.md, "Board and objects" and "Base task".
 """
@@ -11,6 +11,8 @@ import jax
 import numpy as np
 from flax import struct
 
+from trap_tube_jax.by_value import ByValue
+from trap_tube_jax.checks import described, integer_array
 from trap_tube_jax.objects import (
     AGENT,
     BOARD_SIZE,
@@ -29,7 +31,7 @@ from trap_tube_jax.objects import (
 BOARD_SHAPE = (BOARD_SIZE, BOARD_SIZE)
 
 
-class State(struct.PyTreeNode):
+class State(ByValue, struct.PyTreeNode, eq=False):
     """One task at one time: everything the dynamics and the observation depend on.
 
     Attributes:
@@ -67,12 +69,12 @@ class State(struct.PyTreeNode):
     ) -> Self:
         """Builds a state at time 0 from concrete arrays of any integer type.
 
-        The tool may lie over anything, the agent included; the food may stand in an
-        exit. Any number of cells may hold each static object.
+        The tool may cover anything, the agent included, and the food may be in an exit. Any
+        number of cells may hold each static object.
 
         Args:
           board: [12, 12], codes 0 to 4.
-          agent: (row, column), on ground and off the food.
+          agent: (row, column), on ground and not on the food.
           tool: (row, column) of the tool's top-left cell.
           tool_extent: (rows, columns), a bar of 1 to 4 cells that fits on the board.
           food: (row, column), on ground or exit.
@@ -114,9 +116,9 @@ class State(struct.PyTreeNode):
     ) -> Self:
         """Builds a state at time 0 from a picture of 12 rows of 12 characters.
 
-        `.` ground, `x` trap, `e` exit, `1` and `2` the tubes, `F` food, `T` tool,
-        `A` agent. Below food, tool and agent that are drawn is ground. Where one lies
-        above another object, give it by keyword and do not draw it.
+        `.` ground, `x` trap, `e` exit, `1` and `2` the tubes, `F` food, `T` tool, `A` agent.
+        Drawn food, tool and agent stand on ground. Give by keyword, and do not draw, what
+        covers another object.
 
         Args:
           rows: the picture, as one string (blank margins are dropped) or as rows.
@@ -147,15 +149,15 @@ class State(struct.PyTreeNode):
         )
 
 
-class TimeStep(struct.PyTreeNode):
-    """What the environment tells the agent after a reset or a step.
+class TimeStep(ByValue, struct.PyTreeNode, eq=False):
+    """Observation, reward and flags after a reset or a step.
 
     Attributes:
       observation: u8[12, 12, N], the coloured board.
       reward: f32[], 1 on success, else 0.
       terminated: bool[], the task is solved.
       truncated: bool[], the step limit is reached without success.
-      discount: f32[], 0 where `terminated`, else 1: whether the future has value.
+      discount: f32[], 0 where `terminated`, else 1: the weight of future rewards.
     """
 
     observation: jax.Array
@@ -166,12 +168,12 @@ class TimeStep(struct.PyTreeNode):
 
     @property
     def done(self) -> jax.Array:
-        """bool[]: the episode is over, for either reason."""
+        """Whether the episode is over, bool[]: terminated or truncated."""
         return self.terminated | self.truncated
 
 
 def base_state(num_features: int = 3) -> State:
-    """The base task (environment.md, "Base task") in base colours of N features."""
+    """Builds the base task in base colours of N features; environment.md, "Base task"."""
     return State.from_ascii(
         """
         ............
@@ -205,7 +207,8 @@ def validate(state: State) -> State:
     for flag in ("terminated", "truncated"):
         if getattr(state, flag):
             raise ValueError(f"the state is {flag}; allowed: one whose episode is not over")
-    board, tool, extent = (np.asarray(x) for x in (state.board, state.tool, state.tool_extent))
+    fields = (state.board, state.tool, state.tool_extent)
+    board, tool, extent = (np.asarray(field, np.int64) for field in fields)  # sums stay exact
     if board.max() > max(STATIC_OBJECTS):
         row, column = np.argwhere(board > max(STATIC_OBJECTS))[0]
         allowed = ", ".join(f"{code} {OBJECT_NAMES[code]}" for code in STATIC_OBJECTS)
@@ -220,7 +223,7 @@ def validate(state: State) -> State:
     if tool.min() < 0 or (tool + extent).max() > BOARD_SIZE:
         raise ValueError(
             f"tool at {tuple(tool.tolist())} with extent {tuple(extent.tolist())} leaves the "
-            f"board; all its cells must lie in rows and columns 0 to {BOARD_SIZE - 1}"
+            f"board; all its cells must be in rows and columns 0 to {BOARD_SIZE - 1}"
         )
     _check_stands_on("agent", state.agent, board, (GROUND,))
     _check_stands_on("food", state.food, board, (GROUND, EXIT))
@@ -248,15 +251,14 @@ def check_structure(state: Any) -> None:
             raise ValueError(f"state.{name} must be an array, got {type(field).__name__}")
         if field.dtype != dtype:
             raise ValueError(
-                f"state.{name} must be {np.dtype(dtype).name}{list(shape)}, "
-                f"got {field.dtype}{list(field.shape)}"
+                f"state.{name} must be {np.dtype(dtype).name}{list(shape)}, got {described(field)}"
             )
 
 
 def check_state(state: Any) -> None:
-    """Checks that `state` is one unbatched `State`, by type and shapes alone.
+    """Checks type and shapes of one unbatched `State`.
 
-    Functions of one state call it, so it must be quick: it runs whenever they are traced.
+    The check must be quick: every function of one state makes it when called or traced.
 
     Raises:
       ValueError: naming the field, what it is and what it must be.
@@ -301,12 +303,7 @@ def _field_specs(num_features: int) -> dict[str, tuple[tuple[int, ...], type]]:
 
 def _integers(name: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> Any:
     """Converts `value` to `dtype` after checking kind, shape (None: any >= 1) and range."""
-    try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise ValueError(f"{name} must be a rectangular array of integers: {error}") from None
-    if array.dtype.kind not in "iu":
-        raise ValueError(f"{name} must hold integers, got dtype {array.dtype}: {value!r}")
+    array = np.asarray(integer_array(name, value))
     wanted = ", ".join("N >= 1" if size is None else str(size) for size in shape)
     matches = array.ndim == len(shape) and all(
         size == want if want is not None else size >= 1
@@ -337,9 +334,11 @@ def _check_stands_on(name: str, cell: Any, board: np.ndarray, allowed: tuple[int
 
 
 def _parse_picture(rows: str | Sequence[str]) -> np.ndarray:
-    """u8[12, 12]: the object code of every character."""
+    """Reads the object codes u8[12, 12] of a picture."""
     if isinstance(rows, str):
         rows = [line.strip() for line in rows.strip().splitlines()]
+    if not isinstance(rows, Sequence):
+        raise ValueError(f"the picture must be one string or rows, got {type(rows).__name__}")
     if len(rows) != BOARD_SIZE:
         raise ValueError(f"the picture must have {BOARD_SIZE} rows, got {len(rows)}")
     for index, line in enumerate(rows):
@@ -371,7 +370,7 @@ def _refuse_drawn(codes: np.ndarray, code: int, given: Any) -> None:
 
 
 def _drawn_cell(codes: np.ndarray, code: int, given: Any) -> Any:
-    """The only cell drawn as `code`, or `given`."""
+    """Returns the only cell drawn as `code`, or `given`."""
     if given is not None:
         _refuse_drawn(codes, code, given)
         return given
@@ -387,7 +386,7 @@ def _drawn_cell(codes: np.ndarray, code: int, given: Any) -> Any:
 
 
 def _drawn_bar(codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The corner and extent of the cells drawn as tool, which must form a bar."""
+    """Returns corner and extent of the cells drawn as tool, which must form a bar."""
     drawn = np.argwhere(codes == TOOL)
     if not len(drawn):
         raise ValueError(

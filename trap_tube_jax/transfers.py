@@ -1,12 +1,13 @@
 """The transfers: PRNG-driven maps from states to states, and their composition.
 
-A transfer is any pure function `(key, state) -> state`. The three of the paper are
-`perceptual` (another layout), `structural` (other features) and `symbolic` (the tool
-swaps its looks with another object).
+A transfer is any pure function `(key, state) -> state`. The paper has three: `perceptual`
+resamples the layout, `structural` the features, and `symbolic` swaps the looks of the tool and
+another object.
 
 Source: paper, sections "Perceptual", "Structural" and "Symbolic"; environment.md, "Transfers".
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -29,7 +30,7 @@ from trap_tube_jax.objects import (
     TUBE1,
     TUBE2,
 )
-from trap_tube_jax.prng import fold_in, loop_free
+from trap_tube_jax.prng import fold_in, loop_free, typed_key
 from trap_tube_jax.state import State, check_state
 
 Transfer = Callable[[jax.Array, State], State]
@@ -40,42 +41,61 @@ POINT_OF_OBJECT = np.array([4, 2, 3, 1, 1, 0, 0, 0], np.int32)
 
 
 def compose(*transfers: Transfer) -> Transfer:
-    """The transfer that applies `transfers` from left to right, each with its own key.
+    """Returns the transfer that applies `transfers` from left to right, each with its own key.
 
-    Transfer i gets `jax.random.fold_in(key, i)`, a key of the same type as `key`.
+    Transfer i gets the typed key `jax.random.fold_in(key, i)`.
 
     Raises:
-      ValueError: one of them is not callable, or not hashable.
+      ValueError: a transfer is not callable, or not hashable.
     """
-    for transfer in transfers:
-        if not callable(transfer):
-            raise ValueError(
-                f"a transfer is a function (key, state) -> state, got {transfer!r}; "
-                "allowed: trap_tube_jax.perceptual, structural, symbolic or your own"
-            )
-        try:
-            hash(transfer)
-        except TypeError as error:
-            raise ValueError(
-                f"a transfer must be hashable, for example a frozen dataclass, got {transfer!r}"
-            ) from error
+    return Composition(transfers)
 
-    def composed(key: jax.Array, state: State) -> State:
-        for index, transfer in enumerate(transfers):
+
+@dataclasses.dataclass(frozen=True)
+class Composition:
+    """Several transfers as one; see `compose`."""
+
+    transfers: tuple[Transfer, ...]
+
+    def __post_init__(self):
+        for transfer in self.transfers:
+            if not callable(transfer):
+                raise ValueError(
+                    f"a transfer is a function (key, state) -> state, got {transfer!r}; "
+                    "allowed: trap_tube_jax.perceptual, structural, symbolic or your own"
+                )
+            try:
+                hash(transfer)
+            except TypeError as error:
+                raise ValueError(
+                    f"a transfer must be hashable, for example a frozen dataclass, got {transfer!r}"
+                ) from error
+
+    def __call__(self, key: jax.Array, state: State) -> State:
+        """Applies the transfers to `state`."""
+        key = typed_key(key)
+        for index, transfer in enumerate(self.transfers):
             state = transfer(fold_in(key, index), state)
-            # Without it XLA fuses a draw into each of its uses and repeats it there.
+            # Without the barrier XLA fuses a draw into each of its uses and repeats it there.
             state = jax.lax.optimization_barrier(state)
         return state
 
-    return composed
+    @property
+    def __name__(self) -> str:
+        return ", ".join(map(transfer_name, self.transfers))
+
+
+def transfer_name(transfer: Transfer) -> str:
+    """Returns the name of a transfer for labels and messages."""
+    return getattr(transfer, "__name__", None) or repr(transfer)
 
 
 def perceptual(key: jax.Array, state: State) -> State:
-    """F_P: resamples tube, openings, food, tool and agent; keeps the palette.
+    """Resamples tube, openings, food, tool and agent; keeps the palette (F_P).
 
-    environment.md, "Perceptual", has every choice and its distribution; `layouts` lists the
-    outcomes. A number below n is the remainder of 32 random bits, off the uniform
-    distribution by less than n / 2**32.
+    Draws a number below n as the remainder of 32 random bits, whose distribution differs from
+    the uniform one by less than n / 2**32. `layouts` lists the outcomes.
+    Source: environment.md, "Perceptual".
 
     Args:
       key: PRNG key.
@@ -85,7 +105,7 @@ def perceptual(key: jax.Array, state: State) -> State:
       A state with a new layout.
 
     Raises:
-      ValueError: `state` is not one unbatched state.
+      ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
     """
     check_state(state)
     tables = jax.tree.map(jnp.asarray, layout_tables())
@@ -103,11 +123,11 @@ def perceptual(key: jax.Array, state: State) -> State:
 
 
 def structural(key: jax.Array, state: State) -> State:
-    """F_St: resamples the features of tool, tubes, trap, exit and ground.
+    """Resamples the features of tool, tubes, trap, exit and ground (F_St).
 
-    Five independent points u, uniform on the unit sphere in N dimensions, become
-    features floor((u + 1) / 2 * 255). Both tubes share a point; agent and food keep
-    their features. N is the palette's.
+    Draws five independent points u, uniform on the unit sphere in the palette's N dimensions,
+    and sets features to floor((u + 1) / 2 * 255). Both tubes share a point; agent and food keep
+    their features. Source: environment.md, "Structural".
 
     Args:
       key: PRNG key.
@@ -117,28 +137,28 @@ def structural(key: jax.Array, state: State) -> State:
       The state with a new palette.
 
     Raises:
-      ValueError: `state` is not one unbatched state.
+      ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
     """
     check_state(state)
     return recolor(state, sphere_points(key, state.palette.shape[-1]))
 
 
 def sphere_points(key: jax.Array, num_features: int) -> jax.Array:
-    """f32[8, N]: for every object code the point that `structural` draws, uniform on the sphere.
+    """Draws the points f32[8, N] of `structural`, one per object code.
 
-    The rows of agent and food are not used.
+    Points are uniform on the unit sphere. The rows of agent and food are not used.
     """
     normal = jax.random.normal(loop_free(key), (5, num_features), jnp.float32)
     points = normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
     if num_features == 1:  # -1 and 1, which the rounded quotient may miss
-        points = jnp.where(normal < 0, -1.0, 1.0)
+        points = jnp.where(normal < 0, -1, 1).astype(jnp.float32)
     return points[POINT_OF_OBJECT]
 
 
 def recolor(state: State, points: jax.Array) -> State:
-    """The state with the features of points f32[8, N], but for agent and food.
+    """Sets the features of all objects except agent and food to those of points f32[8, N].
 
-    Coordinates beyond -1 or 1 are cut off there.
+    Coordinates are clipped to -1 to 1.
     """
     features = jnp.floor((points.clip(-1, 1) + 1) / 2 * 255).astype(jnp.uint8)
     keeps = np.isin(np.arange(NUM_OBJECTS), (AGENT, FOOD))[:, None]
@@ -146,14 +166,16 @@ def recolor(state: State, points: jax.Array) -> State:
 
 
 def symbolic(key: jax.Array, state: State) -> State:
-    """F_Sy: swaps shape, place and colour of the tool with those of a random object.
+    """Swaps shape, place and colour of the tool with those of a random object (F_Sy).
 
-    The object is uniform over tool, tube1, tube2, trap and exit. The new tool starts at
-    the object's top-left cell, has as many cells, and is horizontal if the first two in
-    reading order share a row; the object takes the old tool's cells. "Tool" changes
-    nothing. On boards of your own nor does an object that cannot be a tool: one without
-    cells, one with more than four, or one whose bar would leave the board; and nothing is
-    swapped while the tool covers agent or food, which would then stand on the object.
+    The object is uniform over tool, tube1, tube2, trap and exit; "tool" changes nothing. The
+    new tool starts at the object's top-left cell, has as many cells, and is horizontal if the
+    first two in reading order share a row. The object takes the old tool's cells.
+
+    On boards of your own, the state stays as it is if the object cannot be a tool (it has no
+    cells, more than four, or its bar would leave the board), or if the tool covers agent or
+    food, which would then stand on the object.
+    Source: environment.md, "Symbolic".
 
     Args:
       key: PRNG key.
@@ -163,7 +185,7 @@ def symbolic(key: jax.Array, state: State) -> State:
       The state after the swap.
 
     Raises:
-      ValueError: `state` is not one unbatched state.
+      ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
     """
     check_state(state)
     choice = jax.random.randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS), jnp.int32)
@@ -171,15 +193,16 @@ def symbolic(key: jax.Array, state: State) -> State:
 
 
 def swap_with_tool(state: State, code: jax.Array) -> State:
-    """The symbolic swap for a given object.
+    """Swaps the looks of the tool and a given object.
 
     Args:
       state: one unbatched state.
-      code: i32[], one of `SYMBOLIC_OBJECTS`; the tool's own code changes nothing.
+      code: integer[], one of `SYMBOLIC_OBJECTS`; the tool's own code changes nothing.
 
     Returns:
       The state after the swap, or as it was; see `symbolic`.
     """
+    code = code.astype(jnp.uint8)
     cells = np.arange(BOARD_SIZE**2, dtype=np.int32)
     is_object = state.board.reshape(-1) == code
     length = jnp.sum(is_object, dtype=jnp.int32)
@@ -187,7 +210,7 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
     second = jnp.min(cells, where=is_object & (cells > first), initial=cells[-1])
     corner = cell_of(first)
     horizontal = (length > 1) & (second // BOARD_SIZE == first // BOARD_SIZE)
-    extent = jnp.where(horizontal, jnp.stack([1, length]), jnp.stack([length, 1]))
+    extent = jnp.stack([jnp.where(horizontal, 1, length), jnp.where(horizontal, length, 1)])
 
     covers = functools.partial(bar_covers, state.tool, state.tool_extent)
     is_clear = ~covers(state.agent) & ~covers(state.food)
@@ -195,8 +218,8 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
     swaps = (length >= 1) & (length <= MAX_TOOL_LENGTH) & fits & is_clear
     old_tool = bar_cells(state.tool, state.tool_extent)
     board = jnp.where(state.board == code, jnp.uint8(GROUND), state.board)
-    board = jnp.where(old_tool, code.astype(jnp.uint8), board)
-    objects = np.arange(NUM_OBJECTS)
+    board = jnp.where(old_tool, code, board)
+    objects = np.arange(NUM_OBJECTS, dtype=np.uint8)
     partner = jnp.where(objects == TOOL, code, jnp.where(objects == code, TOOL, objects))
     looks_of = jnp.where(swaps, partner, objects)
     return state.replace(

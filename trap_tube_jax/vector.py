@@ -1,28 +1,30 @@
-"""Many environments at once that start over by themselves: the fast path on a CPU.
+"""Batches of environments with auto-reset: the fast path on a CPU.
 
-`VectorEnvironment` does what `jax.vmap` of an `AutoReset` does, bit for bit; that is the
-plain reference to read and to test against. Three differences make it fast:
+`VectorEnvironment` equals `jax.vmap` of an `AutoReset`, bit for bit; read that first. Three
+differences make it fast:
 
-1. Auto-reset by selection draws a new task for every environment at every step. Here the
-   finished environments alone start over, gathered into chunks of fixed size, as many
-   chunks as it takes.
+1. Auto-reset by selection draws a new task for every environment at every step. Here only the
+   finished environments start over, gathered into chunks of fixed size, as many chunks as it
+   takes.
 2. Board and palette are fixed within an episode, so their picture is drawn once, at the
    reset. A step draws food, tool and agent over it.
-3. A picture is a flat vector of bytes, each compared with its own row and column. A loop
-   over 12 * 12 * N neighbouring bytes vectorises; one whose innermost axis are three
-   channels does not. The pictures pass through the loop of the resets, which keeps XLA
-   from fusing the later reshape to [12, 12, N] into that loop over bytes.
+3. A picture is a flat vector of bytes, each compared with its own row and column. A loop over
+   12 * 12 * N neighbouring bytes vectorises; a loop whose innermost axis are three channels does
+   not. The pictures pass through the loop of the resets, which keeps XLA from fusing the later
+   reshape to [12, 12, N] into the loop over bytes.
 """
 
-from typing import Any
+import dataclasses
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.checks import check_integer, check_own_state
-from trap_tube_jax.environment import Environment
+from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.state import State, TimeStep
 from trap_tube_jax.wrappers import (
@@ -35,11 +37,11 @@ from trap_tube_jax.wrappers import (
 MAX_SELECTED_FEATURES = 8
 
 
-class VectorState(struct.PyTreeNode):
-    """The states of B environments that start over by themselves.
+class VectorState(ByValue, struct.PyTreeNode, eq=False):
+    """The states of B environments with auto-reset.
 
     Attributes:
-      episodes: the states and keys that `jax.vmap` of an `AutoReset` keeps.
+      episodes: states and keys, as `jax.vmap` of an `AutoReset` keeps them.
       background: u8[B, 12 * 12 * N], each board without food, tool and agent.
     """
 
@@ -47,53 +49,56 @@ class VectorState(struct.PyTreeNode):
     background: jax.Array
 
 
+@dataclasses.dataclass(frozen=True)
 class VectorEnvironment:
-    """B environments in step, each starting its next episode when one ends.
+    """B environments in lockstep, each starting its next episode when one ends.
 
-    States, observations and everything else equal `jax.vmap` of `AutoReset(env)`, for the
-    same keys and actions. It is batched already: jit and scan it, and do not vmap it over
-    environments. A vmap over seeds works; each step then runs as many chunks as the seed with
-    the most finished environments needs.
+    States, observations and everything else equal `jax.vmap` of `AutoReset(env)` for the same
+    keys and actions. Keys of JAX's `rbg` implementations are an exception: their draws depend on
+    the batch, so the tasks after the first differ from those of `jax.vmap`.
+
+    The environment is batched: jit and scan it, and do not vmap it over environments. A vmap over
+    seeds works; each step then runs as many chunks as the seed with the most finished
+    environments needs.
+
+    Attributes:
+      env: an environment without auto-reset.
+      chunk_size: environments that start over at a time, at least 1. Small chunks waste less
+        when few end together, and suit a CPU; large ones suit a GPU.
+
+    Raises:
+      ValueError: naming the argument, its value and what is allowed.
     """
 
-    starts_over = True
+    env: Environment
+    chunk_size: int = dataclasses.field(default=32, kw_only=True)
+    starts_over: ClassVar = True
 
-    def __init__(self, env: Environment, *, chunk_size: int = 32):
-        """Wraps the environment of one task set.
-
-        Args:
-          env: the environment; not wrapped in an `AutoReset`.
-          chunk_size: how many environments start over at a time, at least 1. Small
-            chunks waste less when few end together, and are quick on a CPU; a GPU wants
-            large ones.
-
-        Raises:
-          ValueError: naming the argument, its value and what is allowed.
-        """
-        if not isinstance(env, Environment):
-            raise ValueError(f"env must be a trap_tube_jax.Environment, got {type(env).__name__}")
-        self.env = env
-        self.chunk_size = check_integer("chunk_size", chunk_size)
-        self._auto_reset = AutoReset(env)
+    def __post_init__(self):
+        if not isinstance(self.env, Environment):
+            raise ValueError(f"env must be a trap_tube_jax.Environment, got {self.env!r}")
+        check_integer("chunk_size", self.chunk_size)
 
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
-        """Starts the first episodes, one for each of the keys [B].
+        """Starts the first episodes, one for each of the keys [B], B >= 1.
 
         Raises:
-          ValueError: `keys` is not a batch of keys.
+          ValueError: `keys` is not a batch of PRNG keys.
         """
         _check_keys(keys)
-        episodes, timestep = jax.vmap(self._auto_reset.reset)(keys)
+        episodes, timestep = jax.vmap(AutoReset(self.env).reset)(keys)
         return VectorState(episodes, jax.vmap(draw_static)(episodes.inner)), timestep
 
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
-        """Takes one action i32[B, 2] in each and starts over those whose episode ended.
+        """Takes one action in every environment and starts the next episode where one ended.
 
-        Numbers of actions are not checked; see `Environment.step`.
+        Args:
+          state: the state that `reset` or `step` returned.
+          actions: integer[B, 2]; see `Environment.step`.
 
         Raises:
-          ValueError: `state` is not what `reset` and `step` return first, or the actions' shape is
-            wrong.
+          ValueError: `state` is of another type, or the actions' shape, dtype or concrete
+            numbers are wrong.
         """
         stepped, timestep, final_picture = self._advance(state, actions)
         state, picture = self._start_over(timestep.done, stepped, final_picture)
@@ -102,8 +107,9 @@ class VectorEnvironment:
     def _advance(
         self, state: VectorState, actions: jax.Array
     ) -> tuple[VectorState, TimeStep, jax.Array]:
-        """One step without any reset: states, timesteps, and pictures u8[B, 12 * 12 * N]."""
-        _check_step(state, actions)
+        """Takes one step without any reset; also returns pictures u8[B, 12 * 12 * N]."""
+        check_own_state(state, VectorState)
+        actions = check_actions(actions, (len(state.background), 2))
         inner, timestep = jax.vmap(self.env.step)(state.episodes.inner, actions)
         stepped = VectorState(AutoResetState(inner, state.episodes.key), state.background)
         return stepped, timestep, jax.vmap(draw_movable)(inner, state.background)
@@ -111,7 +117,7 @@ class VectorEnvironment:
     def _start_over(
         self, done: jax.Array, state: VectorState, picture: jax.Array
     ) -> tuple[VectorState, jax.Array]:
-        """Replaces state and picture where `done` bool[B] by those of a next episode."""
+        """Replaces state and picture by those of a next episode where `done` bool[B]."""
         num_envs, size = len(done), min(self.chunk_size, len(done))
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
@@ -125,9 +131,9 @@ class VectorEnvironment:
             write = lambda into, rows: into.at[index].set(  # noqa: E731
                 rows, mode="drop", indices_are_sorted=True
             )
-            # What is read back from where it was written is not computed again in each of its
-            # uses, as XLA does with what it fuses.
-            new, _ = jax.vmap(self._auto_reset.reset)(read(state.episodes.key))
+            # Reading back what was just written keeps XLA from computing it again in each use.
+            keys = jax.random.clone(read(state.episodes.key))  # overwritten by the next ones
+            new, _ = jax.vmap(AutoReset(self.env).reset)(keys)
             episodes = jax.tree.map(write, state.episodes, new)
             inner = jax.tree.map(read, episodes.inner)
             background = write(state.background, jax.vmap(draw_static)(inner))
@@ -144,22 +150,16 @@ class VectorEnvironment:
 
 def _check_keys(keys: Any) -> None:
     is_typed = jnp.issubdtype(getattr(keys, "dtype", np.int32), jax.dtypes.prng_key)
-    if np.ndim(keys) != (1 if is_typed else 2):
+    shape = np.shape(keys)
+    if len(shape) != (1 if is_typed else 2) or shape[0] == 0:
         raise ValueError(
-            f"reset takes PRNG keys [B], got {type(keys).__name__} of shape {np.shape(keys)}; make "
+            f"expected PRNG keys [B] with B >= 1, got {type(keys).__name__} of shape {shape}; make "
             "them with jax.random.split(jax.random.key(seed), B)"
         )
 
 
-def _check_step(state: Any, actions: Any) -> None:
-    check_own_state(state, VectorState)
-    wanted = (len(state.background), 2)
-    if np.shape(actions) != wanted:
-        raise ValueError(f"actions must be integer{list(wanted)}, got shape {np.shape(actions)}")
-
-
 def draw_static(state: State) -> jax.Array:
-    """u8[12 * 12 * N]: the features of the board without food, tool and agent."""
+    """Draws the board without food, tool and agent, u8[12 * 12 * N]."""
     num_features = state.palette.shape[-1]
     objects = jnp.repeat(state.board.reshape(-1), num_features)
     features = _everywhere(state.palette[GROUND])
@@ -169,16 +169,13 @@ def draw_static(state: State) -> jax.Array:
 
 
 def draw_movable(state: State, background: jax.Array) -> jax.Array:
-    """u8[12 * 12 * N]: food, tool and agent over a `draw_static` picture, as `observe` has them.
-
-    Each byte is compared with its own row and column.
-    """
+    """Draws food, tool and agent over a `draw_static` picture: a flat `observe`."""
     num_features = state.palette.shape[-1]
     cell = np.arange(background.size) // num_features
     row, column = (cell // BOARD_SIZE).astype(np.uint8), (cell % BOARD_SIZE).astype(np.uint8)
     top, left = state.tool.astype(jnp.uint8)
     height, width = state.tool_extent.astype(jnp.uint8)
-    # Below the top or left of it, the unsigned difference wraps around to a large number.
+    # Above or left of the tool the unsigned difference wraps around to a large number.
     in_tool = (row - top < height) & (column - left < width)
 
     def at(position: jax.Array) -> jax.Array:
@@ -190,7 +187,7 @@ def draw_movable(state: State, background: jax.Array) -> jax.Array:
 
 
 def _everywhere(features: jax.Array) -> jax.Array:
-    """u8[12 * 12 * N]: the features u8[N] of one object in every cell."""
+    """Repeats the features u8[N] of one object in every cell, u8[12 * 12 * N]."""
     (num_features,) = features.shape
     if num_features > MAX_SELECTED_FEATURES:
         return jnp.tile(features, BOARD_SIZE**2)

@@ -1,24 +1,25 @@
-"""Wrappers around an environment, pure as it is, with the same `reset` and `step`.
+"""Wrappers around an environment: pure, with the same `reset` and `step`.
 
-They are unbatched; `EpisodeStatistics` also goes around a `VectorEnvironment`.
+Wrappers are unbatched; `EpisodeStatistics` also wraps a `VectorEnvironment`.
 """
 
-from typing import Any, Protocol
+import dataclasses
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.checks import check_own_state
-from trap_tube_jax.environment import check_key
-from trap_tube_jax.prng import split
+from trap_tube_jax.prng import typed_key
 from trap_tube_jax.state import TimeStep
 
 
 class EnvironmentLike(Protocol):
-    """What a wrapper takes, and what it is: an environment with a state of any type.
+    """An environment with a state of any type: wrapped by wrappers, and implemented by them.
 
-    One that starts over by itself has an attribute `starts_over` that is true.
+    An environment that resets itself has a true attribute `starts_over`.
     """
 
     def reset(self, key: jax.Array, /) -> tuple[Any, TimeStep]:
@@ -30,60 +31,63 @@ class EnvironmentLike(Protocol):
         ...
 
 
-class AutoResetState(struct.PyTreeNode):
-    """The state of an environment that starts over by itself.
+class AutoResetState(ByValue, struct.PyTreeNode, eq=False):
+    """The state of an environment that resets itself.
 
     Attributes:
-      inner: the wrapped environment's state.
-      key: PRNG key, the source of the next episodes.
+      inner: state of the wrapped environment.
+      key: typed PRNG key for the next episodes.
     """
 
     inner: Any
     key: jax.Array
 
 
-class AutoResetTimeStep(TimeStep):
-    """A timestep whose observation already belongs to the next episode if this one ended.
+class AutoResetTimeStep(TimeStep, eq=False):
+    """A timestep whose observation is the next episode's first if this episode ended.
 
     Attributes:
       final_observation: u8[12, 12, N], the observation after the action and before any
-        reset: the episode's last where `done`, `observation` elsewhere. Under jit it
-        costs nothing unless it is used.
+        reset: the episode's last where `done`, else `observation`. Under jit it costs
+        nothing unless it is used.
     """
 
     final_observation: jax.Array
 
 
+@dataclasses.dataclass(frozen=True)
 class AutoReset:
     """Starts the next episode within the step that ends one.
 
-    Reward, flags and discount are those of the step that was taken; the observation is
-    the one to act on next. Every episode's task comes from a fresh key.
+    Reward, flags and discount belong to the action taken; the observation is the one to act on
+    next. Every episode draws its task with a fresh key.
+
+    Attributes:
+      env: an environment that does not reset itself.
+
+    Raises:
+      ValueError: `env` resets itself, is an `EpisodeStatistics` or no environment.
     """
 
-    starts_over = True
+    env: EnvironmentLike
+    starts_over: ClassVar = True
 
-    def __init__(self, env: EnvironmentLike):
-        """Wraps an environment that does not start over by itself.
-
-        Raises:
-          ValueError: it does, or it is an `EpisodeStatistics`.
-        """
-        if _starts_over(env):
+    def __post_init__(self):
+        _check_environment(self.env)
+        if _starts_over(self.env):
             raise ValueError(
-                f"{type(env).__name__} starts over by itself already; allowed: an environment "
-                "that does not, such as a trap_tube_jax.Environment"
+                f"{type(self.env).__name__} resets itself already; allowed: an environment that "
+                "does not, such as a trap_tube_jax.Environment"
             )
-        if isinstance(env, EpisodeStatistics):
+        if isinstance(self.env, EpisodeStatistics):
             raise ValueError(
-                "every next episode would start with all counts at zero; allowed: "
+                "every episode would start with all counts at zero; allowed: "
                 "EpisodeStatistics(AutoReset(env))"
             )
-        self.env = env
 
     def reset(self, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
         """Starts the first episode. See `Environment.reset`."""
-        reset_key, next_key = split(check_key(key))
+        reset_key, next_key = jax.random.split(typed_key(key))
         inner, timestep = self.env.reset(reset_key)
         first = auto_reset_timestep(timestep, timestep.observation, timestep.observation)
         return AutoResetState(inner, next_key), first
@@ -91,7 +95,7 @@ class AutoReset:
     def step(
         self, state: AutoResetState, action: jax.Array
     ) -> tuple[AutoResetState, AutoResetTimeStep]:
-        """Takes one action and, if that ended the episode, starts the next.
+        """Takes one action and starts the next episode if this one ended.
 
         Raises:
           ValueError: `state` is not an `AutoResetState`.
@@ -99,28 +103,30 @@ class AutoReset:
         check_own_state(state, AutoResetState)
         inner, timestep = self.env.step(state.inner, action)
         stepped = (AutoResetState(inner, state.key), timestep.observation)
-        fresh, first = self.reset(state.key)
+        # Clones, since `done` selects whether the reset uses the key up or the state keeps it.
+        fresh, first = self.reset(jax.random.clone(state.key))
         next_state, observation = jax.tree.map(
             lambda new, old: jnp.where(timestep.done, new, old),
             (fresh, first.observation),
             stepped,
         )
+        next_state = next_state.replace(key=jax.random.clone(next_state.key))
         return next_state, auto_reset_timestep(timestep, observation, timestep.observation)
 
 
-class EpisodeStatisticsState(struct.PyTreeNode):
-    """The state of an environment that keeps count of its episodes.
+class EpisodeStatisticsState(ByValue, struct.PyTreeNode, eq=False):
+    """The state of an environment that counts its episodes.
 
-    Around a `VectorEnvironment` of B environments the counts have the shape [B].
+    Around a `VectorEnvironment` of B environments all counts have shape [B].
 
     Attributes:
-      inner: the wrapped environment's state.
+      inner: state of the wrapped environment.
       running_return: f32[], rewards of the current episode so far.
       running_length: i32[], steps of the current episode so far.
       last_return: f32[], the undiscounted return of the last finished episode.
       last_length: i32[], the number of steps of the last finished episode.
       episodes: i32[], finished episodes since the reset.
-      over: bool[], the wrapped environment has ended and does not start over.
+      over: bool[], the wrapped environment has ended and does not reset itself.
     """
 
     inner: Any
@@ -132,16 +138,29 @@ class EpisodeStatisticsState(struct.PyTreeNode):
     over: jax.Array
 
 
+@dataclasses.dataclass(frozen=True)
 class EpisodeStatistics:
     """Counts return and length of every episode of any environment, also a `VectorEnvironment`.
 
-    Around a bare environment, steps after the end of the episode are not counted. To start
-    over, wrap an `AutoReset` in it, not the other way round.
+    Around a bare environment, steps after the end of the episode are not counted. For several
+    episodes use `EpisodeStatistics(AutoReset(env))`, not the reverse.
+
+    Attributes:
+      env: an environment, wrapped or not.
+
+    Raises:
+      ValueError: `env` is no environment.
     """
 
-    def __init__(self, env: EnvironmentLike):
-        self.env = env
-        self.starts_over = _starts_over(env)
+    env: EnvironmentLike
+
+    def __post_init__(self):
+        _check_environment(self.env)
+
+    @property
+    def starts_over(self) -> bool:
+        """Whether the wrapped environment resets itself."""
+        return _starts_over(self.env)
 
     def reset(self, key: jax.Array) -> tuple[EpisodeStatisticsState, TimeStep]:
         """Starts the first episode with all counts at zero."""
@@ -169,7 +188,7 @@ class EpisodeStatistics:
         inner, timestep = self.env.step(state.inner, action)
         running_return = state.running_return + timestep.reward
         running_length = state.running_length + 1
-        # A bare environment stays done: its only episode must not finish at every step.
+        # A bare environment stays done; its only episode must not finish at every step.
         finished = timestep.done & ~state.over
         return EpisodeStatisticsState(
             inner=inner,
@@ -177,9 +196,17 @@ class EpisodeStatistics:
             running_length=jnp.where(timestep.done, 0, running_length),
             last_return=jnp.where(finished, running_return, state.last_return),
             last_length=jnp.where(finished, running_length, state.last_length),
-            episodes=state.episodes + finished,
+            episodes=state.episodes + finished.astype(jnp.int32),
             over=timestep.done & (not self.starts_over),
         ), timestep
+
+
+def _check_environment(env: Any) -> None:
+    methods = (getattr(env, "reset", None), getattr(env, "step", None))
+    if isinstance(env, type) or not all(map(callable, methods)):
+        raise ValueError(
+            f"env must be an environment with reset(key) and step(state, action), got {env!r}"
+        )
 
 
 def _starts_over(env: Any) -> bool:
@@ -189,7 +216,7 @@ def _starts_over(env: Any) -> bool:
 def auto_reset_timestep(
     timestep: TimeStep, observation: jax.Array, final_observation: jax.Array
 ) -> AutoResetTimeStep:
-    """The timestep of a step with these observations, of any shape with as many elements."""
+    """Returns `timestep` with other observations, reshaped to its own."""
     shape = timestep.observation.shape
     return AutoResetTimeStep(
         observation=observation.reshape(shape),

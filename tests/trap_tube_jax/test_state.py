@@ -166,6 +166,7 @@ BAD_ARRAYS = [
     ("food beyond 32 bits", {"food": (0, 2**40)}, ["food", str(2**40), "allowed"]),
     ("tool below the board", {"tool": (9, 1)}, ["tool", "(9, 1)", "(4, 1)", "0 to 11"]),
     ("tool above the board", {"tool": (-1, 1)}, ["tool", "(-1, 1)", "0 to 11"]),
+    ("tool off 32 bits", {"tool": (2**31 - 1, 1)}, ["tool", str(2**31 - 1), "0 to 11"]),
     ("tool too wide", {"tool_extent": (2, 2)}, ["tool_extent", "(2, 2)", "1 to 4"]),
     ("tool too long", {"tool_extent": (1, 5)}, ["tool_extent", "(1, 5)", "1 to 4"]),
     ("tool of no cell", {"tool_extent": (0, 1)}, ["tool_extent", "(0, 1)", "1 to 4"]),
@@ -182,6 +183,7 @@ def test_create_refuses(changes, words):
 
 # What is wrong, the picture, keywords, and the message's words.
 BAD_PICTURES: list[tuple[str, Any, dict[str, Any], list[str]]] = [
+    ("nothing", None, {}, ["one string or rows", "NoneType"]),
     ("a row missing", PICTURE[:11], {}, ["12 rows", "11"]),
     ("a row too many", "\n".join([*PICTURE, "." * 12]), {}, ["12 rows", "13"]),
     ("a row too long", picture_with(3, "." * 13), {}, ["row 3", "12 characters", "13"]),

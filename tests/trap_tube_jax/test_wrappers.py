@@ -119,11 +119,17 @@ def test_statistics_go_around_what_starts_over():
 
 
 @pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
-def test_auto_reset_refuses_what_starts_over_by_itself(wrapper):
+def test_auto_reset_refuses_what_resets_itself(wrapper):
     env = wrapper(tt.Environment())
-    words = [wrapper.__name__, "starts over by itself", "trap_tube_jax.Environment"]
+    words = [wrapper.__name__, "resets itself", "trap_tube_jax.Environment"]
     assert_refused(words, tt.AutoReset, env)
-    assert_refused(["starts over by itself"], tt.AutoReset, tt.EpisodeStatistics(env))
+    assert_refused(["resets itself"], tt.AutoReset, tt.EpisodeStatistics(env))
+
+
+@pytest.mark.parametrize("wrap", [tt.AutoReset, tt.EpisodeStatistics])
+@pytest.mark.parametrize("env", [None, "base", tt.Environment, tt.base_state()])
+def test_what_is_no_environment_is_refused(wrap, env):
+    assert_refused(["reset(key) and step(state, action)"], wrap, env)
 
 
 @pytest.mark.parametrize("wrap", [tt.AutoReset, tt.EpisodeStatistics])

@@ -1,0 +1,98 @@
+"""Copies of public objects: equal to the original, and of the same use."""
+
+import copy
+import itertools
+import pickle
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from easy import EASY, assert_same
+from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
+from trap_tube_jax.controls import CONTROLS, drawn_from
+
+OPTIMISED = False  # few steps
+KEY = jax.random.key(0)
+GRADED = (tt.graded_perceptual(0.5), tt.graded_structural(0.25))
+ENVIRONMENTS: dict[str, Any] = {
+    "base": tt.make("base"),
+    "shorter": tt.make("base", max_steps=5),
+    "own base": tt.Environment(base=EASY),
+    "more features": tt.make("base", num_features=4),
+    "paper": tt.make("pstsy"),
+    "graded": tt.Environment(GRADED),
+    "control": tt.make("two-traps"),
+    "auto-reset": tt.AutoReset(tt.make("pstsy")),
+    "statistics": tt.EpisodeStatistics(tt.AutoReset(tt.make("pstsy"))),
+    "vector": tt.VectorEnvironment(tt.make("pstsy")),
+    "small chunks": tt.VectorEnvironment(tt.make("pstsy"), chunk_size=2),
+    "next step": NextStepVectorEnvironment(tt.make("pstsy")),
+}
+TRANSFERS: list[tt.Transfer] = [
+    *(tt.perceptual, tt.structural, tt.symbolic, *GRADED, tt.graded_perceptual(0.75)),
+    *(tt.compose(), tt.compose(tt.perceptual, *GRADED), tt.compose(tt.structural)),
+    *map(drawn_from, CONTROLS),
+]
+STATES = [
+    *(ENVIRONMENTS[name].reset(KEY) for name in ("own base", "more features", "statistics")),
+    tt.VectorEnvironment(tt.make("base")).reset(jax.random.split(KEY, 2)),
+]
+TASK_SETS = (*tt.PAPER_TASK_SETS, *tt.CONTROL_TASK_SETS)
+PUBLIC = [*ENVIRONMENTS.values(), *TRANSFERS, *TASK_SETS, *itertools.chain(*STATES)]
+PUBLIC += [tt.base_state(), tt.make("base").observation_spec]
+
+
+def cloudpickled(value: Any) -> Any:
+    cloudpickle = pytest.importorskip("cloudpickle")
+    return pickle.loads(cloudpickle.dumps(value))
+
+
+COPIES = {
+    "pickle": lambda value: pickle.loads(pickle.dumps(value)),
+    "cloudpickle": cloudpickled,
+    "deepcopy": copy.deepcopy,
+}
+
+
+@pytest.mark.parametrize("duplicate", COPIES.values(), ids=COPIES)
+def test_a_copy_equals_its_original_and_nothing_else(duplicate):
+    copies = [duplicate(value) for value in PUBLIC]
+    for (i, value), (j, other) in itertools.product(enumerate(PUBLIC), enumerate(copies)):
+        assert (value == other) == (i == j), (value, other)
+    assert [hash(value) for value in PUBLIC] == [hash(value) for value in copies]
+
+
+@pytest.mark.parametrize("name", ["graded", "control", "statistics", "small chunks"])
+def test_an_unpickled_environment_plays_the_same(name):
+    env = ENVIRONMENTS[name]
+    batched = isinstance(env, tt.VectorEnvironment)
+
+    def play(env: Any) -> Any:
+        key = jax.random.split(KEY, 3) if batched else KEY
+        state, first = jax.jit(env.reset)(key)
+        action = np.zeros((3, 2) if batched else 2, np.int32)
+        return [first, *jax.jit(env.step)(state, action)]
+
+    for one, other in zip(*map(play, (env, pickle.loads(pickle.dumps(env)))), strict=True):
+        assert one == other
+
+
+def test_a_subclass_with_other_attributes_is_another():
+    class Named(tt.Environment):
+        def __init__(self, name: str):
+            super().__init__()
+            self.name = name
+
+    assert Named("one") == Named("one") != Named("two")
+    assert Named("one") != tt.Environment()
+
+
+def test_a_state_equals_neither_another_nor_an_array():
+    state = tt.base_state()
+    assert state == jax.device_get(state), "NumPy arrays of the same dtype and content"
+    assert state != state.replace(time=np.int64(0)) != 0
+    assert len({state, tt.base_state(), state.replace(time=np.int32(1))}) == 2
+    assert_same(jax.tree.map(lambda x: x, state), state)

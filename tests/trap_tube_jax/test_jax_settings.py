@@ -1,0 +1,83 @@
+"""The same tasks and types under every configuration of JAX that a user may choose."""
+
+import contextlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from easy import assert_same
+
+OPTIMISED = False  # few steps
+TRANSFERS = (
+    *tt.task_set("two-traps").transfers,
+    *(tt.graded_perceptual(0.5), tt.perceptual),
+    *(tt.graded_structural(0.5), tt.structural),
+    tt.symbolic,
+)
+STEPS = 4
+
+
+def play() -> Any:
+    """Episodes of two steps, alone and in a batch; keys as their bits."""
+    env = tt.Environment(TRANSFERS, max_steps=2)
+    alone = tt.EpisodeStatistics(tt.AutoReset(env))
+    batch = tt.EpisodeStatistics(tt.VectorEnvironment(env, chunk_size=2))
+    keys = jax.random.split(jax.random.key(5), 3)
+    record: list[Any] = []
+    for wrapped, key, shape in ((alone, jax.random.key(6), (2,)), (batch, keys, (3, 2))):
+        state, timestep = jax.jit(wrapped.reset)(key)
+        step = jax.jit(wrapped.step)
+        for _ in range(STEPS):
+            record.append((state, timestep))
+            state, timestep = step(state, np.ones(shape, int))
+    record.append((tt.action_from_index(np.arange(16)), tt.action_to_index(np.array([1, 2]))))
+
+    def bits(leaf: jax.Array) -> np.ndarray:
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+
+    return jax.tree.map(bits, record)
+
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "64 bits": {"jax_enable_x64": True},
+    "strict": {"jax_numpy_dtype_promotion": "strict"},
+    "64 bits, strict": {"jax_enable_x64": True, "jax_numpy_dtype_promotion": "strict"},
+    "keys used once": {"jax_debug_key_reuse": True},
+    "no NaN": {"jax_debug_nans": True},
+}
+CONTEXTS = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
+    "jax_debug_key_reuse": jax.debug_key_reuse,
+    "jax_debug_nans": jax.debug_nans,
+}
+
+
+@pytest.fixture(scope="module")
+def expected() -> Any:
+    return play()
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_the_same_episodes(expected, settings):
+    with contextlib.ExitStack() as stack:
+        for name, value in settings.items():
+            stack.enter_context(CONTEXTS[name](value))
+        played = play()
+    assert_same(played, expected)
+
+
+def test_keys_of_another_kind_reset_and_step():
+    with jax.default_prng_impl("rbg"):
+        vector = tt.VectorEnvironment(tt.Environment((tt.structural,), max_steps=2))
+        keys = jax.random.split(jax.random.key(0), 3)
+        state, first = jax.jit(vector.reset)(keys)
+        state, _ = jax.jit(vector.step)(state, jnp.zeros((3, 2), jnp.int32))
+        _, timestep = jax.jit(vector.step)(state, jnp.zeros((3, 2), jnp.int32))
+    assert timestep.truncated.all()
+    assert np.any(timestep.observation != first.observation, axis=(1, 2, 3)).all()
