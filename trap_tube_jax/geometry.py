@@ -14,8 +14,10 @@ ROWS, COLUMNS = ROWS.astype(np.int32), COLUMNS.astype(np.int32)
 def unit_vector(direction: jax.Array | int) -> jax.Array:
     """Returns the displacement i32[2] = (row, column) of a direction, zero for other numbers."""
     direction = jnp.asarray(direction)
-    ends = jnp.stack([direction == DOWN, direction == RIGHT]).astype(jnp.int32)
-    return ends - jnp.stack([direction == UP, direction == LEFT]).astype(jnp.int32)
+    up, down, left, right = (
+        (direction == each).astype(jnp.int32) for each in (UP, DOWN, LEFT, RIGHT)
+    )
+    return jnp.stack([down - up, right - left])
 
 
 def cell_of(index: jax.Array) -> jax.Array:
