@@ -144,14 +144,18 @@ class Placement:
         """Moves arrays [S, ...] from the default device, or NumPy, to the devices."""
         if self.mesh is None:
             return states
-        return jax.device_put(states, NamedSharding(self.mesh, PartitionSpec(SEEDS)))
+        rows = NamedSharding(self.mesh, PartitionSpec(SEEDS))
+        # Unlike `device_put`, takes keys to the devices of several processes.
+        return jax.tree.map(
+            lambda x: jax.make_array_from_callback(x.shape, rows, lambda index: x[index]), states
+        )
 
     def local(self, states: Tree) -> Tree:
         """Copies arrays [S, ...] to one device of this process; all processes must call it."""
         if self.mesh is None:
             return states
-        whole = jax.device_put(states, NamedSharding(self.mesh, PartitionSpec()))
-        return jax.tree.map(lambda x: x.addressable_data(0), whole)
+        replicate = jax.jit(_same, out_shardings=NamedSharding(self.mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: x.addressable_data(0), replicate(states))
 
     def __str__(self) -> str:
         """Names the devices, as in "4 gpu devices of 2 processes"."""
@@ -159,3 +163,7 @@ class Placement:
         if self.mesh is None:
             return platform
         return f"{self.devices} {platform} devices" + f" of {processes} processes" * (processes > 1)
+
+
+def _same(tree: Tree) -> Tree:
+    return tree

@@ -39,11 +39,14 @@ class Checkpoints:
         self.folder = folder
         if keep is None and not folder.is_dir():
             raise CheckpointError(f"{folder} holds no checkpoint")
+        if keep is not None:
+            folder.mkdir(parents=True, exist_ok=True)  # Orbax refuses to for one of many processes
         self._manager = ocp.CheckpointManager(
             folder.absolute(),
             options=ocp.CheckpointManagerOptions(
                 max_to_keep=keep,
                 read_only=keep is None,
+                create=False,
                 cleanup_tmp_directories=keep is not None,
                 enable_async_checkpointing=False,
                 multiprocessing_options=_this_process_alone(),

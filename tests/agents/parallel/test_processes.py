@@ -1,0 +1,91 @@
+"""Several processes train one run: they join, stop together, and leave files that one can read."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from agents.parallel import processes
+from agents.runs.checkpoint import Checkpoints
+from agents.runs.metrics import read_rows
+from agents.train import main
+from paths import ROOT
+from refusal import refused
+
+SMALL = (
+    "--curiosity none --max-steps 4 --episodes-per-iteration 8 --minibatch-size 4 --epochs 1 "
+    "--filters 2 2 --hidden 4 --embedding 2 --encode-chunk-size 8 --eval-episodes 1 "
+    "--iterations 100000 --checkpoint-every 1 --keep 1"
+)
+
+
+def start(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", "agents.train", *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def own(text):
+    """Output without that of the library that connects processes."""
+    return "".join(line for line in text.splitlines(True) if not line.startswith("[Gloo]"))
+
+
+@pytest.mark.slow
+def test_two_processes_stop_together_and_one_continues(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    command = [*SMALL.split(), "--out", tmp_path, "--name", "joint"]
+    command += ["--coordinator", address, "--processes", 2, "--process-id"]
+    first, second = (start(*command, number) for number in range(2))
+    while not re.match("iteration 2:", line := first.stdout.readline()):
+        assert line, first.communicate()
+    second.send_signal(signal.SIGTERM)
+    (output, errors), (silence, complaints) = first.communicate(), second.communicate()
+    assert (first.returncode, second.returncode) == (143, 143), errors + complaints
+    assert own(silence + errors + complaints) == ""
+    assert "Stopped. Continue with: " in output
+
+    folder = tmp_path / "joint"
+    with Checkpoints(folder / "checkpoints") as checkpoints:
+        (iteration,) = checkpoints.iterations
+    episodes = [row["episodes"] for row in read_rows(folder / "metrics.csv")]
+    assert episodes == [8 * done for done in range(1, iteration + 1)]
+
+    alone = start("--resume", folder, "--iterations", iteration + 1)
+    _, errors = alone.communicate()
+    assert alone.returncode == 0, errors
+    assert len(read_rows(folder / "metrics.csv")) == iteration + 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--devices 2", "2 of 1 cpu devices in 1 process(es) cannot share"),
+        ("--devices 0", "allowed: 1"),
+        ("--coordinator a:1", "coordinator, processes and process_id belong together"),
+        ("--coordinator a --processes 2 --process-id 0", "coordinator must be HOST:PORT, got 'a'"),
+        ("--coordinator a:1 --processes 2 --process-id 2", "process_id must be in [0, 1], got 2"),
+    ],
+)
+def test_impossible_devices_and_processes_are_refused(capsys, tmp_path, arguments, message):
+    assert message in refused(capsys, main, *arguments.split(), "--out", tmp_path)
+
+
+def test_a_single_process_is_the_first_and_agrees_with_itself():
+    called = []
+    processes.on_first(lambda: called.append(True))
+    assert called == [True]
+    assert processes.is_first()
+    assert [processes.agree(number) for number in (None, 3)] == [None, 3]
+    with pytest.raises(ZeroDivisionError):
+        processes.on_first(lambda: 1 // 0)
