@@ -1,6 +1,6 @@
 """Several processes for one run, joined by `jax.distributed`.
 
-All processes run the same command in a folder that all can read. The first one writes and reports.
+All processes run the same command and read the same folder; the first one writes and reports.
 """
 
 import dataclasses
@@ -30,39 +30,23 @@ class Job:
     processes: int | None = option(None, "devices and hosts")
     process_id: int | None = option(None, "devices and hosts")
 
-    def __post_init__(self) -> None:
-        """Checks the options.
-
-        Raises:
-          ValueError: an option is missing or not allowed.
-        """
-        given = [self.coordinator, self.processes, self.process_id]
-        if given == [None] * 3:
-            return
-        if self.coordinator is None or self.processes is None or self.process_id is None:
-            raise ValueError("coordinator, processes and process_id belong together; give all")
-        if not self.coordinator.rpartition(":")[2].isdigit():
-            raise ValueError(f"coordinator must be HOST:PORT, got {self.coordinator!r}")
-        if not 0 <= self.process_id < self.processes:
-            raise ValueError(
-                f"process_id must be in [0, {self.processes - 1}], got {self.process_id}"
-            )
-
     def join(self) -> None:
         """Waits for the other processes, if any; call it before JAX starts.
 
         Raises:
-          ValueError: the other processes were not found.
+          ValueError: the options are incomplete, or the other processes are not found.
         """
-        if not self.distributed and self.coordinator is None:
+        given = (self.coordinator, self.processes, self.process_id)
+        if not self.distributed and given == (None, None, None):
             return
         jax.config.update("jax_enable_preemption_service", False)  # it would catch SIGTERM
         try:
-            jax.distributed.initialize(self.coordinator, self.processes, self.process_id)
-        except (ValueError, RuntimeError) as error:
+            jax.distributed.initialize(*given)
+        except (ValueError, RuntimeError, IndexError) as error:
             raise ValueError(
-                f"the other processes were not found ({str(error).splitlines()[0]}); without a "
-                "launcher, give --coordinator, --processes and --process-id"
+                f"cannot join the other processes ({str(error).splitlines()[0]}): give "
+                "--distributed under a launcher, else --coordinator HOST:PORT, --processes and "
+                "--process-id"
             ) from error
 
 
@@ -77,22 +61,17 @@ def is_first() -> bool:
 
 
 def agree(number: int | None) -> int | None:
-    """Returns the largest number of any process, None if none has one; all must call it."""
+    """Returns the largest number of any process, None if all have None or 0; all must call it."""
     if count() == 1:
         return number
     return int(np.max(multihost_utils.process_allgather(np.int32(number or 0)))) or None
 
 
-def barrier() -> None:
-    """Waits until all processes have called it."""
-    agree(None)
-
-
 def on_first(function: Callable[[], object]) -> None:
-    """Calls a function in the first process alone; the others wait until it has returned.
+    """Calls a function in the first process; the others wait for it.
 
     Raises:
-      ValueError: it failed, in the other processes; the first one raises its own error.
+      ValueError: the function failed in the first process, which raises its own error.
     """
     failed = True
     try:
@@ -102,4 +81,4 @@ def on_first(function: Callable[[], object]) -> None:
     finally:
         failed = agree(failed)
     if failed:
-        raise ValueError("the first process has failed; its output says why")
+        raise ValueError("the first process failed; its output says why")

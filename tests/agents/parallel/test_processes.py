@@ -72,9 +72,8 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
     [
         ("--devices 2", "2 of 1 cpu devices in 1 process(es) cannot share"),
         ("--devices 0", "allowed: 1"),
-        ("--coordinator a:1", "coordinator, processes and process_id belong together"),
-        ("--coordinator a --processes 2 --process-id 0", "coordinator must be HOST:PORT, got 'a'"),
-        ("--coordinator a:1 --processes 2 --process-id 2", "process_id must be in [0, 1], got 2"),
+        ("--coordinator a:1", "else --coordinator HOST:PORT, --processes and --process-id"),
+        ("--process-id 0", "cannot join the other processes"),
     ],
 )
 def test_impossible_devices_and_processes_are_refused(capsys, tmp_path, arguments, message):
