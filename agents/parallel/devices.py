@@ -5,12 +5,9 @@ seed: each device plays its own episodes and differentiates its own part of ever
 the gradients are averaged. States [S, ...] are split along `seeds` and replicated along `episodes`,
 so a checkpoint fits any number of devices.
 
-    placement = Placement.of(devices, config, seeds)
     learner = make_train(config, axis=placement.axis)
     iterate = jax.jit(placement.shard(jax.vmap(learner.iterate)), donate_argnums=0)
-    states = placement.put(jax.vmap(learner.init)(keys))
-    states, metrics = iterate(states)
-    metrics, states_here = placement.local(metrics), placement.local(states)
+    states, metrics = iterate(placement.put(states))
 """
 
 import contextlib
@@ -61,13 +58,11 @@ class EpisodeAxis:
 
         return jax.tree.map(mean, tree)
 
-    def sum(self, x: jax.Array) -> jax.Array:
-        """Sums over the devices."""
-        return x if self.size == 1 else jax.lax.psum(x, EPISODES)
-
     def part(self, x: jax.Array) -> jax.Array:
         """Returns this device's rows i, i + size, i + 2 size, ... of `x` [B, ...]."""
-        return x if self.size == 1 else x.reshape(-1, self.size)[:, jax.lax.axis_index(EPISODES)]
+        if self.size == 1:
+            return x
+        return x.reshape(-1, self.size)[:, jax.lax.axis_index(EPISODES)]
 
     def gather(self, x: jax.Array) -> jax.Array:
         """Returns the rows [B] of all devices; inverts `part`."""
@@ -121,11 +116,6 @@ class Placement:
         return cls(Mesh(grid, (SEEDS, EPISODES)))
 
     @property
-    def devices(self) -> int:
-        """Number of devices."""
-        return 1 if self.mesh is None else self.mesh.size
-
-    @property
     def axis(self) -> EpisodeAxis:
         """Devices that share the episodes of a seed."""
         return EpisodeAxis(1 if self.mesh is None else self.mesh.shape[EPISODES])
@@ -158,11 +148,11 @@ class Placement:
         return jax.tree.map(lambda x: x.addressable_data(0), replicate(states))
 
     def __str__(self) -> str:
-        """Names the devices, as in "4 gpu devices of 2 processes"."""
+        """Names the devices, as in "4 gpu devices of 2 process(es)"."""
         platform, processes = jax.default_backend(), jax.process_count()
         if self.mesh is None:
             return platform
-        return f"{self.devices} {platform} devices" + f" of {processes} processes" * (processes > 1)
+        return f"{self.mesh.size} {platform} devices of {processes} process(es)"
 
 
 def _same(tree: Tree) -> Tree:

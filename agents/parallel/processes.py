@@ -39,7 +39,8 @@ class Job:
         given = (self.coordinator, self.processes, self.process_id)
         if not self.distributed and given == (None, None, None):
             return
-        jax.config.update("jax_enable_preemption_service", False)  # it would catch SIGTERM
+        if "jax_enable_preemption_service" in jax.config.values:  # it would catch SIGTERM
+            jax.config.update("jax_enable_preemption_service", False)
         try:
             jax.distributed.initialize(*given)
         except (ValueError, RuntimeError, IndexError) as error:

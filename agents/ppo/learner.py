@@ -152,8 +152,8 @@ class Learner:
         batch, (extrinsic, intrinsic) = self.make_batch(state, trajectory, intrinsic_reward)
         params, opt_state, update_metrics = self.update(state, batch, update_key)
 
-        episodes = trajectory.episodes
-        solved = self.axis.gather(episodes.solved)
+        solved = self.axis.gather(trajectory.episodes.solved)
+        steps = jnp.sum(self.axis.gather(trajectory.episodes.length))
         metrics = {**self.play_metrics(batch, intrinsic_reward, solved), **update_metrics}
         metrics["is_finite"] = _is_finite((params, metrics))
         next_state = TrainState(
@@ -166,7 +166,7 @@ class Learner:
             key=key,
             iteration=state.iteration + 1,
             episodes=state.episodes + self.config.episodes_per_iteration,
-            transitions=state.transitions + self.axis.sum(jnp.sum(episodes.length)),
+            transitions=state.transitions + steps,
         )
         return next_state, metrics
 
