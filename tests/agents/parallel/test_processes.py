@@ -1,11 +1,8 @@
 """Several processes train one run: they join, stop together, and leave files that one can read."""
 
-import os
 import re
 import signal
 import socket
-import subprocess
-import sys
 
 import pytest
 
@@ -13,25 +10,8 @@ from agents.parallel import processes
 from agents.runs.checkpoint import Checkpoints
 from agents.runs.metrics import read_rows
 from agents.train import main
-from paths import ROOT
 from refusal import refused
-
-SMALL = (
-    "--curiosity none --max-steps 4 --episodes-per-iteration 8 --minibatch-size 4 --epochs 1 "
-    "--filters 2 2 --hidden 4 --embedding 2 --encode-chunk-size 8 --eval-episodes 1 "
-    "--iterations 100000 --checkpoint-every 1 --keep 1"
-)
-
-
-def start(*arguments):
-    return subprocess.Popen(
-        [sys.executable, "-W", "error", "-m", "agents.train", *map(str, arguments)],
-        cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+from small_runs import options, start
 
 
 def own(text):
@@ -44,9 +24,11 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    command = [*SMALL.split(), "--out", tmp_path, "--name", "joint"]
+    command = [*options(), "--iterations", 100_000, "--checkpoint-every", 1, "--keep", 1]
+    command += ["--out", tmp_path, "--name", "joint"]
     command += ["--coordinator", address, "--processes", 2, "--process-id"]
-    first, second = (start(*command, number) for number in range(2))
+    first, second = (start("agents.train", *command, number) for number in range(2))
+    assert first.stdout is not None
     while not re.match("iteration 2:", line := first.stdout.readline()):
         assert line, first.communicate()
     second.send_signal(signal.SIGTERM)
@@ -61,7 +43,7 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
     episodes = [row["episodes"] for row in read_rows(folder / "metrics.csv")]
     assert episodes == [8 * done for done in range(1, iteration + 1)]
 
-    alone = start("--resume", folder, "--iterations", iteration + 1)
+    alone = start("agents.train", "--resume", folder, "--iterations", iteration + 1)
     _, errors = alone.communicate()
     assert alone.returncode == 0, errors
     assert len(read_rows(folder / "metrics.csv")) == iteration + 1
