@@ -1,7 +1,7 @@
-"""Features of the observations of episodes, each distinct observation encoded once.
+"""Fast path: features of all observations of episodes, each distinct observation encoded once.
 
-`encode_episodes` does so for episodes that have been played. `Cache` does so while they are
-played: it remembers what any of them has met.
+`encode_episodes` encodes episodes that have been played. `Cache` encodes observations while
+episodes are played, and finds those that any of them has met before.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from trap_tube_jax.observation import observe
 from trap_tube_jax.positions import position_id
 from trap_tube_jax.state import State
 
-CACHE_BITS = 20  # of an observation's hash, by which the cache finds it
+CACHE_BITS = 20  # of an observation's hash, in the table of `Cache`
 
 
 def encode_episodes(
@@ -28,11 +28,11 @@ def encode_episodes(
     *,
     chunk: int,
 ) -> Any:
-    """The features of all observations, f32[T + 1, B, F], or a tree of such arrays.
+    """Encodes all observations to f32[T + 1, B, F], or to a tree of such arrays.
 
     Args:
-      encode_rows: from observations u8[chunk, 12, 12, N] to features; see `chunks.RowFn`.
-      params: what `encode_rows` reads; the features are differentiable with respect to it.
+      encode_rows: encodes observations u8[chunk, 12, 12, N]; see `chunks.map_rows`.
+      params: parameters of `encode_rows`, by which the features are differentiable.
       episodes: the episodes.
       observation_id: i32[T + 1, B], equal only for equal observations.
       chunk: distinct observations encoded at once.
@@ -48,14 +48,14 @@ def encode_episodes(
 
 
 class Cache(NamedTuple):
-    """The features of all observations that B episodes have met so far.
+    """Features of all observations that B episodes have met so far.
 
     Attributes:
       layout_id: i32[B], equal only for equal layouts.
       position: i32[T + 1, B], see `position_id`.
       features: f32[T + 1, B, F].
-      newest: i32[S], by hash: the flat index time * B + episode at which an observation with this
-        hash was last seen, -1 where none was. A later one overwrites an earlier one.
+      newest: i32[S], by hash: the flat index time * B + episode at which an observation of this
+        hash was last met; -1 for none.
     """
 
     layout_id: jax.Array
@@ -65,26 +65,26 @@ class Cache(NamedTuple):
 
     @staticmethod
     def empty(layout_id: jax.Array, num_steps: int, width: int) -> "Cache":
-        """A cache for episodes of `num_steps` steps and features of this width."""
+        """Makes a cache for episodes of `num_steps` steps and features of this width."""
         shape = (num_steps + 1, len(layout_id))
         return Cache(
             layout_id=layout_id,
             position=jnp.zeros(shape, jnp.int32),
-            features=jnp.zeros((*shape, width)),
-            newest=jnp.full(2**CACHE_BITS, -1),
+            features=jnp.zeros((*shape, width), jnp.float32),
+            newest=jnp.full(2**CACHE_BITS, -1, jnp.int32),
         )
 
     def encode(
-        self, agent: Agent, params: Params, state: State, time: jax.Array | int
+        self, agent: Agent, params: Params, state: State, time: jax.Array
     ) -> tuple[jax.Array, "Cache"]:
-        """The features f32[B, F] of B states' observations at `time`, and the cache with them.
+        """Returns the features f32[B, F] of B states' observations at `time`, and the next cache.
 
-        At most `agent.config.encode_chunk_size` observations are encoded at once.
+        Encodes at most `encode_chunk_size` observations at once.
         """
         position = jax.vmap(position_id)(state)
         slot = slots(jnp.stack([self.layout_id, position], axis=1), CACHE_BITS)
         is_known, known = self._look_up(position, slot)
-        # Of those that are not known, the distinct ones come first.
+        # False sorts before true: the distinct unknown observations come first.
         groups = group(is_known.astype(jnp.int32), self.layout_id, position)
         num_new = jnp.max(jnp.where(is_known, -1, groups.number)) + 1
         rows = jax.vmap(observe)(state)[groups.representative]
@@ -93,14 +93,15 @@ class Cache(NamedTuple):
         )
         features = jnp.where(is_known[:, None], known, new[groups.number])
         batch = len(self.layout_id)
+        index = time * batch + jnp.arange(batch, dtype=jnp.int32)
         return features, self._replace(
             position=self.position.at[time].set(position),
             features=self.features.at[time].set(features),
-            newest=self.newest.at[slot].max(time * batch + jnp.arange(batch)),
+            newest=self.newest.at[slot].max(index),
         )
 
     def _look_up(self, position: jax.Array, slot: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Whether observations are known, bool[B], and their features f32[B, F] if they are."""
+        """Returns which observations are known, bool[B], and their features f32[B, F]."""
         met = self.newest[slot]
         same_layout = self.layout_id[met % len(self.layout_id)] == self.layout_id
         same_position = self.position.reshape(-1)[met] == position

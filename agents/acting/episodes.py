@@ -15,16 +15,16 @@ CELL_AGENT, CELL_TOOL, CELL_FOOD = 0, 1, 2  # places in `Episodes.cells`
 
 
 class Episodes(NamedTuple):
-    """B episodes of T steps, padded after an early end with what does not change any more.
+    """B episodes of T steps; after an early end, the last state repeats.
 
     Attributes:
-      layout: B states, of which board, palette and tool extent hold for the episode.
-      cells: u8[T + 1, B, 3, 2], the (row, column) of agent, tool and food at each observation;
-        `CELL_AGENT`, `CELL_TOOL` and `CELL_FOOD` are their places.
+      layout: B states, whose board, palette and tool extent hold for the episode.
+      cells: u8[T + 1, B, 3, 2], (row, column) of agent, tool and food at each observation; see
+        `CELL_AGENT`, `CELL_TOOL` and `CELL_FOOD`.
       action: i32[T, B, 2], (grasp, move).
       reward: f32[T, B], extrinsic.
       discount: f32[T, B], 0 on the step that terminated the episode and after it, else 1.
-      mask: f32[T, B], 1 on steps taken before the episode's end.
+      mask: f32[T, B], 1 on steps taken before the episode's end, else 0.
     """
 
     layout: State
@@ -36,41 +36,41 @@ class Episodes(NamedTuple):
 
     @property
     def solved(self) -> jax.Array:
-        """bool[B]: episodes that earned their reward."""
+        """bool[B], episodes with a reward."""
         return jnp.any(self.reward > 0, axis=0)
 
     @property
     def length(self) -> jax.Array:
-        """i32[B]: steps taken."""
+        """i32[B], steps taken."""
         return jnp.sum(self.mask, axis=0).astype(jnp.int32)
 
     def observations(self) -> jax.Array:
-        """All boards, u8[T + 1, B, 12, 12, N]."""
+        """Returns all boards, u8[T + 1, B, 12, 12, N]."""
         one_time = jax.vmap(lambda layout, cells: observe(place(layout, cells)))
         return jax.vmap(one_time, in_axes=(None, 0))(self.layout, self.cells)
 
 
 def along_episodes(function: Callable[[int, jax.Array], jax.Array], record: Record) -> Record:
-    """Applies `function(axis, array)` to the arrays of a record.
+    """Applies `function(axis, array)` to the arrays of a record, `axis` being that of episodes.
 
-    A record is `Episodes`, or a tree that holds one beside arrays [T, B, ...]. `axis` is where an
-    array has its episodes: 0 in a field of the name `layout`, 1 elsewhere.
+    A record is `Episodes`, or a tree of them and arrays [T, B, ...]. `axis` is 0 in a field named
+    `layout`, else 1.
     """
     layout = jax.tree_util.GetAttrKey("layout")
     return jax.tree.map_with_path(lambda path, x: function(0 if layout in path else 1, x), record)
 
 
 def take(record: Record, places: jax.Array) -> Record:
-    """The episodes at these places, i32[M], of any record; see `along_episodes`."""
+    """Returns the episodes at `places` i32[M] of a record; see `along_episodes`."""
     return along_episodes(lambda axis, x: x[places] if axis == 0 else x[:, places], record)
 
 
 def place(layout: State, cells: jax.Array) -> State:
-    """The state with agent, tool and food at `cells` u8[3, 2]."""
+    """Returns the layout with agent, tool and food at `cells` u8[3, 2]."""
     agent, tool, food = cells.astype(jnp.int32)
     return layout.replace(agent=agent, tool=tool, food=food)
 
 
 def cells_of(state: State) -> jax.Array:
-    """u8[B, 3, 2]: the cells of agent, tool and food in B states."""
+    """Returns the cells of agent, tool and food of B states, u8[B, 3, 2]."""
     return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)

@@ -9,7 +9,7 @@ import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.frames import Frame
-from agents.acting.rollout import Trajectory, greedy_action, rollout
+from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
@@ -26,9 +26,9 @@ class Evaluation(NamedTuple):
     Attributes:
       solved: bool[B].
       length: i32[B], steps taken.
-      action: i32[B, T, 2], (grasp, move); without meaning from `length` on.
-      value: f32[B, T], the network's value of every state; of the task's rewards alone where the
-        intrinsic reward has a value of its own. Without meaning from `length` on, too.
+      action: i32[B, T, 2], (grasp, move); meaningless from `length` on.
+      value: f32[B, T], the value of every state, by the extrinsic value head where rewards have
+        separate ones; meaningless from `length` on.
     """
 
     solved: jax.Array
@@ -43,7 +43,7 @@ def evaluate(agent: Agent, params: Params, env: Environment, tasks: State) -> Ev
     Args:
       agent: the network.
       params: its parameters.
-      env: the dynamics and the step limit; its transfers play no part.
+      env: the dynamics and the step limit; its transfers are not used.
       tasks: B states at time 0.
     """
     frame, played = play_greedily(agent, params, env, tasks)
@@ -56,16 +56,11 @@ def evaluate(agent: Agent, params: Params, env: Environment, tasks: State) -> Ev
 def play_greedily(
     agent: Agent, params: Params, env: Environment, tasks: State
 ) -> tuple[Frame, Trajectory]:
-    """The frame in which the agent sees each task, and the episodes in these frames.
-
-    Arguments are those of `evaluate`.
-    """
+    """Returns the frame of each task, and the episodes in these frames; see `evaluate`."""
     frame = Frame.of(jnp.zeros(len(tasks.time), jnp.int32))
     if agent.config.align_to_food:
         frame = jax.vmap(Frame.facing_food)(jax.vmap(tt.observe)(tasks))
-    seen = jax.vmap(Frame.state)(frame, tasks)
-    unused_key = jax.random.key(0)
-    return frame, rollout(agent, params, env, seen, unused_key, choose=greedy_action)
+    return frame, rollout(agent, params, env, jax.vmap(Frame.state)(frame, tasks), key=None)
 
 
 class Evaluator:
@@ -75,19 +70,19 @@ class Evaluator:
         """Prepares the play.
 
         Args:
-          config: the settings of the policies to come.
-          tasks: the tasks of each set, by name; see `evaluation_tasks`. Where `config.max_steps`
-            is None, the names are those of registered sets, whose limits hold.
+          config: settings of the policies to evaluate.
+          tasks: the tasks of each set, by name; see `evaluation_tasks`. If `config.max_steps` is
+            None, the names must be those of registered sets, whose limits hold.
 
         Raises:
-          ValueError: `config.max_steps` is None, and a name is not that of a registered set.
+          ValueError: `config.max_steps` is None, and a set is not registered.
         """
         self.tasks = dict(tasks)
         self.limits = {name: config.step_limit(name) for name in self.tasks}
-        self._total = sum(len(states.time) for states in self.tasks.values())
+        self._ends = np.cumsum([len(states.time) for states in self.tasks.values()])
         together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
-        self._blocks = [take(together, block) for block in blocks(self._total)]
-        # All sets are played up to the largest limit; `__call__` cuts off what is beyond a set's.
+        self._blocks = [take(together, block) for block in blocks(int(self._ends[-1]))]
+        # All sets are played up to the largest limit; `_within` cuts off steps beyond a set's.
         longest = max(self.limits.values())
         env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
         agent = Agent(config)
@@ -95,7 +90,7 @@ class Evaluator:
 
     @classmethod
     def of_sets(cls, config: Config, sets: Sequence[str], num_tasks: int) -> "Evaluator":
-        """An evaluator of registered task sets.
+        """Makes an evaluator of registered task sets.
 
         Raises:
           ValueError: unknown set, no set, or no task.
@@ -106,19 +101,14 @@ class Evaluator:
         tasks = {name: evaluation_tasks(name, num_tasks, config.num_features) for name in names}
         return cls(config, tasks)
 
-    def compile(self, params: Params) -> None:
-        """Compiles for parameters of these shapes, as the first call would."""
-        self._play = self._play.lower(params, self._blocks[0]).compile()
-
     def __call__(self, params: Params) -> dict[str, Evaluation]:
-        """Outcomes as NumPy arrays, by the names of the tasks."""
+        """Plays all tasks; returns NumPy arrays by the names of the sets."""
         played = [jax.tree.map(np.asarray, self._play(params, states)) for states in self._blocks]
-        whole = jax.tree.map(lambda *parts: np.concatenate(parts)[: self._total], *played)
-        ends = np.cumsum([len(states.time) for states in self.tasks.values()])
-        starts = np.concatenate([[0], ends[:-1]])
+        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *played)
+        starts = [0, *self._ends[:-1]]
         return {
             name: _within(take(whole, slice(start, end)), self.limits[name])
-            for name, start, end in zip(self.tasks, starts, ends, strict=True)
+            for name, start, end in zip(self.tasks, starts, self._ends, strict=True)
         }
 
     def scores(
@@ -126,15 +116,14 @@ class Evaluator:
         played: Mapping[str, Evaluation],
         shortest: Mapping[str, np.ndarray] | None = None,
     ) -> list[Score]:
-        """The score of every set.
+        """Computes the score of every set.
 
         Args:
           played: outcomes by set, as a call returned them.
-          shortest: the lengths i32[B] of each set's shortest plans, to compare with.
+          shortest: lengths i32[B] of each set's shortest plans, to compare with; or None.
         """
         made = []
-        for name, outcome in played.items():
-            solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
+        for name, (solved, length, *_) in played.items():
             found = None
             if shortest is not None:
                 found = Optimality.of(solved, length, shortest[name], self.limits[name])
@@ -145,12 +134,12 @@ class Evaluator:
 
 
 def own_and_paper_sets(config: Config) -> tuple[str, ...]:
-    """The short names of the paper's eight sets, and of that of training if it is another one."""
+    """Returns the short names of the paper's eight sets and of the training set."""
     return tuple(dict.fromkeys((*ALL_SETS, tt.task_set(config.env_id).short)))
 
 
 def _within(outcome: Evaluation, limit: int) -> Evaluation:
-    """The episodes as they are if truncated after `limit` steps."""
+    """Truncates the episodes after `limit` steps."""
     return outcome._replace(
         solved=outcome.solved & (outcome.length <= limit),
         length=np.minimum(outcome.length, limit),

@@ -1,10 +1,10 @@
-"""A frame of reference: the board, turned and mirrored so that the food lies ahead.
+"""Frames of reference: the board turned and mirrored so that the food is ahead.
 
-The rules are the same under the eight symmetries of the board. So an agent may look at a mirror
-image and act in it. One that chooses the image by the food's position relative to its own, as it
-first sees them, has an eighth of the situations to learn. The frame holds for the episode.
+The rules are the same under the eight symmetries of the board, so an agent may see an image of the
+board and act in it. If the image depends on the direction of the food at the first observation, an
+eighth of the situations is left to learn. The frame holds for the whole episode.
 
-Source: own; frames are averaged over, and chosen, in Puny et al. (2022).
+Source: own; Puny et al. (2022) average over frames, and choose them.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from trap_tube_jax.state import State, base_state
 class Frame(NamedTuple):
     """One of the eight images of the board.
 
-    It is mirrored at the main diagonal or not, then upside down or not, then left to right or not.
+    The flags mirror the board at the main diagonal, then upside down, then left to right.
 
     Attributes:
       transposed: bool[].
@@ -34,15 +34,15 @@ class Frame(NamedTuple):
 
     @staticmethod
     def of(number: jax.Array) -> "Frame":
-        """That of a number from 0, the board as it is, to 7."""
+        """Returns frame `number` (0 to 7); 0 is the identity."""
         return Frame(number % 2 == 1, number // 2 % 2 == 1, number // 4 == 1)
 
     @staticmethod
     def facing_food(observation: jax.Array) -> "Frame":
-        """The frame in which food lies below the agent, at most as far to the right as below.
+        """Returns the frame with the food below the agent, at most as far to the right as below.
 
-        Agent and food are found in the observation u8[12, 12, N] by their colours. The board stays
-        as it is where one of them is not to be seen.
+        Finds agent and food in the observation u8[12, 12, N] by their colours. Returns the
+        identity if one of them is not visible.
         """
         palette = base_state(observation.shape[-1]).palette
         agent, food = (_first_cell(observation, palette[thing]) for thing in (AGENT, FOOD))
@@ -52,13 +52,13 @@ class Frame(NamedTuple):
         return Frame(transposed, offset[0] < 0, offset[1] < 0)
 
     def picture(self, board: jax.Array) -> jax.Array:
-        """The image of cells [12, 12, ...]."""
+        """Returns the image of cells [12, 12, ...]."""
         board = jnp.where(self.transposed, board.swapaxes(0, 1), board)
         board = jnp.where(self.top_down, board[::-1], board)
         return jnp.where(self.left_right, board[:, ::-1], board)
 
     def state(self, state: State) -> State:
-        """The image of a state."""
+        """Returns the image of a state."""
         extent = jnp.where(self.transposed, state.tool_extent[::-1], state.tool_extent)
         one_cell = jnp.ones_like(extent)
         return state.replace(
@@ -69,40 +69,28 @@ class Frame(NamedTuple):
             food=self._corner(state.food, one_cell),
         )
 
-    def action(self, action: jax.Array) -> jax.Array:
-        """The image of an action i32[..., 2]."""
-        return self._directions()[action]
-
     def original_action(self, action: jax.Array) -> jax.Array:
-        """The action i32[..., 2] whose image this is; undoes `action`."""
-        return jnp.argsort(self._directions())[action]
+        """Returns the action i32[..., 2] whose image is `action`."""
+        direction = np.arange(NUM_DIRECTIONS, dtype=np.int32)
+        for applies, swapped in (
+            (self.left_right, (UP, DOWN, RIGHT, LEFT)),
+            (self.top_down, (DOWN, UP, LEFT, RIGHT)),
+            (self.transposed, (LEFT, RIGHT, UP, DOWN)),
+        ):
+            image = jnp.asarray(swapped, jnp.int32)[direction]
+            direction = jnp.where(applies, image, direction)
+        return jnp.asarray(direction)[action]
 
     def _corner(self, cell: jax.Array, extent: jax.Array) -> jax.Array:
-        """The top-left cell i32[2] of the image of a bar with this top-left cell.
-
-        Args:
-          cell: i32[2].
-          extent: i32[2], the image's.
-        """
+        """Returns the top-left cell i32[2] of the image of a bar, whose image has this extent."""
         cell = jnp.where(self.transposed, cell[::-1], cell)
         flips = jnp.stack([self.top_down, self.left_right])
         return jnp.where(flips, BOARD_SIZE - extent - cell, cell)
 
-    def _directions(self) -> jax.Array:
-        """i32[4]: what becomes of every direction."""
-        image = jnp.arange(NUM_DIRECTIONS)
-        for applies, swapped in (
-            (self.transposed, (LEFT, RIGHT, UP, DOWN)),
-            (self.top_down, (DOWN, UP, LEFT, RIGHT)),
-            (self.left_right, (UP, DOWN, RIGHT, LEFT)),
-        ):
-            image = jnp.where(applies, jnp.asarray(np.array(swapped))[image], image)
-        return image
-
 
 def _first_cell(observation: jax.Array, color: jax.Array) -> jax.Array:
-    """The first cell i32[2] with this colour u8[N]; -1, -1 if there is none."""
+    """Returns the first cell i32[2] of this colour u8[N]; (-1, -1) if there is none."""
     has_color = jnp.all(observation == color[None, None], axis=-1).reshape(-1)
-    place = jnp.argmax(has_color)
-    cell = jnp.stack([place // BOARD_SIZE, place % BOARD_SIZE]).astype(jnp.int32)
+    place = jnp.argmax(has_color).astype(jnp.int32)
+    cell = jnp.stack([place // BOARD_SIZE, place % BOARD_SIZE])
     return jnp.where(jnp.any(has_color), cell, -1)

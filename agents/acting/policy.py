@@ -12,13 +12,13 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 
 class Carry(NamedTuple):
-    """What a policy remembers from one step of B episodes to the next.
+    """Memory of a policy between the steps of B episodes.
 
     Attributes:
       embedding: f32[B, hidden], the state of the GRU.
       action_tm1: i32[B, 2], the previous (grasp, move) in the frame; zeros before the first step.
-      frame: the frames, three arrays bool[B], as each episode's first observation has fixed them.
-      is_first: bool[B], whether no observation has been seen yet.
+      frame: the frames, three arrays bool[B], fixed by each episode's first observation.
+      is_first: bool[B], true before the first step.
     """
 
     embedding: jax.Array
@@ -30,15 +30,15 @@ class Carry(NamedTuple):
 class Policy(NamedTuple):
     """A trained network that acts from observations alone.
 
-    Start every episode with `initial`. The previous reward, which the network also takes, is
-    0 until an episode ends, so nothing but observations is needed.
+    Start every episode with `initial`. The network's input of the previous reward is 0, as it is
+    in training until an episode ends.
 
     Attributes:
-      name: what to call it in tables.
-      config: the settings that it was trained with.
+      name: the policy's name in tables.
+      config: the settings of its training.
       params: its parameters.
       iteration: iterations trained.
-      greedy: take the most probable actions; false draws them.
+      greedy: takes the most probable actions; otherwise draws them.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Policy(NamedTuple):
     greedy: bool = True
 
     def initial(self, batch: int) -> Carry:
-        """The carry before the first step of `batch` episodes."""
+        """Returns the carry before the first step of `batch` episodes."""
         zeros = jnp.zeros(batch, jnp.int32)
         return Carry(
             embedding=Agent(self.config).initial_state(self.params, batch),
@@ -60,18 +60,18 @@ class Policy(NamedTuple):
     def act(
         self, observation: jax.Array, carry: Carry, key: jax.Array | None = None
     ) -> tuple[jax.Array, Carry]:
-        """One action of each of B episodes. Pure; jit it.
+        """Chooses one action for each of B episodes. Pure; jit it.
 
         Args:
-          observation: u8[B, 12, 12, N], batched because the encoder is.
-          carry: `initial(B)` at an episode's first step, then what the last call returned.
-          key: PRNG key of the draws; not used, and may be absent, where `greedy`.
+          observation: u8[B, 12, 12, N].
+          carry: `initial(B)` at an episode's first step, then the carry of the last call.
+          key: PRNG key of the draws; unused if `greedy`.
 
         Returns:
           The actions i32[B, 2], (grasp, move) each, and the next carry.
 
         Raises:
-          ValueError: shape or type of `observation` is wrong, or a key is missing.
+          ValueError: shape or dtype of `observation` is wrong, or a key is missing.
         """
         wanted = (len(carry.action_tm1), BOARD_SIZE, BOARD_SIZE, self.config.num_features)
         if observation.shape != wanted or observation.dtype != jnp.uint8:
@@ -81,14 +81,13 @@ class Policy(NamedTuple):
             )
         if key is None and not self.greedy:
             raise ValueError("a policy that draws its actions needs a key; greedy ones do not")
-        agent = Agent(self.config)
-        frame = carry.frame
+        agent, frame = Agent(self.config), carry.frame
         if self.config.align_to_food:
             first = jax.vmap(Frame.facing_food)(observation)
             frame = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, frame)
             observation = jax.vmap(Frame.picture)(frame, observation)
         features = agent.encode(self.params, observation)
-        reward_tm1 = jnp.zeros(len(observation))
+        reward_tm1 = jnp.zeros(len(observation), jnp.float32)
         embedding = agent.step(self.params, carry.embedding, features, carry.action_tm1, reward_tm1)
         actions, _ = agent.policy_and_value(self.params, embedding)
         action = actions.mode() if key is None or self.greedy else actions.sample(key)

@@ -32,6 +32,12 @@ class Agent:
         self.core = Core(config.hidden, config.embedding, config.recurrent)
         self.heads = Heads(config.num_value_heads)
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Agent) and self.config == other.config
+
+    def __hash__(self) -> int:
+        return hash(self.config)
+
     @functools.cached_property
     def width(self) -> int:
         """F, the number of features of an encoded observation."""

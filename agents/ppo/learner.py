@@ -19,7 +19,7 @@ from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import Episodes, take
 from agents.acting.frames import Frame
 from agents.acting.identity import observation_ids
-from agents.acting.rollout import Trajectory, rollout, sample_action
+from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
@@ -185,7 +185,7 @@ class Learner:
         if self.config.align_to_food:
             frame = jax.vmap(Frame.facing_food)(timestep.observation)
             initial = jax.vmap(Frame.state)(frame, initial)
-        return rollout(self.agent, params, self.env, initial, action_key, choose=sample_action)
+        return rollout(self.agent, params, self.env, initial, action_key)
 
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
         """Computes the curiosity's reward of every step.

@@ -1,4 +1,4 @@
-"""Grouping equal elements, and functions of rows chunk by chunk."""
+"""Encoding each distinct observation once changes neither the loss nor its gradient."""
 
 from typing import Any
 
@@ -7,93 +7,67 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.networks import chunks
-from agents.networks.grouping import group
+from agents import Config, make_train
+from agents.acting.encodings import encode_episodes
+from agents.ppo import learner
 
-ROWS, WIDTH = 37, 5
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_groups_are_those_of_numpy(seed):
-    rng = np.random.default_rng(seed)
-    keys = rng.integers(0, 6, (2, 200)).astype(np.int32)
-    groups = group(*map(jnp.asarray, keys))
-    _, expected = np.unique(keys, axis=1, return_inverse=True)
-    np.testing.assert_array_equal(groups.number, expected)
-    assert groups.total == expected.max() + 1
-    representative = np.asarray(groups.representative)[expected]
-    np.testing.assert_array_equal(keys[:, representative], keys)
-
-
-def plain(params: dict[str, jax.Array], rows: jax.Array) -> jax.Array:
-    return jnp.tanh(rows @ params["w"] + params["b"].reshape(1, -1))
+CONFIG = Config(
+    env_id="psy",
+    max_steps=7,
+    episodes_per_iteration=12,
+    minibatch_size=6,
+    filters=(3, 4),
+    hidden=6,
+    embedding=2,
+    encode_chunk_size=4,
+)
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("icm-detached", "rnd", "ride", "e3b")
+]
 
 
-def forgetful(params: dict[str, jax.Array], rows: jax.Array, _: None) -> tuple[jax.Array, None]:
-    return plain(params, rows), None
+@pytest.mark.parametrize("curiosity", ["icm", "none", *SLOW])
+def test_the_loss_and_its_gradient_are_those_of_the_plain_encoding(curiosity, monkeypatch):
+    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity}))
 
+    def plain_encoding(encode_rows, params, episodes, observation_id, *, chunk):
+        del observation_id, chunk
+        rows = episodes.observations()
+        if "encoder" not in params:
+            return jax.vmap(lambda rows: encode_rows(params, rows, None)[0])(rows)
+        features = jax.vmap(lambda rows: train.agent.encode(params, rows))(rows)
+        own = params.get("curiosity", {})
+        return features, jax.vmap(lambda rows: train.curiosity.encode(own, rows))(rows)
 
-def remembering(
-    params: dict[str, jax.Array], rows: jax.Array, remembered: dict[str, jax.Array] | None
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    product = rows @ params["w"]
-    if remembered is not None:
-        product = chunks.recall(product, remembered["product"])
-    return jnp.tanh(product + params["b"].reshape(1, -1)), {"product": product}
+    @jax.jit
+    def prepare(key):
+        state = train.init(key)
+        trajectory = train.play(state.params, jax.random.split(key, 12), key)
+        reward, _ = train.intrinsic_reward(state, trajectory)
+        return state.params, train.make_batch(state, trajectory, reward)[0]
 
+    def loss_of(encoding):
+        monkeypatch.setattr(learner, "encode_episodes", encoding)
+        return jax.jit(jax.value_and_grad(lambda p, batch: train.loss(p, batch)[0]))
 
-@pytest.fixture(scope="module")
-def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
-    keys = jax.random.split(jax.random.key(0), 4)
-    params = {
-        "w": jax.random.normal(keys[0], (3, WIDTH)),
-        "b": jax.random.normal(keys[1], (WIDTH,)),
-    }
-    return params, jax.random.normal(keys[2], (ROWS, 3)), jax.random.normal(keys[3], (ROWS, WIDTH))
-
-
-@pytest.mark.parametrize("fn", [forgetful, remembering])
-@pytest.mark.parametrize("chunk", [1, 8, 37, 64])
-def test_map_rows_and_its_gradient(problem, fn, chunk, monkeypatch):
-    monkeypatch.setattr(chunks, "REMEMBERED_BYTES", 16 * 4 * WIDTH)
-    params, rows, cotangent = problem
-
-    def ours(params, count):
-        features: Any = chunks.map_rows(fn, chunk, params, rows, count)
-        return jnp.sum(jnp.where((jnp.arange(ROWS) < count)[:, None], features, 0) * cotangent)
-
-    def reference(params, count):
-        return jnp.sum(plain(params, rows[:count]) * cotangent[:count])
-
-    compiled = jax.jit(jax.value_and_grad(ours))
-    for count in (0, 1, 8, 9, ROWS):
-        got, want = compiled(params, count), jax.value_and_grad(reference)(params, count)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), got, want)
-
-
-def test_map_rows_under_vmap_with_different_counts(problem):
-    params, rows, cotangent = problem
-    many = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, -leaf]), params)
-    counts = jnp.array([0, 5, ROWS])
-
-    def gradient(params, count):
-        def total(params):
-            features: Any = chunks.map_rows(remembering, 8, params, rows, count)
-            return jnp.sum(features * cotangent * (jnp.arange(ROWS) < count)[:, None])
-
-        return jax.grad(total)(params)
-
-    together = jax.jit(jax.vmap(gradient))(many, counts)
-    alone = [
-        gradient(jax.tree.map(lambda leaf, i=index: leaf[i], many), counts[index])
-        for index in range(3)
-    ]
-    alone = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
+    params, batch = prepare(jax.random.key(4))
+    plain = loss_of(plain_encoding)(params, batch)
+    fast = loss_of(encode_episodes)
+    value, gradient = fast(params, batch)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), together, alone
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
+        (value, gradient),
+        plain,
     )
+    if curiosity == "icm":  # which stops no gradient
+        check_by_finite_differences(lambda p: fast(p, batch)[0], params, gradient)
 
 
-def test_shared_maximum_is_unbatched():
-    doubled = jax.vmap(jax.vmap(lambda x: x + chunks.shared_maximum(x)))
-    np.testing.assert_array_equal(doubled(jnp.array([[1, 2], [3, 4]])), [[5, 6], [7, 8]])
+def check_by_finite_differences(loss: Any, params: Any, gradient: Any) -> None:
+    """Checks the gradient along itself."""
+    norm = np.sqrt(sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(gradient)))
+
+    def at(step):
+        return loss(jax.tree.map(lambda p, g: p + step / norm * g, params, gradient))
+
+    np.testing.assert_allclose((at(1e-2) - at(-1e-2)) / 2e-2, norm, rtol=2e-2)

@@ -1,8 +1,6 @@
 """Episodes of the scan against a plain loop that encodes every observation."""
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +8,13 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, make_train
+from agents import Config
 from agents.acting import encodings
-from agents.acting.episodes import Episodes
-from agents.acting.identity import first_visits, layout_ids, observation_ids, position_id, visits
-from agents.acting.rollout import Trajectory, rollout, sample_action
+from agents.acting.identity import observation_ids
+from agents.acting.rollout import rollout
 from agents.networks import chunks
+from agents.networks.actions import ActionDistribution
 from agents.networks.agent import Agent
-from agents.ppo import learner
 
 CONFIG = Config(
     env_id="psy",
@@ -25,7 +22,6 @@ CONFIG = Config(
     episodes_per_iteration=12,
     minibatch_size=6,
     epochs=2,
-    curiosity="icm-detached",
     filters=(3, 4),
     hidden=6,
     embedding=2,
@@ -37,30 +33,31 @@ counts: list[int] = []  # distinct observations that `play` encoded, step by ste
 drawn_with: list[bytes] = []  # the keys that actions were drawn with, step by step
 
 
-def choose(key, actions):
-    jax.debug.callback(lambda data: drawn_with.append(data.tobytes()), jax.random.key_data(key))
-    return sample_action(key, actions).at[0].set(jnp.array([0, 3]))
-
-
 @pytest.fixture(scope="module")
 def make_play():
-    """Compiles the scan anew, from parameters and B states to episodes; it fills `counts`."""
+    """Compiles the scan anew; it fills `counts` and `drawn_with`, and solves the first episode."""
     env = tt.make(CONFIG.env_id, max_steps=CONFIG.max_steps)
     agent = Agent(CONFIG)
-    map_rows = chunks.map_rows
+    map_rows, sample = chunks.map_rows, ActionDistribution.sample
 
     def counting(fn, chunk, params, rows, count):
         if not isinstance(rows, tuple):  # as windows are
             jax.debug.callback(lambda count: counts.append(int(count)), count)
         return map_rows(fn, chunk, params, rows, count)
 
+    def recording(actions, key):
+        data = jax.random.key_data(key)
+        jax.debug.callback(lambda data: drawn_with.append(data.tobytes()), data)
+        return sample(actions, key).at[0].set(jnp.array([0, 3]))
+
     def play(params, initial):
         key = jax.random.key(2)
-        return rollout(agent, params, env, initial, key, choose=choose)
+        return rollout(agent, params, env, initial, key)
 
     def make(params, initial):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(chunks, "map_rows", counting)
+            patch.setattr(ActionDistribution, "sample", recording)
             # A partial of its own, because JAX remembers what it traced by function.
             return jax.jit(functools.partial(play)).lower(params, initial).compile()
 
@@ -114,7 +111,7 @@ def test_episodes_follow_the_environment(played):
     np.testing.assert_array_equal(episodes.length[1:] == CONFIG.max_steps, ~episodes.solved[1:])
 
 
-def test_every_observation_has_its_own_features(played):
+def test_features_are_those_of_the_observations(played):
     _, _, params, _, _, trajectory = played
     plain = encoding()(params, trajectory.episodes)
     np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
@@ -153,7 +150,7 @@ def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch)
         assert sum(counts) == distinct if bits else sum(counts) > distinct
 
 
-def test_network_saw_the_episodes_in_order(played):
+def test_the_network_saw_the_episodes_in_order(played):
     """Values are of all observations, the last one included."""
     _, agent, params, _, _, trajectory = played
 
@@ -171,138 +168,3 @@ def test_network_saw_the_episodes_in_order(played):
     np.testing.assert_allclose(trajectory.embedding, embedding, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(trajectory.value, value, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(trajectory.log_prob, log_prob, rtol=1e-4, atol=1e-4)
-
-
-def test_observation_ids_are_equal_for_equal_observations_alone(played):
-    trajectory: Trajectory = played[-1]
-    ids = np.asarray(jax.jit(observation_ids)(trajectory.episodes)).reshape(-1)
-    boards = jax.jit(Episodes.observations)(trajectory.episodes)
-    boards = np.asarray(boards).reshape(len(ids), -1)
-    _, first = np.unique(boards, axis=0, return_inverse=True)
-    # Different ids may show one board: the agent over the food, say. Never the reverse.
-    for identity in set(ids.tolist()):
-        assert len(set(first[ids == identity].tolist())) == 1
-
-
-def test_visits():
-    ids = jnp.array([[0, 5], [1, 5], [0, 5], [2, 6]])
-    np.testing.assert_array_equal(visits(ids), [[1, 1], [1, 2], [2, 3], [1, 1]])
-    np.testing.assert_array_equal(first_visits(ids), [[1, 1], [1, 0], [0, 0], [1, 1]])
-
-
-class Problem(NamedTuple):
-    """A loss and its value and gradient at some parameters."""
-
-    total: Callable
-    params: dict
-    value: jax.Array
-    gradient: dict
-
-
-@functools.cache
-def prepared(curiosity):
-    """A learner with fresh parameters, and the batch that it makes of episodes."""
-    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity}))
-
-    @jax.jit
-    def prepare(trajectory):
-        state = train.init(jax.random.key(4))
-        # The same episodes with the features of these parameters.
-        boards = trajectory.episodes.observations()
-        features = jax.vmap(lambda rows: train.agent.encode(state.params, rows))(boards)
-        trajectory = trajectory._replace(features=features)
-        reward, _ = train.intrinsic_reward(state, trajectory)
-        return state, train.make_batch(state, trajectory, reward)[0]
-
-    return train, prepare
-
-
-def problem(curiosity, trajectory) -> Problem:
-    """Traced anew each time, for `encode_episodes` may be replaced in between."""
-    train, prepare = prepared(curiosity)
-    state, batch = prepare(trajectory)
-    total = jax.jit(jax.value_and_grad(lambda p: train.loss(p, batch)[0]))
-    return Problem(total, state.params, *total(state.params))
-
-
-@pytest.mark.parametrize(
-    "curiosity",
-    [
-        "icm",
-        pytest.param("icm-detached", marks=pytest.mark.slow),
-        pytest.param("rnd", marks=pytest.mark.slow),
-        pytest.param("ride", marks=pytest.mark.slow),
-        pytest.param("e3b", marks=pytest.mark.slow),
-        pytest.param("none", marks=pytest.mark.slow),
-    ],
-)
-def test_encoding_distinct_observations_changes_neither_loss_nor_gradient(played, curiosity):
-    train, _ = prepared(curiosity)
-
-    def plain_encoding(encode_rows, params, episodes, observation_id, *, chunk):
-        del observation_id, chunk
-        rows = episodes.observations()
-        if "encoder" not in params:
-            return jax.vmap(lambda rows: encode_rows(params, rows, None)[0])(rows)
-        features = jax.vmap(lambda rows: train.agent.encode(params, rows))(rows)
-        own = params.get("curiosity", {})
-        return features, jax.vmap(lambda rows: train.curiosity.encode(own, rows))(rows)
-
-    fast = problem(curiosity, played[-1])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learner, "encode_episodes", plain_encoding)
-        plain = problem(curiosity, played[-1])
-    pairs = (fast.value, fast.gradient), (plain.value, plain.gradient)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), *pairs)
-    if curiosity == "icm":
-        check_by_finite_differences(fast)
-
-
-def check_by_finite_differences(loss: Problem) -> None:
-    """The gradient of the whole loss, along itself; the paper's curiosity stops no gradient."""
-    norm = float(np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(loss.gradient))))
-    step = 1e-2 / norm
-
-    def at(sign):
-        moved = jax.tree.map(
-            lambda p, g: np.asarray(p) + np.float32(sign * step) * np.asarray(g),
-            loss.params,
-            loss.gradient,
-        )
-        return loss.total(moved)[0]
-
-    np.testing.assert_allclose((at(1) - at(-1)) / (2 * step), norm**2, rtol=2e-2)
-
-
-def test_layouts_share_an_id_only_if_equal():
-    env = tt.make("pstsy")
-    keys = jax.random.split(jax.random.key(0), 40)
-    states, _ = jax.jit(jax.vmap(env.reset))(jnp.concatenate([keys, keys[::-1]]))
-    ids = np.asarray(layout_ids(states))
-    parts = (states.board, states.palette, states.tool_extent)
-    content = [
-        tuple(np.concatenate([np.ravel(leaf[i]) for leaf in parts]).tolist()) for i in range(80)
-    ]
-    same = np.array([[a == b for a in content] for b in content])
-    np.testing.assert_array_equal(ids[:, None] == ids[None], same)
-    assert len(set(ids.tolist())) == len(set(content))
-
-
-def test_equal_hashes_do_not_merge_layouts(monkeypatch):
-    """With a hash that says nothing, layouts are still told apart by their content."""
-
-    class Zeros:
-        def integers(self, low: int, high: int, size: int, dtype: type) -> np.ndarray:
-            del low, high
-            return np.zeros(size, dtype)
-
-    monkeypatch.setattr(np.random, "default_rng", lambda seed: Zeros())
-    states, _ = jax.jit(jax.vmap(tt.make("st").reset))(jax.random.split(jax.random.key(1), 6))
-    assert len(set(np.asarray(layout_ids(states)).tolist())) == 6
-
-
-def test_positions_are_told_apart():
-    state = tt.base_state()
-    cells = np.random.default_rng(0).integers(0, 12, (500, 3, 2)).astype(np.int32)
-    ids = jax.vmap(lambda c: position_id(state.replace(agent=c[0], tool=c[1], food=c[2])))(cells)
-    assert len(set(np.asarray(ids).tolist())) == len(np.unique(cells, axis=0))

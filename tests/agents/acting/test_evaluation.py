@@ -1,0 +1,141 @@
+"""Greedy evaluation on fixed tasks."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from agents import Config, make_train
+from agents.acting.evaluation import Evaluation, Evaluator, own_and_paper_sets
+from agents.ppo.learner import Learner
+from easy import assert_same, rows
+from tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
+from trap_tube_jax.registry import PAPER_TASK_SETS
+from trap_tube_jax.scoring import benchmark
+from trap_tube_jax.scoring.scores import Optimality
+from trap_tube_jax.scoring.tasks import evaluation_tasks, fixed_tasks
+
+Played = tuple[Evaluator, Any, dict[str, Evaluation]]
+
+
+@pytest.fixture(scope="module")
+def played() -> Played:
+    """A random policy on two sets, and on tasks of which it solves some."""
+    tasks = {name: evaluation_tasks(name, 2, 1) for name in ("base", "p")}
+    evaluator = Evaluator(CONFIG, {**tasks, "mine": food_next_to_agent()})
+    params = random_params()
+    return evaluator, params, evaluator(params)
+
+
+def test_outcomes_are_those_of_the_recorded_actions(played):
+    evaluator, _, outcomes = played
+    step = jax.jit(tt.Environment(base=tt.base_state(1), max_steps=STEPS).step)
+    for name, tasks in evaluator.tasks.items():
+        for index, solved in enumerate(outcomes[name].solved):
+            state = rows(tasks, index)
+            for action in outcomes[name].action[index, : outcomes[name].length[index]]:
+                assert not state.terminated
+                state, _ = step(state, jnp.asarray(action))
+            assert state.terminated == solved
+            assert state.terminated | state.truncated
+
+
+def test_tasks_of_your_own_are_scored(played):
+    evaluator, _, outcomes = played
+    assert outcomes["mine"].solved.any()
+    assert 1 in outcomes["mine"].length[outcomes["mine"].solved]
+    by_set = {score.set: score for score in evaluator.scores(outcomes)}
+    assert by_set["mine"].percent == 25 * outcomes["mine"].solved.sum()
+    assert (by_set["mine"].interval is None, by_set["base"].interval is None) == (False, True)
+
+
+def test_playing_in_blocks_changes_nothing(played, monkeypatch):
+    evaluator, params, outcomes = played
+    monkeypatch.setattr(benchmark, "BLOCK", 3)
+    assert_same(Evaluator(CONFIG, evaluator.tasks)(params), outcomes)
+
+
+def test_each_sets_own_limit_holds_unless_the_settings_have_one(played, own_task_sets):
+    """With limits of 1 and 12, tasks that took longer than 1 are not solved."""
+    evaluator, params, outcomes = played
+    mine = outcomes["mine"]
+    for name, limit in (("one", 1), ("twelve", STEPS)):
+        tt.register(name, (), base=tt.base_state(1), max_steps=limit)
+    tasks: dict[str, tt.State] = dict.fromkeys(("one", "twelve"), evaluator.tasks["mine"])
+    config = Config.from_dict({**CONFIG.to_dict(), "max_steps": None})
+    own = Evaluator(config, tasks)
+    assert own.limits == {"one": 1, "twelve": STEPS}
+    assert Evaluator(CONFIG, tasks).limits == {"one": STEPS, "twelve": STEPS}
+    found = own(params)
+    np.testing.assert_array_equal(found["twelve"].solved, mine.solved)
+    np.testing.assert_array_equal(found["twelve"].length, mine.length)
+    at_once = mine.solved & (mine.length == 1)
+    assert 0 < at_once.sum()
+    np.testing.assert_array_equal(found["one"].solved, at_once)
+    np.testing.assert_array_equal(found["one"].length, 1)
+    with pytest.raises(ValueError, match="unknown task set 'mine'"):
+        Evaluator(config, {"mine": tasks["one"]})
+
+
+def test_scores_use_the_papers_notation():
+    outcome = Evaluation(jnp.array([True, False]), jnp.array([11, 50]), *[jnp.zeros((2, 50))] * 2)
+    evaluator = Evaluator.of_sets(Config(), ["pst"], 2)
+    (score,) = evaluator.scores({"pst": outcome}, {"pst": np.array([11, 12])})
+    assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
+    assert score.mean_steps == 11
+    assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)
+
+
+def test_a_set_of_your_own_is_evaluated_after_the_papers(own_task_sets):
+    tt.register("Own-v0", (), short="own")
+    papers = tuple(entry.short for entry in PAPER_TASK_SETS)
+    assert own_and_paper_sets(Config(env_id="own")) == (*papers, "own")
+    assert own_and_paper_sets(Config(env_id="pst")) == papers
+
+
+def test_unknown_and_missing_sets_are_refused():
+    with pytest.raises(ValueError, match=r"unknown task set 'q'; allowed: .*pstsy"):
+        Evaluator.of_sets(CONFIG, ["q"], 2)
+    with pytest.raises(ValueError, match="name at least one task set; allowed: base, p"):
+        Evaluator.of_sets(CONFIG, [], 2)
+
+
+def test_keys_of_tasks_are_never_drawn_in_training(monkeypatch):
+    """Records the keys that transfers get, which depend on those of `reset` alone."""
+    seen = []
+    no_update = lambda learner, state, *_: (state.params, state.opt_state, {})  # noqa: E731
+    monkeypatch.setattr(Learner, "update", no_update)
+
+    def record(key, state):
+        data = jax.random.key_data(key)
+        jax.debug.callback(lambda data: seen.append(tuple(np.ravel(data))), data)
+        return state
+
+    env = tt.Environment((record,), base=tt.base_state(1), max_steps=STEPS)
+    config = Config.from_dict(
+        {**CONFIG.to_dict(), "episodes_per_iteration": 4, "minibatch_size": 2}
+    )
+    learner = make_train(config, env)
+    seen.clear()
+    first_key = jax.jit(lambda key: learner.init(key).key)
+    shapes = jax.eval_shape(learner.init, jax.random.key(0))._replace(key=None)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    iterate = jax.jit(learner.iterate)
+    for seed in range(3):
+        state = zeros._replace(key=first_key(jax.random.key(seed)))
+        for _ in range(2):
+            state, _ = iterate(state)
+    jax.effects_barrier()
+    training = set(seen)
+    assert len(training) == 3 * 2 * 4
+
+    seen.clear()
+    for entry in PAPER_TASK_SETS:
+        fixed_tasks(env, entry.id, 8)
+        fixed_tasks(env, entry.id, 8, "validation")
+    jax.effects_barrier()
+    assert len(set(seen)) == 2 * 8 * len(PAPER_TASK_SETS)
+    assert not training & set(seen)

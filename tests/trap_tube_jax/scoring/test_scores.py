@@ -1,0 +1,44 @@
+"""Scores of given outcomes."""
+
+import numpy as np
+import pytest
+
+from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, wilson_interval
+
+
+def test_optimality_compares_with_shortest_plans():
+    found = Optimality.of(
+        solved=np.array([True, True, False, False, False]),
+        length=np.array([10, 20, 50, 50, 50]),
+        shortest=np.array([10, 5, -1, 51, 50]),
+        max_steps=50,
+    )
+    assert found.solvable == 3
+    assert found.percent_of_solvable == pytest.approx(200 / 3)
+    assert (found.mean, found.worst) == (0.625, 0.25)
+    nothing = Optimality.of(np.array([False]), np.array([50]), np.array([-1]), 50)
+    assert nothing == Optimality(0, None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    # R: binom::binom.confint(successes, trials, methods = "wilson").
+    [(0, 10, 0.0, 0.27753), (5, 10, 0.23659, 0.76341), (10, 10, 0.72247, 1.0)],
+)
+def test_wilson_interval(successes, trials, low, high):
+    np.testing.assert_allclose(wilson_interval(successes, trials), (low, high), atol=1e-5)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(1, 0), (-1, 5), (6, 5)])
+def test_wilson_interval_refuses(successes, trials):
+    with pytest.raises(ValueError, match=r"\b(k|n)\b"):
+        wilson_interval(successes, trials)
+
+
+def test_few_layouts_are_counted_and_have_no_interval():
+    solved = np.array([True, True, False, True, False])
+    layout = np.array([0, 0, 0, 1, 1])
+    score = Score.of("stsy", "{St, Sy}", solved, np.full(5, 9), layout=layout)
+    assert (score.percent, score.interval, score.layouts) == (60.0, None, Layouts(1, 2))
+    assert str(score.layouts) == "1 of 2"
+    assert Score.of("p", "{P}", solved, np.full(5, 9)).layouts is None

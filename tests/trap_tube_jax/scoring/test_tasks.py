@@ -1,0 +1,39 @@
+"""The fixed tasks: draws of their environments, by keys that nothing else uses."""
+
+import jax
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from easy import assert_same
+from trap_tube_jax.registry import PAPER_TASK_SETS
+from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_keys, evaluation_tasks, layout_numbers
+
+
+def test_tasks_are_those_that_the_environment_draws():
+    keys = evaluation_keys("PerceptualSymbolicTrapTube-v0", 3)
+    drawn, _ = jax.jit(jax.vmap(tt.make("psy").reset))(keys)
+    assert_same(evaluation_tasks("psy", 3), drawn)
+    assert_same(evaluation_tasks("psy", 2), jax.tree.map(lambda x: x[:2], drawn))
+    assert_same(evaluation_tasks("PerceptualSymbolicTrapTube-v0", 3), drawn)
+
+
+def test_keys_differ_within_and_between_sets_and_purposes():
+    keys = [
+        jax.random.key_data(evaluation_keys(entry.id, 64, purpose))
+        for entry in PAPER_TASK_SETS
+        for purpose in ("test", "validation")
+    ]
+    assert len(np.unique(np.concatenate(keys), axis=0)) == 64 * len(keys)
+
+
+@pytest.mark.parametrize("name", ALL_SETS)
+def test_sets_of_few_layouts(name):
+    layout = layout_numbers(name, evaluation_tasks(name, 64))
+    number = {"base": 1, "st": 1, "sy": 5, "stsy": 5}.get(name)
+    assert (None if layout is None else len(set(layout.tolist()))) == number
+
+
+def test_the_number_of_tasks_is_checked():
+    with pytest.raises(ValueError, match="must be an integer >= 1, got 0"):
+        evaluation_tasks("p", 0)
