@@ -123,7 +123,8 @@ class Evaluator:
           shortest: lengths i32[B] of each set's shortest plans, to compare with; or None.
         """
         made = []
-        for name, (solved, length, *_) in played.items():
+        for name, outcome in played.items():
+            solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
             found = None
             if shortest is not None:
                 found = Optimality.of(solved, length, shortest[name], self.limits[name])

@@ -1,16 +1,13 @@
 """A trained policy drives other libraries' interfaces as it drives the environment."""
 
-import csv
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_policy import CONFIG, FOOD_BESIDE, SEEDS, STEPS, random_params
 
 import trap_tube_jax as tt
-from agents import Policy, evaluate
-from agents.acting.policy_files import save_policy
+from agents.acting.evaluation import Evaluator
+from tiny_policy import FOOD_CELLS, STEPS, random_policy
 from trap_tube_jax import registry
 
 pytest.importorskip("gymnasium")
@@ -20,25 +17,21 @@ from trap_tube_jax.adapters import to_gymnax
 from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv, TrapTubeVectorEnv
 
 pytestmark = pytest.mark.interop
-NAMES = [f"Beside{index}-v0" for index in range(len(FOOD_BESIDE))]
-POLICY = Policy("mine", CONFIG, random_params(SEEDS[0]), 1)
+NAMES = [f"Near{index}-v0" for index in range(len(FOOD_CELLS))]
+POLICY = random_policy()
 ACT = jax.jit(POLICY.act)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def expected(tmp_path_factory):
-    """The percentages that `agents.evaluate` finds on four sets of one task each."""
-    folder = tmp_path_factory.mktemp("policy")
-    save_policy(folder / "mine.safetensors", POLICY)
+def expected():
+    """The percentages of four sets of one task each, by the evaluator."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registry, "_task_sets", dict(registry._task_sets))
-        for name, cell in zip(NAMES, FOOD_BESIDE, strict=True):
+        for name, cell in zip(NAMES, FOOD_CELLS, strict=True):
             base = tt.base_state(1).replace(food=jnp.array(cell, jnp.int32))
             tt.register(name, (), base=base, max_steps=STEPS)
-        arguments = [str(folder / "mine.safetensors"), "--sets", *NAMES]
-        evaluate.main([*arguments, "--output", str(folder / "table.csv")])
-        rows = csv.DictReader((folder / "table.csv").read_text().splitlines())
-        found = [100.0 * int(row["solved"]) / int(row["tasks"]) for row in rows]
+        evaluator = Evaluator.of_sets(POLICY.config, NAMES, 1)
+        found = [score.percent for score in evaluator.scores(evaluator(POLICY.params))]
         assert 0 < np.mean(found) < 100
         yield found
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
+from agents import Config
 from agents.acting.evaluation import Evaluator
 from agents.networks.agent import Agent
 from easy import assert_same
@@ -97,17 +98,19 @@ def test_unusable_arguments_are_refused(batch, convert, key, message):
         policy.act(observation, policy.initial(batch), None if key is None else jax.random.key(key))
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, pickle, cloudpickle], ids=str)
-def test_copies_are_equal(copied):
-    def make_copy(x):
-        return copied(x) if callable(copied) else pickle.loads(copied.dumps(x))
+COPIES = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda x: pickle.loads(pickle.dumps(x)),
+    "cloudpickle": lambda x: pickle.loads(cloudpickle.dumps(x)),
+}
 
-    policy = random_policy()
+
+@pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
+def test_copies_are_equal(copied):
+    policy, agent = random_policy(), Agent(CONFIG)
     carry = policy.initial(2)
-    assert_same(make_copy(policy)._asdict()["params"], policy.params)
-    assert make_copy(policy)._replace(params=None) == policy._replace(params=None)
-    assert_same(make_copy(carry), carry)
-    agent = Agent(CONFIG)
+    assert_same(copied(policy).params, policy.params)
+    assert copied(policy)._replace(params=None) == policy._replace(params=None)
+    assert_same(copied(carry), carry)
     assert agent.width == 2
-    assert make_copy(agent) == agent
-    assert make_copy(agent) != Agent(policy.config.preset("fast"))
+    assert copied(agent) == agent != Agent(Config())

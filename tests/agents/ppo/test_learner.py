@@ -142,7 +142,7 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, c
 
 
 def test_episodes_are_played_facing_the_food(monkeypatch):
-    first: Any = lambda agent, params, env, initial, key, choose: initial  # noqa: E731
+    first: Any = lambda agent, params, env, initial, key: initial  # noqa: E731
     monkeypatch.setattr(learner, "rollout", first)
     keys = jax.random.split(jax.random.key(1), 64)
     start: Any = jax.jit(make_train(BEST).play)({}, keys, jax.random.key(2))
