@@ -39,8 +39,8 @@ AGENTS = (
     ("ppo",),
     ("pretrained", "runs"),
     ("train",),
-    ("experiments", "profiles"),
-    ("evaluate", "examples", "profile", "sweep"),
+    ("experiments", "profiles", "sweep"),
+    ("evaluate", "examples", "profile"),
 )
 LEARNING = ("registry", "config", "parallel", "networks", "acting", "curiosity", "ppo")
 SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))

@@ -22,7 +22,7 @@ for folder in ("trap_tube_jax", "agents", "benchmarks", "tests"):
 WAITING = {f"benchmarks/results/{name}_preset.md" for name in ("best", "fast")}
 WAITING |= {"benchmarks/results/curiosities.md"}
 NAMES = sorted({str(page.relative_to(ROOT)) for page in PAGES} - WAITING)
-BEING_REWRITTEN = ("agents.experiments", "agents.sweep", "benchmarks.")
+BEING_REWRITTEN = ("benchmarks.",)
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\n\n```text\n(.*?)^```$)?", re.DOTALL | re.MULTILINE)

@@ -1,145 +1,112 @@
-"""Runs trained side by side, each by a process of its own on cores of its own."""
+"""Executors of a grid's runs, and the call that trains one in their processes."""
 
-import itertools
+import contextlib
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import threading
-import time
-from collections.abc import Sequence
-from typing import NamedTuple
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
+import jax
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.progress import TimeElapsedColumn as Elapsed
 
-from agents import train
-from agents.parallel.cores import available_cores
-from agents.runs.folder import EXTENDABLE, Run, RunFolder
-from agents.runs.stopping import Stopped, StopSignals
+from agents.parallel.devices import become_devices
+from agents.runs.compilation import enable_cache
+from agents.runs.folder import Run
+from agents.runs.session import RunOptions, train_run
+from agents.runs.stopping import Stopped
+from trap_tube_jax.imports import import_modules
 
-POLL_SECONDS = 0.5
-
-
-class Worker(NamedTuple):
-    """A process that trains a run.
-
-    Attributes:
-      folder: the run's files.
-      process: the process; it stops where its standard input ends.
-      cores: those that it runs on.
-    """
-
-    folder: RunFolder
-    process: subprocess.Popen
-    cores: list[int]
+SPAWN = multiprocessing.get_context("spawn")
 
 
-def default_processes() -> int:
-    """How many runs to train at a time: on a CPU as many as there are cores, else one.
+class ProcessPerCall(ThreadPoolExecutor):
+    """Makes each call in a fresh process, so that a crash costs one call; threads only wait."""
 
-    On a GPU, several processes would compete for its memory and slow each other down.
-    """
-    program = "import jax; print(jax.default_backend())"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    return len(available_cores()) if done.stdout.strip() == "cpu" else 1
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
+        """Schedules a call; function, arguments and result are pickled."""
+        return super().submit(self._call, function, *args, **kwargs)
+
+    def _call(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        threads = max(1, _cores() // self._max_workers)
+        with ProcessPoolExecutor(1, SPAWN, _begin, (threads,)) as pool:
+            return pool.submit(function, *args, **kwargs).result()
 
 
-def train_runs(
-    runs: Sequence[tuple[RunFolder, Run]],
-    processes: int,
-    console: Console,
-    stop: StopSignals,
-) -> list[RunFolder]:
-    """Trains runs to their end as `python -m agents.train --resume` does, some at a time.
+@contextlib.contextmanager
+def make_executor(processes: int | None, cluster: str | None) -> Iterator[Executor]:
+    """Makes the executor of a grid's runs.
 
     Args:
-      runs: folders that hold the runs, and how these are to end.
-      processes: how many at a time; each gets its share of the cores.
-      console: where to show progress. What a run itself shows goes to its `log.txt`.
-      stop: tells when to stop early.
-
-    Returns:
-      The runs that failed.
+      processes: runs at a time on this machine; None for one per core, or for one alone where
+        JAX has other devices than the CPU.
+      cluster: address of a Dask scheduler; None for this machine.
 
     Raises:
-      Stopped: on request; every run has saved.
-      KeyboardInterrupt: on a second request; the current iterations are lost.
+      ValueError: `processes` is below 1, or Dask is not installed.
+      OSError: the scheduler does not answer.
     """
-    waiting, working, failed = list(runs), list[Worker](), list[RunFolder]()
-    cores = available_cores()
-    free = [cores[first::processes] or cores for first in range(processes)]
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Elapsed())
-    told = False
-    with stop, Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-        everything = bars.add_task("runs", total=len(runs))
+    if cluster is not None:
         try:
-            while working or (waiting and not stop.received):
-                while free and waiting and not stop.received:
-                    working.append(_start(*waiting.pop(0), free.pop()))
-                if stop.received and not told:
-                    told = True
-                    for worker in working:
-                        worker.process.send_signal(stop.received)
-                for worker in [each for each in working if each.process.poll() is not None]:
-                    worker.process.communicate()  # closes its input
-                    working.remove(worker)
-                    free.append(worker.cores)
-                    bars.advance(everything)
-                    if _has_failed(worker, console, stop):
-                        failed.append(worker.folder)
-                time.sleep(POLL_SECONDS)
-        finally:
-            for worker in working:
-                worker.process.kill()
-                worker.process.communicate()
-    if stop.received:
-        raise Stopped(stop.received)
-    return failed
+            from distributed import Client  # noqa: PLC0415  an extra
+        except ImportError:
+            raise ValueError("--cluster needs Dask: pip install -e '.[agents,cluster]'") from None
+        with Client(cluster) as client:
+            yield client.get_executor(pure=False)
+        return
+    if processes is None:
+        with ProcessPoolExecutor(1, SPAWN) as pool:  # this process leaves GPUs to the runs
+            backend = pool.submit(jax.default_backend).result()
+        processes = _cores() if backend == "cpu" else 1
+    with ProcessPerCall(processes) as executor:
+        yield executor
 
 
-def _command(folder: RunFolder, run: Run) -> list[str]:
-    path = folder.path
-    limits = [(f"--{name.replace('_', '-')}", getattr(run.config, name)) for name in EXTENDABLE]
-    parts = (
-        *(sys.executable, "-m", __name__, "--resume", "--name", path.name, "--out", path.parent),
-        *itertools.chain.from_iterable(limits),
-    )
-    return [str(part) for part in parts]
+def train_logged(path: Path, run: Run, options: RunOptions, stop_file: Path) -> str:
+    """Trains a run in this process; its output goes to a file next to its folder.
+
+    Returns:
+      `done`, `stopped`, or what has failed.
+    """
+    if stop_file.exists():
+        return "stopped"
+    with log_of(path).open("a", buffering=1, encoding="utf-8") as log:
+        try:
+            import_modules(run.imports)
+            become_devices(options.devices)
+            enable_cache()
+            train_run(path, run, options, console=Console(file=log), stop_file=stop_file)
+        except Stopped:
+            return "stopped"
+        except Exception as error:
+            traceback.print_exc(file=log)
+            return f"failed: {error}"
+    return "done"
 
 
-def _start(folder: RunFolder, run: Run, cores: list[int]) -> Worker:
-    with folder.log.open("a") as log:
-        process = subprocess.Popen(
-            _command(folder, run),
-            stdin=subprocess.PIPE,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,  # Ctrl-C comes to us alone, who pass it on
-        )
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(process.pid, cores)  # before it starts threads, which inherit it
-    return Worker(folder, process, cores)
+def log_of(path: Path) -> Path:
+    """Returns the log of the run in a folder."""
+    return path.with_name(f"{path.name}.log")
 
 
-def _has_failed(worker: Worker, console: Console, stop: StopSignals) -> bool:
-    """Says how a run has ended; whether it failed."""
-    status, log = worker.process.returncode, worker.folder.log
-    failed = status != 0 and not stop.received
-    words = f"failed; see {log}" if failed else "stopped" if status else "done"
-    console.print(f"{worker.folder.path.name}: {words}", soft_wrap=True, highlight=False)
-    return failed
+def _begin(threads: int) -> None:
+    """Limits the threads of a training process, and decides what ends it."""
+    os.environ.setdefault("NPROC", str(threads))  # for XLA, which starts one per core
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C arrives by the stop file
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _stop_with_parent() -> None:
-    """Asks this process to stop when the one that started it is gone."""
-    sys.stdin.read()
-    os.kill(os.getpid(), signal.SIGTERM)
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
-if __name__ == "__main__":
-    threading.Thread(target=_stop_with_parent, daemon=True).start()
-    train.main()
+def _cores() -> int:
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1

@@ -1,0 +1,181 @@
+"""Grids of settings and seeds: the options of their commands, and the named grids.
+
+Source of `exp1` and `exp2`: the paper's section "Results".
+"""
+
+import dataclasses
+import itertools
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+import trap_tube_jax as tt
+from agents.command_line import Imports
+from agents.config import PRESETS, Config
+from agents.ppo.learner import make_train
+from agents.runs.folder import Run, RunFolder, check_name
+from agents.runs.session import RunOptions
+from trap_tube_jax.imports import import_modules
+
+COMMA = re.compile(r",(?![^\[]*\])")  # but not those of a list
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Trains every point of a grid of settings with every seed, several runs at a time.
+
+    Each run is a folder as agents.train makes it. Next to these folders are results.csv, with a
+    row per run, evaluation and task set, table.md and figures. Ctrl-C saves all runs, and the same
+    command continues. More seeds or values of a setting extend the grid.
+
+    Attributes:
+      settings: settings of all runs as NAME=VALUE, or of a grid as NAME=VALUE,VALUE.
+      imports: modules to import first, which register curiosities, encoders or task sets.
+      preset: named settings to start from.
+      env: task set to train on, by id or short name; the preset's if absent.
+      only: names of the points to train; all if absent.
+      seeds: number of seeds.
+      seed: the first seed.
+      name: the grid's folder within --out; named after the grid, preset and task set if absent.
+      out: the folder of all grids.
+      processes: runs at a time; one per core if absent, or one at all with a GPU or TPU.
+      cluster: address of a Dask scheduler whose workers train the runs, as in tcp://HOST:8786.
+      run: how each run is trained and evaluated.
+    """
+
+    settings: tuple[str, ...] = ()
+    imports: Imports = ()
+    preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
+    env: str | None = None
+    only: tuple[str, ...] = ()
+    seeds: int = 1
+    seed: int = 0
+    name: str | None = None
+    out: Path = Path("runs")
+    processes: int | None = None
+    cluster: str | None = None
+    run: Annotated[RunOptions, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=RunOptions
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """A named grid.
+
+    Attributes:
+      options: what its command line starts from.
+      settings: settings of all points, which the command line may replace.
+      points: settings by the name of the point.
+    """
+
+    options: Options = dataclasses.field(default_factory=Options)
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    points: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=lambda: {"": {}})
+
+    def runs(self, name: str, options: Options) -> dict[Path, Run]:
+        """Returns the runs by their folders, seed after seed.
+
+        Args:
+          name: the grid's name, with which its folder's begins.
+          options: the command line.
+
+        Raises:
+          ValueError: an option is not allowed, or a stored run has other settings.
+        """
+        if options.seeds < 1:
+            raise ValueError(f"seeds must be >= 1, got {options.seeds}")
+        import_modules(options.imports)
+        configs = self.configs(options)
+        short = tt.task_set(next(iter(configs.values())).env_id).short
+        if (options.preset, short) != (self.options.preset, self.options.env):
+            name = f"{name}-{options.preset}-{short}"
+        check_name(options.name or name)
+        root, runs = options.out / (options.name or name), {}
+        for seed in range(options.seed, options.seed + options.seeds):
+            for point, config in configs.items():
+                run = Run(config, options.preset, seed, algorithm=point, imports=options.imports)
+                path = root / f"{point}-seed{seed}"
+                check_name(path.name)
+                if RunFolder(path).config.is_file():
+                    run.check_continues(RunFolder.open(path)[1])
+                runs[path] = run
+        return runs
+
+    def configs(self, options: Options) -> dict[str, Config]:
+        """Returns the settings of every point by its name.
+
+        Raises:
+          ValueError: a setting or point is unknown or not allowed.
+        """
+        given = dict(map(_parse, options.settings))
+        if len(given) < len(options.settings):
+            raise ValueError(f"give a setting only once, got {' '.join(options.settings)}")
+        fixed = sorted({name for own in self.points.values() for name in own} & given.keys())
+        if fixed:
+            raise ValueError(f"the grid's points decide {', '.join(fixed)}; use --only")
+        common = {**self.settings, **({} if options.env is None else {"env_id": options.env})}
+        configs = {}
+        for name, *texts in itertools.product(self.points, *given.values()):
+            chosen = {k: given[k][text] for k, text in zip(given, texts, strict=True)}
+            config = Config.preset(options.preset, **{**common, **chosen, **self.points[name]})
+            varied = [
+                f"{k}={text.strip('[]').replace(',', 'x')}"
+                for k, text in zip(given, texts, strict=True)
+                if len(given[k]) > 1
+            ]
+            point = ",".join(filter(None, [name, *varied])) or options.preset
+            configs[point] = dataclasses.replace(config, env_id=tt.task_set(config.env_id).id)
+        for name in options.only:
+            if name not in configs:
+                raise ValueError(f"no point {name!r}; allowed: {', '.join(configs)}")
+        chosen = {name: configs[name] for name in options.only or configs}
+        for config in chosen.values():
+            make_train(config)  # refuses what cannot be trained with
+        return chosen
+
+
+def _parse(text: str) -> tuple[str, dict[str, Any]]:
+    """Reads NAME=VALUE,VALUE; returns the name, and by their text the values."""
+    name, _, values = text.partition("=")
+    if not values:
+        raise ValueError(f"give settings as NAME=VALUE,VALUE, got {text!r}")
+    return name, {each: _value(each) for each in COMMA.split(values)}
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _options(preset: str, env: str, seeds: int, evaluate_every: int) -> Options:
+    run = RunOptions(evaluate_every=evaluate_every, reported=1000)
+    return Options(preset=preset, env=env, seeds=seeds, run=run)
+
+
+PAPER_POINTS = {"ppo": {"curiosity": "none"}, "ppo+icm": {"curiosity": "icm"}}
+CURIOSITIES = ("icm", "icm-detached", "rnd", "noveld", "ride", "e3b", "effects")
+
+GRIDS = {
+    "exp1": Grid(_options("paper", "base", 5, evaluate_every=1), {"iterations": 250}, PAPER_POINTS),
+    "exp2": Grid(
+        _options("paper", "pstsy", 5, evaluate_every=1), {"iterations": 500}, PAPER_POINTS
+    ),
+    "fast": Grid(_options("fast", "base", 10, evaluate_every=100)),
+    "best": Grid(_options("best", "pstsy", 5, evaluate_every=20)),
+    "curiosities": Grid(
+        _options("best", "pstsy", 2, evaluate_every=20),
+        {"iterations": 312},
+        {
+            "ppo": {"curiosity": "none"},
+            **{f"ppo+{name}": {"curiosity": name} for name in CURIOSITIES},
+            "ppo+effects,recurrent=false": {"curiosity": "effects", "recurrent": False},
+        },
+    ),
+}

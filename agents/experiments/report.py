@@ -1,0 +1,94 @@
+"""Files of a grid's results, and what is drawn from them: python -m agents.experiments.report.
+
+A grid's folder holds results.csv (rows of `agents.results`), curves.csv (metrics by iteration) and
+grid.json (title, command, settings that all runs share, machines). table.md and the figures are
+functions of these three, so that a folder of results is drawn again from them alone.
+"""
+
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+import agents
+from agents.experiments import figures, tables
+from agents.runs.folder import RunFolder, read_json, write_json, write_text
+from agents.runs.results import find_runs, metrics
+from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.registry import task_set
+
+CURVES = (
+    *("algorithm", "seed", "iteration", "episodes", "transitions", "seconds"),
+    *("success", "evaluation"),
+)
+WIDTH = 80
+
+
+def collect(root: Path, command: str) -> None:
+    """Writes results.csv, curves.csv and grid.json from the runs in a folder.
+
+    Raises:
+      ValueError: there is no run, or one cannot be read.
+    """
+    results, curves, folders = agents.results(root), metrics(root), find_runs(root)
+    results["run"] = results["run"].map(lambda path: Path(path).name)
+    results.to_csv(root / "results.csv", index=False)
+    curves[list(CURVES)].to_csv(root / "curves.csv", index=False)
+    configs = [read_json(folder.config)["config"] for folder in folders]
+    first = configs[0]
+    train_set = task_set(first["env_id"])
+    about = {
+        "title": f"{root.name}: trained on {train_set.label}",
+        "command": command,
+        "train_set": train_set.short,
+        "threshold": first["stop_when_solved"] or 1.0,
+        "settings": {k: v for k, v in first.items() if all(own[k] == v for own in configs)},
+        "machines": _machines(folders),
+    }
+    write_json(root / "grid.json", about)
+
+
+def write(root: Path) -> str:
+    """Writes table.md and the figures from the files of `collect`.
+
+    Returns:
+      The main tables as text of at most 80 columns, and the files that were written.
+    """
+    results, curves = (pd.read_csv(root / name) for name in ("results.csv", "curves.csv"))
+    about = read_json(root / "grid.json")
+    found = tables.tables(results, curves, about)
+    parts = [f"**{heading}**\n\n{tables.markdown(table)}" for heading, table in found.items()]
+    parts += [tables.NOTE, f"`{about['command']}`", *map(_machine, about["machines"])]
+    write_text(root / "table.md", "\n\n".join([f"# {about['title']}", *parts]) + "\n")
+    drawn = figures.save(root, results, curves, about)
+    shown = [
+        f"{heading}\n{table.to_string(line_width=WIDTH)}"
+        for heading, table in list(found.items())[:2]
+    ]
+    files = [str(path) for path in (root / "results.csv", root / "table.md", *drawn)]
+    return "\n\n".join([*shown, "\n".join(files)])
+
+
+def _machines(folders: Iterable[RunFolder]) -> list[dict[str, Any]]:
+    found = [
+        each
+        for folder in folders
+        if folder.provenance.exists()
+        for each in read_json(folder.provenance)
+    ]
+    return [each for place, each in enumerate(found) if each not in found[:place]]
+
+
+def _machine(machine: dict[str, Any]) -> str:
+    return (
+        f"{machine['cores']} core(s) of {machine['processor']}, {machine['device']}; "
+        f"jax {machine['jax']}, commit `{machine['commit']}`."
+    )
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        for folder in sys.argv[1:]:
+            print(write(Path(folder)))

@@ -1,0 +1,106 @@
+"""The points of a grid, their settings, and the paper's protocols."""
+
+import dataclasses
+import sys
+
+import pytest
+
+from agents.experiments.grids import GRIDS, Grid, Options
+from agents.runs.folder import Run, RunFolder
+from agents.runs.session import RunOptions
+from refusal import assert_refused
+
+
+def configs(*settings, grid=None, **options):
+    return (grid or Grid()).configs(Options(settings=settings, **options))
+
+
+def test_a_grid_holds_every_combination_by_name():
+    found = configs("learning_rate=1e-3,3e-4", "curiosity=icm,none", "clip_eps=0.3")
+    assert list(found) == [
+        "learning_rate=1e-3,curiosity=icm",
+        "learning_rate=1e-3,curiosity=none",
+        "learning_rate=3e-4,curiosity=icm",
+        "learning_rate=3e-4,curiosity=none",
+    ]
+    last = found["learning_rate=3e-4,curiosity=none"]
+    assert (last.learning_rate, last.curiosity, last.clip_eps) == (3e-4, "none", 0.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "setting", "value"),
+    [
+        ("filters=[2,3],[4,5]", "filters=4x5", "filters", (4, 5)),
+        ("align_to_food=true,false", "align_to_food=true", "align_to_food", True),
+        ("max_steps=null,7", "max_steps=null", "max_steps", None),
+        ("clip_eps=0.3", "paper", "clip_eps", 0.3),
+    ],
+)
+def test_values_are_json_or_text(text, name, setting, value):
+    assert getattr(configs(text, preset="paper")[name], setting) == value
+
+
+def test_a_setting_may_have_no_effect_at_some_points():
+    assert len(configs("curiosity=effects,none", "intrinsic_coef=0.5,1.0")) == 4
+    found = configs("intrinsic_coef=0.5", grid=GRIDS["exp1"], preset="paper")
+    assert {config.intrinsic_coef for config in found.values()} == {0.5}
+
+
+def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, own_task_sets):
+    monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
+    given = Options(("curiosity=none,icm",), ("agents.examples.near_food",), seeds=2, seed=3)
+    given = dataclasses.replace(given, env="near-food", out=tmp_path)
+    runs = Grid().runs("sweep", given)
+    assert [str(path.relative_to(tmp_path)) for path in runs] == [
+        f"sweep-fast-near-food/curiosity={name}-seed{seed}"
+        for seed in (3, 4)
+        for name in ("none", "icm")
+    ]
+    run = list(runs.values())[1]
+    assert (run.algorithm, run.seed, run.imports) == ("curiosity=icm", 3, given.imports)
+    assert run.config.env_id == "NearFood-v0"
+
+
+@pytest.mark.parametrize(
+    ("name", "env", "iterations"),
+    [
+        ("exp1", "TrapTube-v0", 250),
+        ("exp2", "PerceptualStructuralSymbolicTrapTube-v0", 500),
+    ],
+)
+def test_the_papers_experiments(name, env, iterations):
+    grid = GRIDS[name]
+    found = grid.configs(grid.options)
+    assert [(name, config.curiosity) for name, config in found.items()] == [
+        *(("ppo", "none"), ("ppo+icm", "icm"))
+    ]
+    for config in found.values():
+        assert (config.env_id, config.iterations, config.eval_episodes) == (env, iterations, 128)
+    assert (grid.options.preset, grid.options.seeds) == ("paper", 5)
+    assert grid.options.run == RunOptions(evaluate_every=1, reported=1000)
+
+
+def test_a_named_grid_keeps_its_settings_unless_given():
+    grid = GRIDS["curiosities"]
+    given = dataclasses.replace(
+        grid.options, settings=("encoder=paper", "filters=[32,64]"), only=("ppo+effects",)
+    )
+    ((name, config),) = grid.configs(given).items()
+    assert (name, config.encoder, config.iterations) == ("ppo+effects", "paper", 312)
+    given = dataclasses.replace(given, settings=("iterations=20",))
+    assert grid.configs(given)["ppo+effects"].iterations == 20
+    assert next(iter(grid.runs("curiosities", grid.options))).parent.name == "curiosities"
+    other = dataclasses.replace(grid.options, preset="fast")
+    assert next(iter(grid.runs("curiosities", other))).parent.name == "curiosities-fast-pstsy"
+
+
+def test_a_stored_run_with_other_settings_is_refused(tmp_path):
+    given = Options(settings=("clip_eps=0.3",), out=tmp_path)
+    ((path, run),) = Grid().runs("sweep", given).items()
+    other = Run(dataclasses.replace(run.config, clip_eps=0.2), "fast", algorithm="fast")
+    path.mkdir(parents=True)
+    RunFolder(path).note(other)
+    assert_refused(["clip_eps=0.2, not 0.3"], Grid().runs, "sweep", given)
+    RunFolder(path).note(run)
+    longer = dataclasses.replace(given, settings=("clip_eps=0.3", "iterations=200"))
+    assert Grid().runs("sweep", longer)[path].config.iterations == 200

@@ -1,0 +1,158 @@
+"""Tables and figures are functions of tidy rows, and say what the published records say."""
+
+import re
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from agents.experiments import figures, report, tables
+from paths import ROOT
+
+RESULTS = ROOT / "benchmarks" / "results"
+PAGES = {
+    "exp2_best": "best_preset.md",
+    "exp2_curiosities": "curiosities.md",
+    "exp2_long": "best_preset.md",
+    "exp2_paper_encoder": "curiosities.md",
+    "fast_base": "fast_preset.md",
+}
+ABOUT = {"title": "x", "train_set": "pstsy", "threshold": 1.0}
+
+
+def rows(algorithm, solved, *, task_set="p", purpose="test", iteration=2, tasks=10, layouts=None):
+    """Returns a row of results per seed."""
+    few = {} if layouts is None else {"layouts": layouts, "layouts_total": 5}
+    return [
+        {
+            "algorithm": algorithm, "seed": seed, "purpose": purpose, "task_set": task_set,
+            "iteration": iteration, "tasks": tasks, "solved": count,
+            "layouts": np.nan, "layouts_total": np.nan, **few,
+        }
+        for seed, count in enumerate(solved)
+    ]  # fmt: skip
+
+
+def curves(algorithm="ppo", evaluations=((0, 1), (0, 0, 1))):
+    """Returns a row of metrics per seed and iteration."""
+    return pd.DataFrame(
+        {
+            "algorithm": algorithm, "seed": seed, "iteration": i, "episodes": 100 * i,
+            "transitions": 1000 * i, "seconds": 60.0 * i, "success": share / 2, "evaluation": share,
+        }
+        for seed, shares in enumerate(evaluations)
+        for i, share in enumerate(shares, 1)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("values", "high", "text"),
+    [
+        ([50.0, 60.0, 70.0], 100, "60.0 [35.2, 84.8]"),  # 4.303 * 10 / sqrt(3)
+        ([0.0, 50.0], 100, "25.0 [0.0, 100.0]"),
+        ([7.0, 7.0], 100, "7.0 [7.0, 7.0]"),
+        ([7.0], 100, "7.0"),
+        ([], 100, "–"),
+    ],
+)
+def test_means_have_clipped_intervals(values, high, text):
+    assert tables.mean_text(np.array(values), ".1f", high) == text
+
+
+def test_success_is_by_set_and_algorithm_with_the_papers_figures():
+    results = pd.DataFrame(
+        rows("ppo+icm", [5, 6, 7])
+        + rows("ppo+icm", [9, 9, 9], iteration=1)  # tested before training went on
+        + rows("ppo+icm", [1, 1, 1], purpose="validation", iteration=3)
+        + rows("ppo+icm", [6, 6, 8], task_set="sy", layouts=3)
+        + rows("ppo+icm", [10, 10, 10], task_set="base")
+        + rows("ppo", [1])
+        + rows("ppo", [10], task_set="own")
+    )
+    table = tables.tables(results, curves(), ABOUT)["Test tasks solved, %"]
+    assert list(table) == ["ppo+icm", "ppo", "PPO, paper", "PPO + ICM, paper"]
+    assert table.loc["{P}"].tolist() == ["60.0 [35.2, 84.8]", "10.0", "0.0", "2.0 ± 3.0"]
+    assert table.loc["{Sy}"].tolist() == ["66.7 (3 of 5)", "–", "35.5 ± 10.9", "40.2 ± 16.9"]
+    assert table.loc["own"].tolist() == ["–", "100.0", "–", "–"]
+    assert table.loc[tables.MEAN, "ppo+icm"] == "63.3 [37.5, 89.2]"  # base does not count
+    by_seed = tables.tables(results, curves(), ABOUT)["Test tasks solved by seed, %"]
+    assert by_seed.loc["ppo+icm, seed 2", ["{P}", "iteration"]].tolist() == ["70.0", "2"]
+    other = tables.tables(results, curves(), {**ABOUT, "train_set": "sy"})
+    assert "PPO, paper" not in other["Test tasks solved, %"]
+
+
+def test_training_is_summed_up_with_the_papers_trials():
+    three = ((0, 1), (0, 0, 1), (0, 0, 0))
+    made = pd.concat([curves("ppo+icm", three), curves("<b>", ((0.5,),))])
+    table = tables.training_table(made, 1.0, with_paper=True)
+    assert table.loc["ppo+icm"].tolist() == ["2 of 3", "250 [0, 885]", "2,667", "2.7"]
+    assert table.loc["<b>"].tolist() == ["0 of 1", "–", "1,000", "1.0"]
+    assert table.loc["PPO + ICM, paper"].tolist()[:2] == ["5 of 5", "102,000 ± 60,000"]
+    assert tables.training_table(made, 0.5, with_paper=False).loc["<b>", "solved"] == "1 of 1"
+
+
+def test_runs_that_have_tested_nothing_yet_have_a_table_and_curves(tmp_path):
+    nothing = pd.DataFrame(rows("ppo", [1], purpose="validation"))
+    assert list(tables.tables(nothing, curves(), ABOUT)) == ["Training"]
+    assert [path.name for path in figures.save(tmp_path, nothing, curves(), ABOUT)] == [
+        "curves.png"
+    ]
+
+
+def test_curves_are_of_seeds_and_their_mean_only_where_all_end_together():
+    results = pd.DataFrame(
+        rows("ppo", [3, 4], purpose="validation", iteration=1)
+        + rows("ppo", [5, 8], purpose="validation")
+    )
+    figure = figures.draw_curves(results, curves(evaluations=((0, 1), (0, 0.5))), ABOUT)
+    training, greedy, p = figure.axes
+    assert [axis.get_title() for axis in figure.axes] == [
+        *("training", "greedy, {P, St, Sy}", "greedy, {P}")
+    ]
+    assert greedy.lines[-1].get_ydata().tolist() == [0, 75]
+    assert p.lines[-1].get_xydata().tolist() == [[100, 35], [200, 65]]
+    assert len(training.lines) == 3
+    uneven = figures.draw_curves(results, curves(), ABOUT)
+    assert [len(line.get_xdata()) for line in uneven.axes[0].lines] == [2, 3]
+    single = figures.draw_curves(results, curves(evaluations=((0, 1),)), ABOUT)
+    assert len(single.axes[0].lines) == 1
+
+
+def test_many_algorithms_are_points_and_bars_but_not_lines(tmp_path):
+    names = [f"a{i}" for i in range(8)]
+    tested = pd.DataFrame([row for name in names for row in rows(name, [3, 4])])
+    many = pd.concat(map(curves, names))
+    (path,) = figures.save(tmp_path, tested, many, ABOUT)
+    assert path.name == "success.png"
+    with Image.open(path) as picture:
+        assert picture.width == 8.3 * figures.DPI
+    axis = figures.draw_success(tables.reported(tested), ABOUT).axes[0]
+    assert [text.get_text() for text in axis.get_yticklabels()] == [*names, *tables.PAPER_SUCCESS]
+    assert axis.lines[0].get_xdata().tolist() == [30, 40]
+
+
+@pytest.mark.parametrize(("record", "page"), PAGES.items())
+def test_the_pages_have_the_tables_of_the_records(record, page, tmp_path):
+    copy = shutil.copytree(RESULTS / record, tmp_path / record)
+    shown = report.write(copy)
+    _, _, table = (copy / "table.md").read_text().partition("**Test tasks solved, %**\n\n")
+    assert table.partition("\n\n")[0] in (RESULTS / page).read_text()
+    assert max(map(len, shown.splitlines()[:-5])) <= report.WIDTH
+
+
+def test_every_record_is_on_a_page():
+    assert {path.parent.name for path in RESULTS.glob("*/results.csv")} == set(PAGES)
+
+
+@pytest.mark.parametrize(("agent", "record"), [("best", "exp2_best"), ("fast", "fast_base")])
+def test_the_leaderboard_is_of_the_records(agent, record):
+    results, curves = (
+        pd.read_csv(RESULTS / record / name) for name in ("results.csv", "curves.csv")
+    )
+    means = tables.by_set(tables.reported(results)).drop(columns=tables.MEAN).mean()
+    steps = tables.training_table(curves, 1.0, with_paper=False).loc[agent, "steps"]
+    row = " | ".join([*map("{:.1f}".format, means), steps])
+    page = (ROOT / "trap_tube_jax" / "protocol.md").read_text()
+    assert re.search(rf"^\| `{agent}`, mean of .* \| {re.escape(row)} \|$", page, re.MULTILINE)
