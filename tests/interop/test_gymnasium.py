@@ -1,9 +1,12 @@
 """The Gymnasium adapter under Gymnasium's own tools."""
 
+import copy
 import functools
 import itertools
+import pickle
 from typing import Any
 
+import cloudpickle
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -249,9 +252,31 @@ def test_own_task_sets_can_be_registered(own_task_sets):
     assert gymnasium.make("trap_tube_jax/GymnasiumTest-v0").unwrapped.env.max_steps == 7
 
 
+@pytest.mark.parametrize(
+    "duplicate",
+    [
+        copy.deepcopy,
+        lambda env: pickle.loads(pickle.dumps(env)),
+        lambda env: cloudpickle.loads(cloudpickle.dumps(env)),
+    ],
+)
+@pytest.mark.parametrize("make", [TrapTubeEnv, functools.partial(TrapTubeVectorEnv, num_envs=2)])
+def test_copies_continue_the_episode(make, duplicate):
+    envs = [make("psy")]
+    envs[0].reset(seed=1)
+    actions = [envs[0].action_space.sample() for _ in range(60)]
+    for action in actions[:3]:
+        envs[0].step(action)
+    envs.append(duplicate(envs[0]))
+    for action in actions:
+        np.testing.assert_array_equal(*(env.step(action)[0] for env in envs))
+    np.testing.assert_array_equal(*(env.reset()[0] for env in envs))
+
+
 @pytest.mark.parametrize("context", ["spawn", "forkserver"])
 def test_processes_of_their_own_change_nothing(context):
-    functions = [functools.partial(TrapTubeEnv, "p", max_steps=3)] * 2
+    own = tt.Environment((tt.perceptual,), max_steps=3)
+    functions = [functools.partial(TrapTubeEnv, own)] * 2
     envs = [SyncVectorEnv(functions), AsyncVectorEnv(functions, context=context)]
     np.testing.assert_array_equal(*(each.reset(seed=3)[0] for each in envs))
     for _ in range(6):

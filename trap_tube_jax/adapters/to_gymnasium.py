@@ -8,8 +8,9 @@ Importing `trap_tube_jax` registers them where Gymnasium >= 1.1 is installed:
 Both take the keyword arguments of the classes below. The step limit is `max_steps`.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,16 +38,36 @@ RENDER_MODES = ("rgb_array", "ansi")
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}
 AUTORESET_MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
 
-# Equal environments share their compiled programs.
-_reset = jax.jit(lambda env, key: env.reset(key), static_argnums=0)
 _observe = jax.jit(jax.vmap(observe))
-_step = jax.jit(Environment.step, static_argnums=0)
-_step_batch = jax.jit(
-    lambda batch, state, actions: batch.step(state, actions), static_argnums=0, donate_argnums=1
-)
 
 
-class TrapTubeEnv(gymnasium.Env):
+class _Programs(NamedTuple):
+    reset: Callable[..., Any]
+    step: Callable[..., Any]
+
+
+@functools.lru_cache(maxsize=32)
+def _compile(env: AutoReset | VectorEnvironment) -> _Programs:
+    """Compiles programs that equal environments share."""
+    if isinstance(env, AutoReset):
+        return _Programs(jax.jit(env.reset), jax.jit(env.env.step))
+    return _Programs(jax.jit(env.reset), jax.jit(env.step, donate_argnums=0))
+
+
+class _Compiled:
+    """Mixin that runs the programs of `_pure`, and leaves them out of copies and pickles."""
+
+    _pure: AutoReset | VectorEnvironment
+
+    @functools.cached_property
+    def _programs(self) -> _Programs:
+        return _compile(self._pure)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_programs"}
+
+
+class TrapTubeEnv(_Compiled, gymnasium.Env):
     """One environment.
 
     An episode truncates after `max_steps` by itself. After `reset(seed=s)` the task and all
@@ -92,7 +113,7 @@ class TrapTubeEnv(gymnasium.Env):
                 f"render_mode must be None or one of {', '.join(RENDER_MODES)}, got {render_mode!r}"
             )
         self.env = task_set
-        self._auto_reset = AutoReset(task_set)
+        self._pure = AutoReset(task_set)
         self.render_mode = render_mode
         self.cell_size = check_integer("cell_size", cell_size)
         spec = self.env.observation_spec
@@ -108,7 +129,7 @@ class TrapTubeEnv(gymnasium.Env):
         super().reset(seed=seed)
         state = self._state
         key = _keys([self.np_random_seed])[0] if seed is not None or state is None else state.key
-        self._state, timestep = _reset(self._auto_reset, key)
+        self._state, timestep = self._programs.reset(key)
         return np.array(timestep.observation), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -119,7 +140,9 @@ class TrapTubeEnv(gymnasium.Env):
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         state = _started(self._state)
-        inner, timestep = _step(self.env, state.inner, _grasp_and_move(action, self.action_space))
+        inner, timestep = self._programs.step(
+            state.inner, _grasp_and_move(action, self.action_space)
+        )
         self._state = state.replace(inner=inner)
         return (
             np.array(timestep.observation),
@@ -143,7 +166,7 @@ class TrapTubeEnv(gymnasium.Env):
         return np.array(render(state, self.cell_size))
 
 
-class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
+class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
     """Many environments, stepped by one compiled program.
 
     Environment i after `reset(seed=s)` is `TrapTubeEnv` after `reset(seed=s + i)`: the batch
@@ -187,7 +210,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(one.observation_space, num_envs)
         self.action_space = batch_space(one.action_space, num_envs)
         is_same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
-        self._batch = (VectorEnvironment if is_same_step else NextStepVectorEnvironment)(self.env)
+        self._pure = (VectorEnvironment if is_same_step else NextStepVectorEnvironment)(self.env)
         self._state: VectorState | None = None
 
     def reset(
@@ -212,7 +235,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         mask = (options or {}).get("reset_mask")
         if mask is None:
             keys = self._next_keys(seed)
-            self._state, timestep = _reset(self._batch, keys)
+            self._state, timestep = self._programs.reset(keys)
             return np.array(timestep.observation), {}
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
@@ -220,7 +243,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
                 f"reset_mask must be bool[{self.num_envs}] with at least one true, got {mask}"
             )
         state = _started(self._state)
-        fresh, _ = _reset(self._batch, self._next_keys(seed))
+        fresh, _ = self._programs.reset(self._next_keys(seed))
         state = jax.tree.map(
             lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old),
             fresh,
@@ -240,7 +263,7 @@ class TrapTubeVectorEnv(gymnasium.vector.VectorEnv):
         """
         state = _started(self._state)
         actions = _grasp_and_move(actions, self.single_action_space, self.num_envs)
-        self._state, timestep = _step_batch(self._batch, state, actions)
+        self._state, timestep = self._programs.step(state, actions)
         terminations, truncations = np.array(timestep.terminated), np.array(timestep.truncated)
         infos: dict[str, Any] = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
