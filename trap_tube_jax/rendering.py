@@ -209,7 +209,8 @@ def _arrange(tiles: np.ndarray, objects: jax.Array) -> jax.Array:
 
 def _ink(color: Any) -> Any:
     """Returns black or white f32[h, w, 1], the one with more contrast to f32[h, w, 3]."""
-    return (color @ LUMA.astype(np.float32) < 128)[..., None] * np.float32(255)
+    is_dark = color @ LUMA.astype(np.float32) < 128
+    return 255 * is_dark[..., None].astype(np.float32)
 
 
 def _blend(image: Any, ink: Any, opacity: Any) -> Any:
@@ -265,22 +266,24 @@ def _face(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _tool_bar(state: State, cell_size: int) -> jax.Array:
     """Draws a bar f32[12 s, 12 s] with round ends along the tool; a single cell is vertical."""
-    along = jnp.where(state.tool_extent[1] > 1, np.array([0, 1]), np.array([1, 0]))
-    half = (state.tool_extent - 1) / 2 + TOOL_BAR_OVERHANG * along
-    y, x = _offsets(state.tool + state.tool_extent / 2, BOARD_SIZE, cell_size)
+    corner, extent = state.tool.astype(np.float32), state.tool_extent.astype(np.float32)
+    along = jnp.where(extent[1] > 1, np.array([0, 1], np.float32), np.array([1, 0], np.float32))
+    half = (extent - 1) / 2 + TOOL_BAR_OVERHANG * along
+    y, x = _offsets(corner + extent / 2, BOARD_SIZE, cell_size)
     outside = [jnp.maximum(abs(y) - half[0], 0), jnp.maximum(abs(x) - half[1], 0)]
     return _coverage(jnp.hypot(*outside) - TOOL_BAR_RADIUS, cell_size)
 
 
 def _draw_hand(image: jax.Array, state: State, grasp: jax.Array, cell_size: int) -> jax.Array:
     """Draws a white hand with a black outline on the agent's border in the grasp direction."""
-    y, x = _offsets(state.agent + 0.5 + 0.5 * unit_vector(grasp), BOARD_SIZE, cell_size)
+    center = state.agent.astype(np.float32) + 0.5 + 0.5 * unit_vector(grasp).astype(np.float32)
+    y, x = _offsets(center, BOARD_SIZE, cell_size)
     disc = jnp.hypot(y, x) - HAND_RADIUS
     hand = jnp.where(holds_tool(state, grasp), disc, jnp.abs(disc + 0.07) - 0.07)
     is_shown = (grasp >= 0) & (grasp < NUM_DIRECTIONS)
-    outline = _coverage(hand - 0.05, cell_size) * is_shown
-    image = _blend(image, 0.0, outline)
-    return _blend(image, 255.0, _coverage(hand, cell_size) * is_shown)
+    hand = jnp.where(is_shown, hand, jnp.inf)
+    image = _blend(image, 0.0, _coverage(hand - 0.05, cell_size))
+    return _blend(image, 255.0, _coverage(hand, cell_size))
 
 
 def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:

@@ -22,7 +22,7 @@ STEPS = 4
 
 
 def play() -> Any:
-    """Episodes of two steps, alone and in a batch; keys as their bits."""
+    """Episodes of two steps, alone and in a batch, and a picture; keys as their bits."""
     env = tt.Environment(TRANSFERS, max_steps=2)
     alone = tt.EpisodeStatistics(tt.AutoReset(env))
     batch = tt.EpisodeStatistics(tt.VectorEnvironment(env, chunk_size=2))
@@ -34,6 +34,7 @@ def play() -> Any:
         for _ in range(STEPS):
             record.append((state, timestep))
             state, timestep = step(state, np.ones(shape, int))
+    record.append(tt.render(tt.base_state(), 8, grasp=0))
     record.append((tt.action_from_index(np.arange(16)), tt.action_to_index(np.array([1, 2]))))
 
     def bits(leaf: jax.Array) -> np.ndarray:
