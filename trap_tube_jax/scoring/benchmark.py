@@ -104,7 +104,7 @@ def score(
     program = jax.jit(functools.partial(_play, policy), static_argnums=0)
 
     def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
-        env = _dynamics(entry.max_steps)
+        env = Environment(max_steps=entry.max_steps)  # states hold their tasks
         key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(entry.id.encode()))
         total = len(states.time)
         played = [
@@ -159,7 +159,7 @@ def score_gymnasium(
         )
 
     def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
-        step = _compiled_step(entry.max_steps)
+        step = _compiled_step(Environment(max_steps=entry.max_steps))
         states = jax.device_get(states)
         ends = [_play_one(agent, act, step, take(states, i)) for i in range(len(states.time))]
         solved, length = zip(*ends, strict=True)
@@ -290,11 +290,5 @@ def _grasp_and_move(action: Any) -> np.ndarray:
 
 
 @functools.cache
-def _dynamics(max_steps: int) -> Environment:
-    """Returns the rules under a step limit; the states hold the tasks."""
-    return Environment(max_steps=max_steps)
-
-
-@functools.cache
-def _compiled_step(max_steps: int) -> Callable[..., Any]:
-    return jax.jit(_dynamics(max_steps).step)
+def _compiled_step(env: Environment) -> Callable[..., Any]:
+    return jax.jit(env.step)

@@ -66,16 +66,6 @@ def _by_cells(table: np.ndarray) -> np.ndarray:
     return by_agent_first.transpose(4, 5, 2, 3, 0, 1)
 
 
-def count_reachable(state: State) -> int:
-    """Computes `distances(state).num_reachable` in less time and memory."""
-    num_open = 0
-    solved = []
-    for level in levels(checked(state)):
-        num_open += len(level.nodes)
-        solved.append(np.unique(level.successors[level.solved]))
-    return num_open + len(np.unique(np.concatenate(solved)))
-
-
 def _explore(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns `from_start` i16[144^3], the unsolved nodes i32[n], their successors i32[n, 16]."""
     from_start = np.full(NUM_POSITIONS, UNKNOWN, np.int16)

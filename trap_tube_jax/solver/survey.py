@@ -1,10 +1,9 @@
-"""The difficulty of a task set: shortest plans and graphs of many of its tasks.
+"""The difficulty of a task set: shortest plans of many of its tasks.
 
 Source: environment.md, "Task sets", has the statistics of the paper's eight.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,8 +11,7 @@ import numpy as np
 
 from trap_tube_jax.checks import check_integer, check_seed
 from trap_tube_jax.registry import TaskSet, make
-from trap_tube_jax.solver.distance import count_reachable
-from trap_tube_jax.solver.search import solve_batch, take
+from trap_tube_jax.solver.search import solve_batch
 from trap_tube_jax.state import State
 
 QUANTILES = (5, 25, 50, 75, 95)
@@ -21,19 +19,17 @@ QUANTILES = (5, 25, 50, 75, 95)
 
 @dataclasses.dataclass(frozen=True)
 class Survey:
-    """Shortest plans and graph sizes of tasks drawn from a set.
+    """Shortest plans of tasks drawn from a set.
 
     Attributes:
       task_set: the set.
       seed: the seed of the tasks.
       length: i32[T], length of every task's shortest plan; -1 if unsolvable.
-      reachable: i32[G], number of distinct reachable states of each of the first G tasks.
     """
 
     task_set: TaskSet
     seed: int
     length: np.ndarray
-    reachable: np.ndarray
 
     @property
     def solved_length(self) -> np.ndarray:
@@ -49,25 +45,18 @@ class Survey:
             "tasks": len(self.length),
             "seed": self.seed,
             "solvable": len(solved) / len(self.length),
-            "mean": _plain(np.mean, solved),
+            "mean": solved.mean().item() if len(solved) else None,
             "quantiles": dict(zip(map(str, QUANTILES), quantiles, strict=True)),
-            "longest": _plain(np.max, solved),
-            "reachable": {
-                "tasks": len(self.reachable),
-                "mean": _plain(np.mean, self.reachable),
-                "fewest": _plain(np.min, self.reachable),
-                "most": _plain(np.max, self.reachable),
-            },
+            "longest": solved.max().item() if len(solved) else None,
         }
 
 
-def survey(task_set: TaskSet, *, tasks: int, graphs: int, seed: int = 0) -> Survey:
-    """Solves `tasks` tasks of a set and explores the whole graph of the first `graphs`.
+def survey(task_set: TaskSet, *, tasks: int, seed: int = 0) -> Survey:
+    """Solves tasks of a set.
 
     Args:
       task_set: the set; its id is registered.
-      tasks: how many to draw, at least 1.
-      graphs: number of tasks whose reachable states are counted, 0 to `tasks`, a second each.
+      tasks: number of tasks, at least 1.
       seed: 0 to 2**32 - 1; the tasks are those of the keys
         `jax.random.split(jax.random.key(seed), tasks)`.
 
@@ -75,11 +64,8 @@ def survey(task_set: TaskSet, *, tasks: int, graphs: int, seed: int = 0) -> Surv
       ValueError: a number is out of range; the message names the range.
     """
     tasks = check_integer("tasks", tasks)
-    graphs = check_integer("graphs", graphs, 0, tasks)
     seed = check_seed(seed)
-    states = draw_tasks(task_set, tasks, seed)
-    reachable = [count_reachable(take(states, index)) for index in range(graphs)]
-    return Survey(task_set, seed, solve_batch(states).length, np.array(reachable, np.int32))
+    return Survey(task_set, seed, solve_batch(draw_tasks(task_set, tasks, seed)).length)
 
 
 def draw_tasks(task_set: TaskSet, tasks: int, seed: int) -> State:
@@ -87,7 +73,3 @@ def draw_tasks(task_set: TaskSet, tasks: int, seed: int) -> State:
     env = make(task_set.id)
     keys = jax.random.split(jax.random.key(seed), tasks)
     return jax.device_get(jax.jit(jax.vmap(lambda key: env.reset(key)[0]))(keys))
-
-
-def _plain(function: Callable[[np.ndarray], Any], values: np.ndarray) -> Any:
-    return function(values).item() if len(values) else None

@@ -11,7 +11,6 @@ from paths import ROOT
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver import pictures
-from trap_tube_jax.solver.distance import count_reachable
 from trap_tube_jax.solver.search import checked, levels, take
 from trap_tube_jax.solver.survey import draw_tasks
 from trap_tube_jax.transfers import swap_with_tool
@@ -288,7 +287,7 @@ def test_distances_equal_those_of_brute_force(workshop, workshop_distances):
     from_start = brute_force.distances_from(start, edges)
     to_goal = brute_force.distances_to_goal(edges)
     found = workshop_distances
-    assert found.num_reachable == len(edges) == count_reachable(workshop)
+    assert found.num_reachable == len(edges)
     for agent, tool, food in edges:
         place = (*food, *tool, *agent)
         assert found.from_start[place] == from_start[agent, tool, food]

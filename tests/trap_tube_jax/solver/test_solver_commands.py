@@ -19,10 +19,8 @@ from trap_tube_jax.solver.survey import Survey, survey
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tasks": 0, "graphs": 0}, "tasks must be an integer >= 1, got 0"),
-        ({"tasks": 2, "graphs": 3}, "graphs must be an integer >= 0 and <= 2, got 3"),
-        ({"tasks": 2, "graphs": -1}, "graphs must be an integer >= 0 and <= 2, got -1"),
-        ({"tasks": 2, "graphs": 0, "seed": 2**32}, "seed must be .* <= 4294967295, got 4294967296"),
+        ({"tasks": 0}, "tasks must be an integer >= 1, got 0"),
+        ({"tasks": 2, "seed": 2**32}, "seed must be .* <= 4294967295, got 4294967296"),
     ],
 )
 def test_survey_refuses(options, message):
@@ -31,22 +29,19 @@ def test_survey_refuses(options, message):
 
 
 def test_survey_takes_every_task_of_the_seed_once(monkeypatch):
-    """Numbers stand for the tasks, and for their plans and graphs."""
+    """Numbers stand for the tasks and for their plans."""
     for name, replacement in {
         "draw_tasks": lambda entry, tasks, seed: 10 * seed + np.arange(tasks),
         "solve_batch": lambda tasks: SimpleNamespace(length=tasks),
-        "count_reachable": lambda task: task,
     }.items():
         monkeypatch.setattr(f"trap_tube_jax.solver.survey.{name}", replacement)
-    found = survey(tt.task_set("p"), tasks=5, graphs=3, seed=4)
+    found = survey(tt.task_set("p"), tasks=5, seed=4)
     assert found.length.tolist() == [40, 41, 42, 43, 44]
-    assert found.reachable.tolist() == [40, 41, 42]
     assert found.seed == 4
 
 
 def test_the_figures_of_a_survey():
-    lengths, reachable = np.array([4, -1, 8, 6, -1]), np.array([10, 40])
-    found = Survey(tt.task_set("p"), 3, lengths, reachable).summary()
+    found = Survey(tt.task_set("p"), 3, np.array([4, -1, 8, 6, -1])).summary()
     quantiles = found.pop("quantiles")
     assert found == {
         "id": "PerceptualTrapTube-v0",
@@ -55,14 +50,13 @@ def test_the_figures_of_a_survey():
         "solvable": 0.6,
         "mean": 6,
         "longest": 8,
-        "reachable": {"tasks": 2, "mean": 25, "fewest": 10, "most": 40},
     }
     assert quantiles == pytest.approx({"5": 4.2, "25": 5, "50": 6, "75": 7, "95": 7.8})
 
 
 def test_command_line_surveys_task_sets(tmp_path, capsys):
     picture = tmp_path / "histogram.png"
-    arguments = ["--tasks", "12", "--graphs", "0", "--output", str(picture), "--sets"]
+    arguments = ["--tasks", "12", "--output", str(picture), "--sets"]
     main([*arguments, "sy", "--format", "json"])
     (found,) = json.loads(capsys.readouterr().out)
     assert (found["id"], found["tasks"], found["solvable"]) == ("SymbolicTrapTube-v0", 12, 1)
