@@ -153,17 +153,16 @@ class TrapTubeEnv(_Compiled, gymnasium.Env):
         )
 
     def render(self) -> np.ndarray | str | None:
-        """Returns the board as u8[12 s, 12 s, 3] or as text, depending on `render_mode`.
+        """Returns the board as u8[12 s, 12 s, 3], as text or None, depending on `render_mode`.
 
         Raises:
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
-        if not _draws(self.render_mode):
+        if self.render_mode is None:
             return None
         state = _started(self._state).inner
-        if self.render_mode == "ansi":
-            return render_ascii(state)
-        return np.array(render(state, self.cell_size))
+        is_text = self.render_mode == "ansi"
+        return render_ascii(state) if is_text else np.array(render(state, self.cell_size))
 
 
 class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
@@ -278,7 +277,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray | str, ...] | None:
         """Returns one picture or text per environment; see `TrapTubeEnv.render`."""
-        if not _draws(self.render_mode):
+        if self.render_mode is None:
             return None
         states = _started(self._state).episodes.inner
         if self.render_mode == "ansi":
@@ -336,12 +335,6 @@ def _started(state: Any) -> Any:
     if state is None:
         raise gymnasium.error.ResetNeeded("call reset before step and render")
     return state
-
-
-def _draws(render_mode: str | None) -> bool:
-    if render_mode is None:
-        gymnasium.logger.warn("render does nothing: the environment has no render_mode")
-    return render_mode is not None
 
 
 def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:

@@ -102,15 +102,9 @@ class Score:
         layout: np.ndarray | None = None,
         optimality: Optimality | None = None,
     ) -> "Score":
-        """Computes the score of outcomes bool[B] and lengths i32[B].
+        """Computes the score of outcomes bool[B] and numbers of steps i32[B].
 
-        Args:
-          name: the set's short name.
-          label: the set's name in the paper's notation.
-          solved: bool[B].
-          length: i32[B], steps taken.
-          layout: i32[B], the layout of each task; None unless the set has few.
-          optimality: the comparison with shortest plans, if requested.
+        `layout` i32[B] numbers the layout of each task; it is None unless the set has few.
         """
         count, tasks = int(np.sum(solved)), len(solved)
         low, high = wilson_interval(count, tasks)
@@ -144,11 +138,7 @@ class Scores:
     sets: tuple[Score, ...]
 
     def __getitem__(self, name: str) -> Score:
-        """Returns the score of the set with this short name.
-
-        Raises:
-          ValueError: the set was not scored.
-        """
+        """Returns the score of the set with this short name, or raises ValueError."""
         by_name = {score.set: score for score in self.sets}
         if name not in by_name:
             raise ValueError(f"no score of {name!r}; allowed: {', '.join(by_name)}")
