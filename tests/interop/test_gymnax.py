@@ -13,7 +13,6 @@ gymnax = pytest.importorskip("gymnax")
 spaces = gymnax.environments.spaces
 wrappers = pytest.importorskip("gymnax.wrappers")
 
-import purejaxrl_loop
 from trap_tube_jax.adapters import to_gymnax
 
 pytestmark = pytest.mark.interop
@@ -152,27 +151,28 @@ def test_refused_indices(easy, easy_env, index):
             each.step_env(key, state, index, params)
 
 
-def test_purejaxrl_learns_the_easy_task(easy):
-    info = jax.jit(purejaxrl_loop.make_train(*easy))(jax.random.PRNGKey(0))
-    assert info["returned_episode"].shape == (24, 16, 32)
-    success = info["returned_episode_returns"].mean((1, 2))
-    assert success[0] < 0.6
-    assert success[-1] > 0.95
-
-
-def test_gymnaxs_own_wrappers(easy, easy_env):
+def test_batches_of_purejaxrls_wrappers_scan(easy, easy_env):
+    """As PureJaxRL trains: vmap over environments, scan over steps, `info` stacked over both."""
     env, params = easy
     if to_gymnax.HAS_SIX_VALUES:
         env = to_gymnax.SixValueTrapTube(easy_env)
     env = wrappers.purerl.LogWrapper(wrappers.purerl.FlattenObservationWrapper(env))
     key = jax.random.key(0)
-    observation, state = env.reset(key, params)
-    assert observation.shape == (432,)
-    for index in (3, 1):
-        observation, state, reward, *_, info = env.step(key, state, index, params)
-    assert (observation.shape, float(reward)) == ((432,), 1.0)
-    assert float(info["returned_episode_returns"]) == 1.0
-    assert int(info["returned_episode_lengths"]) == 2
+    observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, 2), params)
+    assert observation.shape == (2, 432)
+
+    def step(state, action):
+        following = jax.vmap(env.step, (0, 0, 0, None))(
+            jax.random.split(key, 2), state, action, params
+        )
+        return following[1], following[2:]
+
+    actions = jnp.array([[3, 0], [1, 0], *[[0, 0]] * 4])
+    _, (reward, *_, info) = jax.jit(lambda state: jax.lax.scan(step, state, actions))(state)
+    assert reward.sum(0).tolist() == [1, 0]
+    assert info["returned_episode_returns"][1:].tolist() == [[1, 0]] * 5
+    assert info["returned_episode_lengths"][1].tolist() == [2, 0]
+    assert info["returned_episode_lengths"][5, 1] == 6
 
 
 def test_stoa_steps_it(easy):
