@@ -12,7 +12,6 @@ import numpy as np
 import trap_tube_jax as tt
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
-from trap_tube_jax.rendering import episode_frames
 
 with needs_extra("pictures"):
     import matplotlib as mpl
@@ -60,7 +59,7 @@ def draw_board() -> Figure:
     """Draws the base task with the names of its objects, and its shortest plan in six steps."""
     state = tt.base_state().replace(palette=PALETTE)
     plan = tt.solve(state)
-    frames = episode_frames(state, plan.actions[: plan.length], CELL)
+    frames = tt.episode_frames(state, plan.actions[: plan.length], CELL)
     figure = Figure(figsize=(8.3, 3.6), layout="constrained")
     parts: Any = figure.subfigures(1, 2, width_ratios=(3.4, 4.9))
     large, steps = parts
