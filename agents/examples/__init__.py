@@ -1,1 +1,1 @@
-"""Short programs, each on its own; tests run them."""
+"""Short programs to start from; tests run them."""

@@ -1,6 +1,6 @@
-"""A curiosity of one's own: a step pays where the tool moves, less the more it has moved.
+"""A curiosity of your own: it pays for moves of the tool, less the more there have been.
 
-python -m agents.examples.custom_curiosity
+python -m agents.examples.custom_curiosity --help
 python -m agents.train --import agents.examples.custom_curiosity --curiosity tool-moves
 """
 
@@ -8,8 +8,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import tyro
 
-from agents import Config, make_train
+from agents import Config, TrainState, make_train
 from agents.acting.episodes import CELL_TOOL
 from agents.curiosity import Curiosity, Experience, register
 
@@ -18,13 +19,13 @@ class ToolMoves(Curiosity):
     """reward: n^(-1/2) for a move of the tool, n the moves in training so far."""
 
     def memory(self) -> jax.Array:
-        """No moves yet, f32[]."""
-        return jnp.zeros(())
+        """Returns no moves, f32[]."""
+        return jnp.zeros((), jnp.float32)
 
     def reward(
         self, params: Any, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
-        """The bonus f32[T, B] of every step, and the moves with this iteration's."""
+        """Returns the reward f32[T, B] of every step, and the moves so far."""
         tool = experience.episodes.cells[:, :, CELL_TOOL]
         moves = jnp.any(tool[1:] != tool[:-1], axis=-1) * experience.episodes.mask
         total = memory + jnp.sum(moves)
@@ -34,16 +35,11 @@ class ToolMoves(Curiosity):
 register("tool-moves", lambda config, env: ToolMoves())
 
 
-def main(iterations: int = 20, **settings: Any) -> tuple[Any, dict[str, jax.Array]]:
-    """Trains with it on base; returns the state of training and the last metrics.
-
-    Args:
-      iterations: how many, at least 1.
-      settings: those of the preset `fast` to change.
-    """
-    train = make_train(Config.preset("fast", curiosity="tool-moves", **settings))
-    iterate = jax.jit(train.iterate)
-    state, metrics = train.init(jax.random.key(0)), {}
+def train(config: Config, iterations: int) -> tuple[TrainState, dict[str, jax.Array]]:
+    """Trains for at least one iteration; returns the last state and metrics."""
+    learner = make_train(config)
+    iterate = jax.jit(learner.iterate)
+    state, metrics = learner.init(jax.random.key(0)), {}
     for number in range(1, iterations + 1):
         state, metrics = iterate(state)
         print(
@@ -53,5 +49,14 @@ def main(iterations: int = 20, **settings: Any) -> tuple[Any, dict[str, jax.Arra
     return state, metrics
 
 
+def main(iterations: int = 20) -> None:
+    """Trains on base with a reward for moves of the tool.
+
+    Args:
+      iterations: number of iterations.
+    """
+    train(Config.preset("fast", curiosity="tool-moves"), iterations)
+
+
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

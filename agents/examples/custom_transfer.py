@@ -1,10 +1,11 @@
-"""A transfer of one's own, and what it takes from an agent that was trained without it.
+"""A transfer of your own, and the score of an agent that was trained without it.
 
-python -m agents.examples.custom_transfer
+python -m agents.examples.custom_transfer --help
 """
 
 import jax
 import jax.numpy as jnp
+import tyro
 
 import agents
 import trap_tube_jax as tt
@@ -12,7 +13,7 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 
 def mirrored(key: jax.Array, state: tt.State) -> tt.State:
-    """Turns left into right with probability 1/2. The shortest plan keeps its length."""
+    """Mirrors the board left to right with probability 1/2; shortest plans keep their length."""
     last = BOARD_SIZE - 1
     image = state.replace(
         board=state.board[:, ::-1],
@@ -20,23 +21,23 @@ def mirrored(key: jax.Array, state: tt.State) -> tt.State:
         food=state.food.at[1].set(last - state.food[1]),
         tool=state.tool.at[1].set(last - state.tool[1] - (state.tool_extent[1] - 1)),
     )
-    turns = jax.random.bernoulli(key)
-    return jax.tree.map(lambda x, y: jnp.where(turns, x, y), image, state)
+    is_mirrored = jax.random.bernoulli(key)
+    return jax.tree.map(lambda x, y: jnp.where(is_mirrored, x, y), image, state)
 
 
 tt.register("MirroredTrapTube-v0", (mirrored,), short="mirrored")
 
 
 def main(tasks: int = 100) -> tt.Scores:
-    """Scores the agent shipped as `base` on base and on its mirror image.
+    """Scores the shipped agent `fast-base` on base and on its mirror image.
 
     Args:
-      tasks: how many of the new set.
+      tasks: number of tasks of the new set.
     """
-    scores = tt.score(agents.load("base"), sets=["base", "mirrored"], tasks=tasks)
+    scores = tt.score(agents.load("fast-base"), sets=["base", "mirrored"], tasks=tasks)
     print(scores)
     return scores
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -1,6 +1,6 @@
-"""A set that any agent learns in seconds: two steps to the right to the food.
+"""A task set that any agent learns in seconds: the food is two steps to the right.
 
-Importing registers it.
+Importing this module registers the set.
 """
 
 import trap_tube_jax as tt

@@ -1,12 +1,13 @@
 """Trains rejax's PPO and scores it; needs the extra `interop`.
 
-python -m agents.examples.rejax_agent
+python -m agents.examples.rejax_agent --help
 """
 
 from collections.abc import Callable
 
 import jax
 import rejax  # pyright: ignore[reportMissingImports]
+import tyro
 
 import trap_tube_jax as tt
 from agents.examples.near_food import NEAR_FOOD
@@ -14,30 +15,30 @@ from trap_tube_jax.adapters import to_gymnax
 
 
 class Policy:
-    """An agent of rejax as `tt.score` plays it: two pure functions of many episodes.
+    """Adapts an agent of rejax to `tt.score`.
 
     Args:
-      act: from one observation u8[12, 12, N] and a key to 4 * grasp + move.
+      act: maps one observation u8[12, 12, N] and a key to 4 * grasp + move.
     """
 
     def __init__(self, act: Callable[[jax.Array, jax.Array], jax.Array]):
         self._act = act
 
     def initial(self, batch: int) -> tuple[()]:
-        """Nothing is remembered."""
+        """Returns no memory."""
         del batch
         return ()
 
     def act(
         self, observation: jax.Array, carry: tuple[()], key: jax.Array
     ) -> tuple[jax.Array, tuple[()]]:
-        """The actions i32[B, 2] for observations u8[B, 12, 12, N]."""
+        """Returns actions i32[B, 2] for observations u8[B, 12, 12, N]."""
         index = jax.vmap(self._act)(observation, jax.random.split(key, len(observation)))
         return tt.action_from_index(index), carry
 
 
 def main(total_timesteps: int = 8_192) -> tt.Scores:
-    """Trains on the food nearby; scores there and, for what it has not learnt, on base.
+    """Trains where food is near, and scores there and on base, which was not trained.
 
     Args:
       total_timesteps: environment steps of training.
@@ -61,4 +62,4 @@ def main(total_timesteps: int = 8_192) -> tt.Scores:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

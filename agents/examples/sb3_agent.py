@@ -1,10 +1,11 @@
 """Trains Stable-Baselines3's PPO and scores it; needs the extra `interop`.
 
-python -m agents.examples.sb3_agent
+python -m agents.examples.sb3_agent --help
 """
 
 import stable_baselines3  # pyright: ignore[reportMissingImports]
 import torch  # pyright: ignore[reportMissingImports]
+import tyro
 
 import trap_tube_jax as tt
 from agents.examples.near_food import NEAR_FOOD
@@ -12,12 +13,12 @@ from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv
 
 
 def main(total_timesteps: int = 3_000) -> tt.Scores:
-    """Trains on the food nearby; scores there and, for what it has not learnt, on base.
+    """Trains where food is near, and scores there and on base, which was not trained.
 
     Args:
       total_timesteps: environment steps of training.
     """
-    torch.set_num_threads(1)  # its threads and JAX's would wait for each other
+    torch.set_num_threads(1)  # otherwise its threads and JAX's wait for each other
     env = TrapTubeEnv(NEAR_FOOD.id)
     model = stable_baselines3.PPO(
         "MlpPolicy", env, n_steps=256, batch_size=64, learning_rate=1e-3, seed=0, device="cpu"
@@ -29,4 +30,4 @@ def main(total_timesteps: int = 3_000) -> tt.Scores:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -1,5 +1,9 @@
 """The programs in `agents/examples`, at small sizes."""
 
+import re
+import runpy
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,17 +13,28 @@ import trap_tube_jax as tt
 from agents.acting.episodes import Episodes
 from agents.curiosity import Experience
 from agents.examples import custom_curiosity, custom_transfer, oracle
+from paths import ROOT
+from small_runs import small_config
 
-SMALL = {
-    "episodes_per_iteration": 8,
-    "minibatch_size": 8,
-    "epochs": 1,
-    "max_steps": 20,
-    "filters": (2, 2),
-    "hidden": 4,
-    "embedding": 2,
-    "encode_chunk_size": 8,
-}
+EXAMPLES = [
+    path
+    for path in sorted((ROOT / "agents" / "examples").glob("*.py"))
+    if "__main__" in path.read_text()
+]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_help_explains_the_options_and_runs_nothing(path, capsys, monkeypatch, own_task_sets):
+    for library in re.findall(r"^import (rejax|stable_baselines3)", path.read_text(), re.M):
+        pytest.importorskip(library)
+    monkeypatch.setattr(sys, "argv", [path.stem, "--help"])
+    with pytest.raises(SystemExit) as error:
+        runpy.run_path(str(path), run_name="__main__")
+    shown = capsys.readouterr().out
+    assert error.value.code == 0
+    assert "usage" in shown
+    assert "iteration " not in shown
+    assert "| set" not in shown
 
 
 def test_a_custom_curiosity_pays_moves_of_the_tool():
@@ -37,7 +52,8 @@ def test_a_custom_curiosity_pays_moves_of_the_tool():
 
 @pytest.mark.slow
 def test_a_custom_curiosity_is_trained_with(capsys):
-    state, metrics = custom_curiosity.main(iterations=2, **SMALL)
+    config = small_config(curiosity="tool-moves", max_steps=20)
+    state, metrics = custom_curiosity.train(config, iterations=2)
     assert state.memory > 0
     assert metrics["intrinsic_reward"] > 0
     assert capsys.readouterr().out.count("moves of the tool") == 2
