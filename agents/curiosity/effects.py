@@ -76,5 +76,6 @@ def new_grasps(episodes: Episodes) -> jax.Array:
     on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
     hand = jnp.clip(hand, 0, BOARD_SIZE - 1)
     time, episode = np.indices(hand.shape[:2], np.int32)
-    color = episodes.observations()[time, episode, hand[..., 0], hand[..., 1]]
-    return first_visits(jnp.where(on_board, hash_rows(color), OFF_BOARD)) * on_board
+    color = hash_rows(episodes.observations()[time, episode, hand[..., 0], hand[..., 1]])
+    is_new = first_visits(jnp.where(on_board, color, OFF_BOARD))
+    return jnp.where(on_board, is_new, 0.0)

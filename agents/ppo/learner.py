@@ -153,7 +153,7 @@ class Learner:
         params, opt_state, update_metrics = self.update(state, batch, update_key)
 
         solved = self.axis.gather(trajectory.episodes.solved)
-        steps = jnp.sum(self.axis.gather(trajectory.episodes.length))
+        steps = jnp.sum(self.axis.gather(trajectory.episodes.length), dtype=jnp.int32)
         metrics = {**self.play_metrics(batch, intrinsic_reward, solved), **update_metrics}
         metrics["is_finite"] = _is_finite((params, metrics))
         next_state = TrainState(

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config
+from agents import Config, make_train
 from agents.acting.episodes import Episodes
 from agents.curiosity import Curiosity, Experience
 from agents.curiosity.e3b import elliptical_bonus
 from agents.networks import make_encoder
 from agents.networks.layers import draw
 from agents.registry import curiosities
+from small_runs import small_config
 
 SETTINGS = Config(env_id="sy", filters=(2, 3), hidden=4, embedding=2).to_dict()
 BOARD = jnp.zeros((1, 12, 12, 3), jnp.uint8)
@@ -145,3 +146,22 @@ def test_copies_are_equal(name):
         assert hash(copied) == hash(curiosity)
     others = [make(other) for other in curiosities if other != name]
     assert curiosity not in others
+
+
+@pytest.fixture(params=[("jax_enable_x64", True), ("jax_numpy_dtype_promotion", "strict")])
+def config_of_jax(request):
+    name, value = request.param
+    before = getattr(jax.config, name)
+    jax.config.update(name, value)
+    yield
+    jax.config.update(name, before)
+
+
+@pytest.mark.parametrize("name", ["icm", "e3b", "effects", "counts"])
+def test_training_keeps_its_types_whatever_users_set(name, config_of_jax):
+    """Nothing is computed, only traced."""
+    learner = make_train(small_config(curiosity=name, env_id="sy"))
+    state = jax.eval_shape(learner.init, jax.random.key(0))
+    after, metrics = jax.eval_shape(learner.iterate, state)
+    assert after == state
+    assert {metric.dtype for metric in metrics.values()} == {np.dtype(np.float32)}
