@@ -23,7 +23,10 @@ SUFFIX = ".safetensors"
 
 def save_policy(path: Path, policy: Policy) -> None:
     """Writes the parameters and settings of a policy, atomically; its name is not stored."""
-    header = {"config": json.dumps(policy.config.to_dict()), "iteration": str(policy.iteration)}
+    # One entry, because safetensors writes several in any order.
+    header = {
+        "policy": json.dumps({"config": policy.config.to_dict(), "iteration": policy.iteration})
+    }
     params = {part: policy.params[part] for part in PARTS}
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -42,8 +45,8 @@ def load_policy(path: Path) -> Policy:
     """
     header, arrays = _read(path)
     try:
-        config = Config.from_dict(json.loads(header["config"]))
-        iteration = int(header["iteration"])
+        values = json.loads(header["policy"])
+        config, iteration = Config.from_dict(values["config"]), int(values["iteration"])
         template = jax.eval_shape(Agent(config).init, jax.random.key(0))
         params = from_arrays(arrays, template)
     except (KeyError, TypeError, ValueError, RecursionError) as error:

@@ -12,7 +12,6 @@ from easy import assert_same
 from tiny_policy import CONFIG, random_policy
 
 POLICY = random_policy()
-HEADER = {"config": json.dumps(CONFIG.to_dict()), "iteration": "1"}
 ARRAYS = to_arrays(POLICY.params)
 
 
@@ -26,34 +25,36 @@ def test_a_stored_policy_is_the_same(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def config(**settings):
-    return {**HEADER, "config": json.dumps({**CONFIG.to_dict(), **settings})}
+def header(iteration=1, **settings):
+    values = {"config": {**CONFIG.to_dict(), **settings}, "iteration": iteration}
+    return {"policy": json.dumps(values)}
 
 
 @pytest.mark.parametrize(
-    ("header", "changes", "message"),
+    ("stored", "changes", "message"),
     [
-        ({}, {}, "does not hold a policy of this version: 'config'"),
-        ({**HEADER, "config": "{"}, {}, "does not hold a policy of this version"),
-        ({**HEADER, "config": "[]"}, {}, "does not hold a policy of this version"),
-        ({**HEADER, "config": "[" * 100_000}, {}, "does not hold a policy of this version"),
-        ({**HEADER, "iteration": "x"}, {}, "does not hold a policy of this version"),
-        (config(clip=0.2), {}, "unknown setting 'clip'"),
-        (config(hidden=5), {}, r"core/params/bias is float32\[2, 12\], not float32\[2, 15\]"),
-        (config(encoder="own"), {}, "unknown encoder 'own'.*--import MODULE"),
-        (HEADER, {"heads/params/more": np.ones(1)}, "heads/params/more is not expected"),
-        (HEADER, {"heads/params/value/bias": None}, "heads/params/value/bias is missing"),
+        ({}, {}, "does not hold a policy of this version: 'policy'"),
+        *(
+            ({"policy": text}, {}, "does not hold a policy of this version")
+            for text in ("{", "[]", '{"config": []}', "[" * 100_000)
+        ),
+        (header(iteration="x"), {}, "does not hold a policy of this version"),
+        (header(clip=0.2), {}, "unknown setting 'clip'"),
+        (header(hidden=5), {}, r"core/params/bias is float32\[2, 12\], not float32\[2, 15\]"),
+        (header(encoder="own"), {}, "unknown encoder 'own'.*--import MODULE"),
+        (header(), {"heads/params/more": np.ones(1)}, "heads/params/more is not expected"),
+        (header(), {"heads/params/value/bias": None}, "heads/params/value/bias is missing"),
         (
-            HEADER,
+            header(),
             {"heads/params/value/bias": np.array([np.nan], np.float32)},
             "parameters that are not finite: heads/params/value/bias",
         ),
     ],
 )
-def test_files_of_other_content_are_refused(header, changes, message, tmp_path):
+def test_files_of_other_content_are_refused(stored, changes, message, tmp_path):
     path = tmp_path / "mine.safetensors"
     arrays = {name: array for name, array in {**ARRAYS, **changes}.items() if array is not None}
-    path.write_bytes(safetensors.numpy.save(arrays, header))
+    path.write_bytes(safetensors.numpy.save(arrays, stored))
     with pytest.raises(ValueError, match=message) as error:
         load_policy(path)
     assert str(path) in str(error.value)
