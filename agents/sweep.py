@@ -109,12 +109,14 @@ def launch(
                 failed += [] if outcome == "done" else [path]
                 if outcome.startswith("failed"):
                     _say(console, _tail(log_of(path)))
-        except KeyboardInterrupt:
+        except BaseException:  # not even the current iteration is waited for
+            stop_file.touch()
+            for call in calls:
+                call.cancel()
             for process in multiprocessing.active_children():
                 process.kill()
             raise
-        finally:
-            stop_file.unlink(missing_ok=True)
+    stop_file.unlink(missing_ok=True)
     if stop.received:
         raise Stopped(stop.received)
     return failed

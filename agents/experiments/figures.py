@@ -16,10 +16,6 @@ WIDTH = 8.3  # inches, as in a page 830 pixels wide
 DPI = 150
 # Okabe and Ito's palette, told apart by all kinds of colour vision.
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
-STYLE: Any = {
-    **{"font.size": 9, "figure.labelsize": 9, "axes.titlesize": 9},
-    **{"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True},
-}
 
 
 def save(root: Path, results: Frame, curves: Frame, about: Mapping[str, Any]) -> list[Path]:
@@ -28,35 +24,26 @@ def save(root: Path, results: Frame, curves: Frame, about: Mapping[str, Any]) ->
     Returns:
       The files.
     """
-    import matplotlib as mpl  # noqa: PLC0415  slow to import
-
     names, tested = list(curves["algorithm"].unique()), tables.reported(results)
     drawn = {}
-    with mpl.rc_context(STYLE):
-        if len(names) <= len(COLORS):
-            drawn["curves.png"] = draw_curves(results, curves, about)
-        if len(tested):
-            drawn["success.png"] = draw_success(tested, about)
-        for name, figure in drawn.items():
-            figure.savefig(root / name, dpi=DPI)
+    if len(names) <= len(COLORS):
+        drawn["curves.png"] = draw_curves(results, curves, about)
+    if len(tested):
+        drawn["success.png"] = draw_success(tested, about)
+    for name, figure in drawn.items():
+        figure.savefig(root / name, dpi=DPI)
     return [root / name for name in drawn]
 
 
 def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
-    """Draws percent solved over episodes: in training, and greedily on each set."""
-    curves = curves.sort_values("iteration")
+    """Draws percent solved over iterations: in training, and greedily on each set."""
     own = about["train_set"]
     panels = {
         "training": curves.assign(value=curves["success"]),
         f"greedy, {label(own)}": curves.assign(value=curves["evaluation"]),
     }
-    per_iteration = curves["episodes"] / curves["iteration"]
-    rate = per_iteration.groupby(curves["algorithm"]).mean()
     greedy = results[results["purpose"] == "validation"]
-    greedy = greedy.assign(
-        episodes=greedy["iteration"] * greedy["algorithm"].map(rate),
-        value=greedy["solved"] / greedy["tasks"],
-    )
+    greedy = greedy.assign(value=greedy["solved"] / greedy["tasks"])
     for name, rows in greedy.groupby("task_set", sort=False):
         if name != own and rows.groupby(["algorithm", "seed"]).size().min() > 1:
             panels[f"greedy, {label(str(name))}"] = rows
@@ -65,10 +52,9 @@ def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
         for color, name in zip(COLORS, curves["algorithm"].unique(), strict=False):
             _draw_seeds(axis, rows[rows["algorithm"] == name], color, str(name))
         axis.set_ylim(-3, 103)
-        axis.xaxis.set_major_formatter(_thousands)
     for axis in axes[-min(3, len(axes)) :]:
-        axis.set_xlabel("episodes")
-    figure.supylabel("solved, %")
+        axis.set_xlabel("iterations")
+    figure.supylabel("solved, %", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -94,7 +80,7 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
         axis.set_xticks([0, 50, 100])
     axes[0].set_yticks(range(len(names)), names)
     axes[0].set_ylim(len(names) - 0.5, -0.5)
-    figure.supxlabel("test tasks solved, %: mean, and a point per seed")
+    figure.supxlabel("test tasks solved, %: mean, and a point per seed", fontsize=10)
     return figure
 
 
@@ -111,14 +97,16 @@ def _panels(
     for axis in axes[len(titles) :]:
         axis.remove()
     for axis, name in zip(axes, titles, strict=False):
-        axis.set_title(name)
+        axis.set_title(name, fontsize=10)
+        axis.grid(alpha=0.3)
+        axis.set_axisbelow(True)
         axis.tick_params(labelbottom=True)
     return figure, axes[: len(titles)]
 
 
 def _draw_seeds(axis: Any, rows: Frame, color: str, name: str) -> None:
     """Draws a line per seed, and the mean of several that all end together."""
-    values = 100 * rows.pivot_table(index="episodes", columns="seed", values="value")
+    values = 100 * rows.pivot_table(index="iteration", columns="seed", values="value")
     with_mean = values.shape[1] > 1 and bool(values.iloc[-1].notna().all())
     for count, seed in enumerate(values):
         own = values[seed].dropna()
@@ -127,7 +115,3 @@ def _draw_seeds(axis: Any, rows: Frame, color: str, name: str) -> None:
     if with_mean:
         mean = values.dropna().mean(axis=1)
         axis.plot(mean.index, mean, color=color, linewidth=1.8, label=name)
-
-
-def _thousands(value: float, _: int) -> str:
-    return f"{value / 1000:g}k" if value else "0"

@@ -120,15 +120,10 @@ class Grid:
             raise ValueError(f"the grid's points decide {', '.join(fixed)}; use --only")
         common = {**self.settings, **({} if options.env is None else {"env_id": options.env})}
         configs = {}
-        for name, *texts in itertools.product(self.points, *given.values()):
-            chosen = {k: given[k][text] for k, text in zip(given, texts, strict=True)}
+        for name, *labels in itertools.product(self.points, *given.values()):
+            chosen = {k: given[k][each] for k, each in zip(given, labels, strict=True)}
             config = Config.preset(options.preset, **{**common, **chosen, **self.points[name]})
-            varied = [
-                f"{k}={text.strip('[]').replace(',', 'x')}"
-                for k, text in zip(given, texts, strict=True)
-                if len(given[k]) > 1
-            ]
-            point = ",".join(filter(None, [name, *varied])) or options.preset
+            point = ",".join(filter(None, [name, *labels])) or options.preset
             configs[point] = dataclasses.replace(config, env_id=tt.task_set(config.env_id).id)
         for name in options.only:
             if name not in configs:
@@ -140,11 +135,13 @@ class Grid:
 
 
 def _parse(text: str) -> tuple[str, dict[str, Any]]:
-    """Reads NAME=VALUE,VALUE; returns the name, and by their text the values."""
+    """Reads NAME=VALUE,VALUE; returns the name and its values by their part of a point's name."""
     name, _, values = text.partition("=")
     if not values:
         raise ValueError(f"give settings as NAME=VALUE,VALUE, got {text!r}")
-    return name, {each: _value(each) for each in COMMA.split(values)}
+    if len(texts := COMMA.split(values)) == 1:
+        return name, {"": _value(values)}
+    return name, {f"{name}={each.strip('[]').replace(',', 'x')}": _value(each) for each in texts}
 
 
 def _value(text: str) -> Any:

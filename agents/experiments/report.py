@@ -5,8 +5,8 @@ grid.json (title, command, settings that all runs share, machines). table.md and
 functions of these three, so that a folder of results is drawn again from them alone.
 """
 
+import itertools
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +14,13 @@ import pandas as pd
 
 import agents
 from agents.experiments import figures, tables
-from agents.runs.folder import RunFolder, read_json, write_json, write_text
+from agents.runs.folder import read_json, write_json, write_text
 from agents.runs.results import find_runs, metrics
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.registry import task_set
 
-CURVES = (
-    *("algorithm", "seed", "iteration", "episodes", "transitions", "seconds"),
-    *("success", "evaluation"),
-)
+COUNTS = ["iteration", "episodes", "transitions", "seconds"]
+CURVES = ["algorithm", "seed", *COUNTS, "success", "evaluation"]
 WIDTH = 80
 
 
@@ -35,9 +33,10 @@ def collect(root: Path, command: str) -> None:
     results, curves, folders = agents.results(root), metrics(root), find_runs(root)
     results["run"] = results["run"].map(lambda path: Path(path).name)
     results.to_csv(root / "results.csv", index=False)
-    curves[list(CURVES)].to_csv(root / "curves.csv", index=False)
+    curves[CURVES].to_csv(root / "curves.csv", index=False)
     configs = [read_json(folder.config)["config"] for folder in folders]
-    first = configs[0]
+    noted = [read_json(folder.provenance) for folder in folders if folder.provenance.exists()]
+    machines, first = list(itertools.chain(*noted)), configs[0]
     train_set = task_set(first["env_id"])
     about = {
         "title": f"{root.name}: trained on {train_set.label}",
@@ -45,7 +44,7 @@ def collect(root: Path, command: str) -> None:
         "train_set": train_set.short,
         "threshold": first["stop_when_solved"] or 1.0,
         "settings": {k: v for k, v in first.items() if all(own[k] == v for own in configs)},
-        "machines": _machines(folders),
+        "machines": [each for place, each in enumerate(machines) if each not in machines[:place]],
     }
     write_json(root / "grid.json", about)
 
@@ -69,16 +68,6 @@ def write(root: Path) -> str:
     ]
     files = [str(path) for path in (root / "results.csv", root / "table.md", *drawn)]
     return "\n\n".join([*shown, "\n".join(files)])
-
-
-def _machines(folders: Iterable[RunFolder]) -> list[dict[str, Any]]:
-    found = [
-        each
-        for folder in folders
-        if folder.provenance.exists()
-        for each in read_json(folder.provenance)
-    ]
-    return [each for place, each in enumerate(found) if each not in found[:place]]
 
 
 def _machine(machine: dict[str, Any]) -> str:

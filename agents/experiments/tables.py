@@ -88,16 +88,18 @@ def training_table(curves: Frame, threshold: float, with_paper: bool) -> Frame:
 
 def success_table(tested: Frame, with_paper: bool) -> Frame:
     """Returns percent solved: a row per set, a column per algorithm."""
+    layouts = (
+        tested.groupby(["algorithm", "task_set"])[["layouts", "layouts_total"]].mean().dropna()
+    )
     columns: dict[Any, dict[str, str]] = {}
     for name, own in by_set(tested).groupby("algorithm", sort=False):
-        rows = tested[tested["algorithm"] == name].groupby("task_set")
-        layouts = {each: layouts_text(found) for each, found in rows}
-        columns[name] = {
-            each: f"{values.mean():.1f} ({layouts[each]})"
-            if layouts.get(each)
-            else mean_text(values.to_numpy(), ".1f", high=100)
-            for each, values in own.items()
-        }
+        columns[name] = {}
+        for each, values in own.items():
+            text = mean_text(values.to_numpy(), ".1f", high=100)
+            if (name, each) in layouts.index:
+                solved, total = layouts.loc[(name, each)]
+                text = f"{values.mean():.1f} ({solved:.3g} of {total:g})"
+            columns[name][each] = text
     for name, paper in PAPER_SUCCESS.items() if with_paper else ():
         columns[name] = {
             each: f"{mean:.1f} ± {sd:.1f}" if sd else f"{mean:.1f}"
@@ -141,12 +143,6 @@ def mean_text(values: Any, form: str, high: float = np.inf) -> str:
 def margin_of(values: Any) -> Any:
     """Returns half the width of the 95 % interval of the mean over the first axis, of 2 or more."""
     return stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
-
-
-def layouts_text(rows: Frame) -> str:
-    """Returns the layouts solved of few, mean over seeds; empty for a set of many."""
-    solved, total = rows["layouts"].mean(), rows["layouts_total"].mean()
-    return "" if np.isnan(total) else f"{solved:.3g} of {total:g}"
 
 
 def markdown(table: Frame) -> str:

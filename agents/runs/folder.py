@@ -117,7 +117,6 @@ class RunFolder:
       curves: learning curves, PNG.
       page: the report, HTML.
       animation: a solved episode, GIF.
-      log: output of a run that a sweep trained.
     """
 
     def __init__(self, path: Path):
@@ -131,7 +130,6 @@ class RunFolder:
         self.curves = path / "curves.png"
         self.page = path / "report.html"
         self.animation = path / "solved.gif"
-        self.log = path / "log.txt"
 
     def best(self, seed: int) -> Path:
         """Returns the file of a seed's parameters with the best evaluation so far."""

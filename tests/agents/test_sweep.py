@@ -29,16 +29,13 @@ SETTINGS = [
 
 
 def launch(monkeypatch, tmp_path, train_run, names=("a", "b", "c")):
-    """Launches runs in threads; returns the failed ones' names and what was printed."""
+    """Launches runs in a thread; returns the failed ones' names and what was printed."""
     monkeypatch.setattr(workers, "train_run", train_run)
     console = Console(record=True, width=60)
     runs = {tmp_path / name: Run(Config()) for name in names}
-    try:
-        with ThreadPoolExecutor(1) as executor:
-            failed = sweep.launch(runs, RunOptions(), executor, console)
-        return [path.name for path in failed], console.export_text()
-    finally:
-        assert not (tmp_path / ".stop").exists()
+    with ThreadPoolExecutor(1) as executor:
+        failed = sweep.launch(runs, RunOptions(), executor, console)
+    return [path.name for path in failed], console.export_text()
 
 
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
@@ -58,20 +55,25 @@ def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
     assert "line 3 [bold]" not in shown
 
 
-def test_a_signal_stops_all_runs_and_starts_no_more(monkeypatch, tmp_path):
+@pytest.mark.parametrize("signals", [1, 2])
+def test_a_signal_stops_all_runs_and_a_second_one_at_once(monkeypatch, tmp_path, signals):
     begun = []
 
     def train_run(path, run, options, *, console, stop_file):
         del run, options, console
         begun.append(path.name)
-        os.kill(os.getpid(), signal.SIGTERM)  # asks the launcher, in the main thread
-        while not stop_file.exists():
-            pass
+        for _ in range(signals):
+            os.kill(os.getpid(), signal.SIGTERM)  # asks the launcher, in the main thread
+            while not stop_file.exists():
+                pass
         raise Stopped(signal.SIGTERM)
 
-    with pytest.raises(Stopped) as stopped:
+    with pytest.raises(Stopped if signals == 1 else KeyboardInterrupt):
         launch(monkeypatch, tmp_path, train_run)
-    assert (begun, stopped.value.signal) == (["a"], signal.SIGTERM)
+    assert begun == ["a"]
+    assert (tmp_path / ".stop").exists() == (signals == 2), "else a late process would train"
+    launch(monkeypatch, tmp_path, lambda path, *_, **__: begun.append(path.name))
+    assert begun == ["a", "a", "b", "c"]
 
 
 @pytest.mark.parametrize(

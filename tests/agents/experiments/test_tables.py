@@ -96,9 +96,8 @@ def test_training_is_summed_up_with_the_papers_trials():
 def test_runs_that_have_tested_nothing_yet_have_a_table_and_curves(tmp_path):
     nothing = pd.DataFrame(rows("ppo", [1], purpose="validation"))
     assert list(tables.tables(nothing, curves(), ABOUT)) == ["Training"]
-    assert [path.name for path in figures.save(tmp_path, nothing, curves(), ABOUT)] == [
-        "curves.png"
-    ]
+    (path,) = figures.save(tmp_path, nothing, curves(), ABOUT)
+    assert path.name == "curves.png"
 
 
 def test_curves_are_of_seeds_and_their_mean_only_where_all_end_together():
@@ -108,11 +107,9 @@ def test_curves_are_of_seeds_and_their_mean_only_where_all_end_together():
     )
     figure = figures.draw_curves(results, curves(evaluations=((0, 1), (0, 0.5))), ABOUT)
     training, greedy, p = figure.axes
-    assert [axis.get_title() for axis in figure.axes] == [
-        *("training", "greedy, {P, St, Sy}", "greedy, {P}")
-    ]
+    assert [axis.get_title() for axis in figure.axes[1:]] == ["greedy, {P, St, Sy}", "greedy, {P}"]
     assert greedy.lines[-1].get_ydata().tolist() == [0, 75]
-    assert p.lines[-1].get_xydata().tolist() == [[100, 35], [200, 65]]
+    assert p.lines[-1].get_xydata().tolist() == [[1, 35], [2, 65]]
     assert len(training.lines) == 3
     uneven = figures.draw_curves(results, curves(), ABOUT)
     assert [len(line.get_xdata()) for line in uneven.axes[0].lines] == [2, 3]
@@ -140,10 +137,6 @@ def test_the_pages_have_the_tables_of_the_records(record, page, tmp_path):
     _, _, table = (copy / "table.md").read_text().partition("**Test tasks solved, %**\n\n")
     assert table.partition("\n\n")[0] in (RESULTS / page).read_text()
     assert max(map(len, shown.splitlines()[:-5])) <= report.WIDTH
-
-
-def test_every_record_is_on_a_page():
-    assert {path.parent.name for path in RESULTS.glob("*/results.csv")} == set(PAGES)
 
 
 @pytest.mark.parametrize(("agent", "record"), [("best", "exp2_best"), ("fast", "fast_base")])
