@@ -1,5 +1,6 @@
-"""A board on which random actions succeed soon, and how to compare states."""
+"""A board on which random actions succeed soon, comparison of states, and 64-bit types."""
 
+import importlib
 from typing import Any
 
 import chex
@@ -11,6 +12,12 @@ import trap_tube_jax as tt
 
 EASY = tt.State.from_ascii(["TA.F........", *["." * 12] * 11])
 RIGHT, DOWN = jnp.array((3, 3)), jnp.array((3, 1))
+
+
+def enable_x64(enabled: bool) -> Any:
+    """The context manager of this name, which JAX before 0.8 keeps elsewhere."""
+    home: Any = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")
+    return home.enable_x64(enabled)
 
 
 def rows(tree: Any, index: Any) -> Any:

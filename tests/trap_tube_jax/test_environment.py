@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import DOWN, EASY, RIGHT, assert_same, rows
+from easy import DOWN, EASY, RIGHT, assert_same, enable_x64, rows
 from refusal import assert_refused
 
 OPTIMISED = False  # few steps
@@ -270,7 +270,7 @@ def test_other_numbers_are_no_directions():
     for number in WIDE:
         np.testing.assert_array_equal(tt.action_from_index(number), [-1, -1])
         assert tt.action_to_index(np.stack([number, 0 * number])) == -1
-        with jax.enable_x64(True):
+        with enable_x64(True):
             np.testing.assert_array_equal(jax.jit(tt.action_from_index)(number), [-1, -1])
             state, _ = step(tt.base_state(), np.stack([0 * number, number]))
             np.testing.assert_array_equal(state.agent, tt.base_state().agent)

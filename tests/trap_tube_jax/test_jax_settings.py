@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same
+from easy import assert_same, enable_x64
 
 OPTIMISED = False  # few steps
 TRANSFERS = (
@@ -52,7 +52,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "no NaN": {"jax_debug_nans": True},
 }
 CONTEXTS = {
-    "jax_enable_x64": jax.enable_x64,
+    "jax_enable_x64": enable_x64,
     "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
     "jax_debug_key_reuse": jax.debug_key_reuse,
     "jax_debug_nans": jax.debug_nans,
@@ -66,6 +66,8 @@ def expected() -> Any:
 
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
 def test_the_same_episodes(expected, settings):
+    if "jax_numpy_dtype_promotion" in settings and jax.__version_info__ < (0, 8):
+        pytest.skip("indexing with numbers of several types promotes them inside JAX 0.7")
     with contextlib.ExitStack() as stack:
         for name, value in settings.items():
             stack.enter_context(CONTEXTS[name](value))
