@@ -103,6 +103,8 @@ class Grid:
                 check_name(path.name)
                 if RunFolder(path).config.is_file():
                     run.check_continues(RunFolder.open(path)[1])
+                else:
+                    RunFolder(path).check_free()
                 runs[path] = run
         return runs
 

@@ -166,8 +166,10 @@ class RunFolder:
         """Checks that a new run can be created here.
 
         Raises:
-          ValueError: the folder holds something already.
+          ValueError: the folder holds something already, or Orbax could not restore from it.
         """
+        if "[" in str(self.path.absolute()):  # Orbax would take it for a pattern
+            raise ValueError(f"the path of a run must not contain '[', got {self.path.absolute()}")
         if self.config.is_file():
             raise ValueError(
                 f"{self.path} holds a run; continue it with --resume {self.path}, or give "

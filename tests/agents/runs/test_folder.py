@@ -60,6 +60,7 @@ def test_a_folder_holds_one_run(tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").touch()
     assert_refused(["is taken, and holds no run"], RunFolder(tmp_path / "other").check_free)
+    assert_refused(["must not contain '['"], RunFolder(tmp_path / "[1]" / "x").check_free)
     assert_refused(["none holds no run; runs in", "x"], RunFolder.open, tmp_path / "none")
 
 
