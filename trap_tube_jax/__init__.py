@@ -1,80 +1,116 @@
-"""The trap-tube task of tool use as a functional, vectorised JAX gridworld."""
+"""The trap-tube task of tool use as a functional, vectorised JAX gridworld.
 
-import contextlib
+    import jax
+    import trap_tube_jax as tt
+
+    env = tt.make("PerceptualTrapTube-v0")
+    state, timestep = env.reset(jax.random.key(0))
+    print(tt.render_ascii(state))
+    for action in tt.solve(state).actions:  # pairs (grasp, move): 0 up, 1 down, 2 left, 3 right
+        state, timestep = env.step(state, action)
+    print(timestep.reward, timestep.terminated)
+
+`help(trap_tube_jax.make)` explains a name. Functions are pure and unbatched: jit, vmap and scan
+them.
+
+    task sets      make, task_set, register, registered_ids, TaskSet, PAPER_TASK_SETS,
+                   CONTROL_TASK_SETS
+    environments   Environment, ArraySpec, AutoReset, EpisodeStatistics, VectorEnvironment,
+                   VectorState, action_from_index, action_to_index
+    states         State, TimeStep, base_state, base_palette, validate
+    transfers      perceptual, structural, symbolic, graded_perceptual, graded_structural,
+                   compose, Transfer
+    observations   observe, visible_objects
+    pictures       render, render_ascii, episode_frames, save_gif
+    oracle         solve, solve_batch, Plan, distances, Distances
+    scores         score, score_gymnasium, Score, Scores, evaluation_tasks
+
+Pages in this folder: environment.md, own_tasks.md, graded.md, controls.md, protocol.md.
+"""
+
 import importlib
+import sys
+import types
+import typing
+import warnings
 
 from trap_tube_jax._version import __version__ as __version__
-from trap_tube_jax.environment import (
-    ArraySpec,
-    Environment,
-    action_from_index,
-    action_to_index,
-)
-from trap_tube_jax.graded import graded_perceptual, graded_structural
-from trap_tube_jax.objects import base_palette
-from trap_tube_jax.observation import observe, render_ascii, visible_objects
-from trap_tube_jax.registry import (
-    CONTROL_TASK_SETS,
-    PAPER_TASK_SETS,
-    TaskSet,
-    make,
-    register,
-    registered_ids,
-    task_set,
-)
-from trap_tube_jax.rendering import render, save_gif
-from trap_tube_jax.scoring.benchmark import score, score_gymnasium
-from trap_tube_jax.scoring.scores import Score, Scores
-from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
-from trap_tube_jax.state import State, TimeStep, base_state, validate
-from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
-from trap_tube_jax.vector import VectorEnvironment, VectorState
-from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
+from trap_tube_jax.environment import ArraySpec as ArraySpec
+from trap_tube_jax.environment import Environment as Environment
+from trap_tube_jax.environment import action_from_index as action_from_index
+from trap_tube_jax.environment import action_to_index as action_to_index
+from trap_tube_jax.graded import graded_perceptual as graded_perceptual
+from trap_tube_jax.graded import graded_structural as graded_structural
+from trap_tube_jax.objects import base_palette as base_palette
+from trap_tube_jax.observation import observe as observe
+from trap_tube_jax.observation import render_ascii as render_ascii
+from trap_tube_jax.observation import visible_objects as visible_objects
+from trap_tube_jax.registry import CONTROL_TASK_SETS as CONTROL_TASK_SETS
+from trap_tube_jax.registry import PAPER_TASK_SETS as PAPER_TASK_SETS
+from trap_tube_jax.registry import TaskSet as TaskSet
+from trap_tube_jax.registry import make as make
+from trap_tube_jax.registry import register as register
+from trap_tube_jax.registry import registered_ids as registered_ids
+from trap_tube_jax.registry import task_set as task_set
+from trap_tube_jax.rendering import episode_frames as episode_frames
+from trap_tube_jax.rendering import render as render
+from trap_tube_jax.rendering import save_gif as save_gif
+from trap_tube_jax.scoring.benchmark import score as score
+from trap_tube_jax.scoring.benchmark import score_gymnasium as score_gymnasium
+from trap_tube_jax.scoring.scores import Score as Score
+from trap_tube_jax.scoring.scores import Scores as Scores
+from trap_tube_jax.scoring.tasks import evaluation_tasks as evaluation_tasks
+from trap_tube_jax.solver import Distances as Distances
+from trap_tube_jax.solver import Plan as Plan
+from trap_tube_jax.solver import distances as distances
+from trap_tube_jax.solver import solve as solve
+from trap_tube_jax.solver import solve_batch as solve_batch
+from trap_tube_jax.state import State as State
+from trap_tube_jax.state import TimeStep as TimeStep
+from trap_tube_jax.state import base_state as base_state
+from trap_tube_jax.state import validate as validate
+from trap_tube_jax.transfers import Transfer as Transfer
+from trap_tube_jax.transfers import compose as compose
+from trap_tube_jax.transfers import perceptual as perceptual
+from trap_tube_jax.transfers import structural as structural
+from trap_tube_jax.transfers import symbolic as symbolic
+from trap_tube_jax.vector import VectorEnvironment as VectorEnvironment
+from trap_tube_jax.vector import VectorState as VectorState
+from trap_tube_jax.wrappers import AutoReset as AutoReset
+from trap_tube_jax.wrappers import EpisodeStatistics as EpisodeStatistics
 
-# Gymnasium's convention: importing a package registers its environments. Needs Gymnasium >= 1.1.
-with contextlib.suppress(ImportError):
-    importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
 
-__all__ = [
-    "CONTROL_TASK_SETS",
-    "PAPER_TASK_SETS",
-    "ArraySpec",
-    "AutoReset",
-    "Distances",
-    "Environment",
-    "EpisodeStatistics",
-    "Plan",
-    "Score",
-    "Scores",
-    "State",
-    "TaskSet",
-    "TimeStep",
-    "Transfer",
-    "VectorEnvironment",
-    "VectorState",
-    "action_from_index",
-    "action_to_index",
-    "base_palette",
-    "base_state",
-    "compose",
-    "distances",
-    "graded_perceptual",
-    "graded_structural",
-    "make",
-    "observe",
-    "perceptual",
-    "register",
-    "registered_ids",
-    "render",
-    "render_ascii",
-    "save_gif",
-    "score",
-    "score_gymnasium",
-    "solve",
-    "solve_batch",
-    "structural",
-    "symbolic",
-    "task_set",
-    "validate",
-    "visible_objects",
-]
+def _register_with_gymnasium() -> None:
+    """Follows Gymnasium's convention: importing a package registers its environments."""
+    try:
+        importlib.import_module("gymnasium")
+    except ModuleNotFoundError as error:
+        if error.name == "gymnasium":
+            return
+        raise
+    try:
+        importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
+    except ImportError as error:  # an old version must not keep the environment from its users
+        warnings.warn(f"no task set is registered with Gymnasium: {error}", stacklevel=2)
+
+
+_register_with_gymnasium()
+
+
+__all__: list[str]
+
+
+def __dir__() -> list[str]:
+    """Lists the public names, without submodules."""
+    public = {name: value for name, value in globals().items() if not name.startswith("_")}
+    return [name for name in public if not isinstance(public[name], types.ModuleType)]
+
+
+if not typing.TYPE_CHECKING:
+
+    def __getattr__(name: str) -> list[str]:
+        # help() prints everything that `__all__` names in full, 1,300 lines. Without `__all__` it
+        # prints the text above, so pydoc alone does not get to see it.
+        if name == "__all__" and sys._getframe(1).f_code.co_name != "docmodule":
+            return __dir__()
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

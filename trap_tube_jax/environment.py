@@ -24,7 +24,7 @@ from trap_tube_jax.objects import (
     NUM_DIRECTIONS,
 )
 from trap_tube_jax.observation import observe
-from trap_tube_jax.state import State, TimeStep, base_state, check_state, check_structure, validate
+from trap_tube_jax.state import State, TimeStep, base_state, check_state, validate
 from trap_tube_jax.transfers import (
     Transfer,
     compose,
@@ -245,14 +245,13 @@ def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
     """Returns the state that a transfer returns, if it is a valid one."""
     name = transfer_name(transfer)
     try:
-        structure = jax.eval_shape(transfer, key, state)
+        drawn = jax.jit(transfer)(key, state)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"transfer {name} failed; allowed: a function (key, state) -> state that runs under "
             f"jax.jit; {type(error).__name__}: {error}"
         ) from error
     try:
-        check_structure(structure)
-        return validate(jax.jit(transfer)(key, state))
+        return validate(drawn)
     except ValueError as error:
         raise ValueError(f"transfer {name} returned a broken state: {error}") from error

@@ -1,21 +1,20 @@
-"""Modules of your own, imported for the names that they register."""
+"""Imports of modules by name, and of optional libraries."""
 
 import contextlib
 import importlib
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 
 def import_modules(names: Sequence[str]) -> None:
-    """Imports modules by name, from the current directory too.
+    """Imports modules by name, for what they register; also from the current directory.
 
     Args:
-      names: as in `import NAME`; those that are imported already stay as they are.
+      names: as in `import NAME`. Modules that are imported already stay as they are.
 
     Raises:
-      ValueError: a name is not that of a module, or the module, or one that it needs, is missing.
+      ValueError: a name does not name a module, or a module is missing.
     """
     here = str(Path.cwd())
     if names and here not in sys.path:
@@ -32,20 +31,9 @@ def import_modules(names: Sequence[str]) -> None:
             ) from error
 
 
-def registering_file() -> str:
-    """The file of the code that calls the function that calls this one.
-
-    So a script and the module that is imported from its file are the same. Where there is no file,
-    as in a notebook, it is the module's name.
-    """
-    module = sys._getframe(2).f_globals
-    file = module.get("__file__")
-    return os.path.realpath(file) if file else str(module.get("__name__"))
-
-
 @contextlib.contextmanager
 def needs_extra(extra: str) -> Iterator[None]:
-    """Names the extra that installs what an import inside the `with` block misses.
+    """Turns a failed import inside the `with` block into one that names the extra to install.
 
     Raises:
       ImportError: an import failed.

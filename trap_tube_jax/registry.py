@@ -10,7 +10,7 @@ from trap_tube_jax.checks import check_registered_name
 from trap_tube_jax.controls import CONTROLS, drawn_from
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
-from trap_tube_jax.state import State, base_state, check_structure
+from trap_tube_jax.state import State, base_state, check_state
 from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic, transfer_name
 
 
@@ -43,26 +43,6 @@ class TaskSet:
         symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
         names = [symbols.get(each) or transfer_name(each) for each in self.transfers]
         return "{" + ", ".join(names) + "}" if names else "base"
-
-    def make(
-        self,
-        *,
-        num_features: int | None = None,
-        base: State | None = None,
-        max_steps: int | None = None,
-    ) -> Environment:
-        """Makes the set's environment; see `trap_tube_jax.make`."""
-        base = self.base if base is None else base
-        if base is None:
-            base = base_state(3 if num_features is None else num_features)
-        check_structure(base)
-        if num_features not in (None, base.palette.shape[-1]):
-            raise ValueError(
-                f"num_features={num_features} contradicts the base state, whose palette has "
-                f"{base.palette.shape[-1]} features; give one of them"
-            )
-        max_steps = self.max_steps if max_steps is None else max_steps
-        return Environment(self.transfers, base=base, max_steps=max_steps)
 
 
 PAPER_TASK_SETS = (
@@ -127,7 +107,18 @@ def make(
     Raises:
       ValueError: naming the value and what is allowed.
     """
-    return task_set(name).make(num_features=num_features, base=base, max_steps=max_steps)
+    entry = task_set(name)
+    base = entry.base if base is None else base
+    if base is None:
+        base = base_state(3 if num_features is None else num_features)
+    check_state(base)
+    if num_features not in (None, base.palette.shape[-1]):
+        raise ValueError(
+            f"num_features={num_features} contradicts the base state, whose palette has "
+            f"{base.palette.shape[-1]} features; give one of them"
+        )
+    max_steps = entry.max_steps if max_steps is None else max_steps
+    return Environment(entry.transfers, base=base, max_steps=max_steps)
 
 
 def register(

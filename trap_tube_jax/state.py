@@ -3,7 +3,6 @@
 Source: environment.md, "Board and objects" and "Base task".
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -28,7 +27,14 @@ from trap_tube_jax.objects import (
     base_palette,
 )
 
-BOARD_SHAPE = (BOARD_SIZE, BOARD_SIZE)
+# Shape and dtype of every field of a state; None stands for N >= 1 features.
+_FIELDS: dict[str, tuple[tuple[int | None, ...], type]] = {
+    "board": ((BOARD_SIZE, BOARD_SIZE), np.uint8),
+    "palette": ((NUM_OBJECTS, None), np.uint8),
+    **dict.fromkeys(("agent", "tool", "tool_extent", "food"), ((2,), np.int32)),
+    "time": ((), np.int32),
+    **dict.fromkeys(("terminated", "truncated"), ((), np.bool_)),
+}
 
 
 class State(ByValue, struct.PyTreeNode, eq=False):
@@ -83,25 +89,19 @@ class State(ByValue, struct.PyTreeNode, eq=False):
         Raises:
           ValueError: naming the value and what is allowed.
         """
-        fields: dict[str, Any] = {
-            "board": _integers("board", board, BOARD_SHAPE, np.uint8),
-            "palette": _integers(
-                "palette",
-                base_palette() if palette is None else palette,
-                (NUM_OBJECTS, None),
-                np.uint8,
-            ),
-            "agent": _integers("agent", agent, (2,), np.int32),
-            "tool": _integers("tool", tool, (2,), np.int32),
-            "tool_extent": _integers("tool_extent", tool_extent, (2,), np.int32),
-            "food": _integers("food", food, (2,), np.int32),
-            "time": np.zeros((), np.int32),
-            "terminated": np.zeros((), np.bool_),
-            "truncated": np.zeros((), np.bool_),
+        given = {
+            "board": board,
+            "palette": base_palette() if palette is None else palette,
+            "agent": agent,
+            "tool": tool,
+            "tool_extent": tool_extent,
+            "food": food,
         }
+        fields = {name: _converted(name, value) for name, value in given.items()}
+        start: Any = {"time": np.int32(0), "terminated": np.False_, "truncated": np.False_}
         # A layout is concrete also where it is built inside a traced function.
         with jax.ensure_compile_time_eval():
-            return jax.device_put(validate(cls(**fields)))
+            return jax.device_put(validate(cls(**fields, **start)))
 
     @classmethod
     def from_ascii(
@@ -135,16 +135,13 @@ class State(ByValue, struct.PyTreeNode, eq=False):
         codes = _parse_picture(rows)
         if (tool is None) != (tool_extent is None):
             raise ValueError("tool and tool_extent are given together or not at all")
-        if tool is None:
-            tool, tool_extent = _drawn_bar(codes)
-        else:
-            _refuse_drawn(codes, TOOL, tool)
+        tool, drawn_extent = _place(codes, TOOL, tool, MAX_TOOL_LENGTH)
         return cls.create(
             board=np.where(codes < FOOD, codes, GROUND),
-            agent=_drawn_cell(codes, AGENT, agent),
+            agent=_place(codes, AGENT, agent)[0],
             tool=tool,
-            tool_extent=tool_extent,
-            food=_drawn_cell(codes, FOOD, food),
+            tool_extent=drawn_extent if tool_extent is None else tool_extent,
+            food=_place(codes, FOOD, food)[0],
             palette=palette,
         )
 
@@ -203,7 +200,7 @@ def validate(state: State) -> State:
       ValueError: a field has the wrong type, shape or dtype, the episode is over, an
         object is off the board or where it cannot be; the message says what is allowed.
     """
-    check_structure(state)
+    check_state(state)
     for flag in ("terminated", "truncated"):
         if getattr(state, flag):
             raise ValueError(f"the state is {flag}; allowed: one whose episode is not over")
@@ -235,30 +232,11 @@ def validate(state: State) -> State:
     return state
 
 
-def check_structure(state: Any) -> None:
-    """Checks that `state` is a `State` whose fields have the right shapes and dtypes.
+def check_state(state: Any) -> None:
+    """Checks that `state` is one unbatched `State` with fields of the right shape and dtype.
 
     Args:
-      state: arrays, tracers or `jax.ShapeDtypeStruct` in the fields.
-
-    Raises:
-      ValueError: naming the field, what it is and what it must be.
-    """
-    check_state(state)
-    for name, (shape, dtype) in _field_specs(np.shape(state.palette)[-1]).items():
-        field = getattr(state, name)
-        if not hasattr(field, "shape") or not hasattr(field, "dtype"):
-            raise ValueError(f"state.{name} must be an array, got {type(field).__name__}")
-        if field.dtype != dtype:
-            raise ValueError(
-                f"state.{name} must be {np.dtype(dtype).name}{list(shape)}, got {described(field)}"
-            )
-
-
-def check_state(state: Any) -> None:
-    """Checks type and shapes of one unbatched `State`.
-
-    The check must be quick: every function of one state makes it when called or traced.
+      state: arrays or tracers in the fields.
 
     Raises:
       ValueError: naming the field, what it is and what it must be.
@@ -266,55 +244,39 @@ def check_state(state: Any) -> None:
     if not isinstance(state, State):
         hint = "; reset and step return (state, timestep)" if isinstance(state, tuple) else ""
         raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}{hint}")
-    shape = np.shape(state.palette)
-    num_features = shape[-1] if len(shape) > 1 else 3
-    for name, (shape, dtype) in _field_specs(max(num_features, 1)).items():
+    for name, (shape, dtype) in _FIELDS.items():
         field = getattr(state, name)
-        found = np.shape(field)
-        if found != shape:
-            kind = getattr(field, "dtype", type(field).__name__)
-            hint = "; for a batch of states use jax.vmap" if _is_batch_of(shape, found) else ""
+        if not hasattr(field, "shape") or not hasattr(field, "dtype"):
+            raise ValueError(f"state.{name} must be an array, got {type(field).__name__}")
+        if field.dtype != dtype or not _fits(field.shape, shape):
+            extra = len(field.shape) - len(shape)
+            is_batch = extra > 0 and _fits(field.shape[extra:], shape)
             raise ValueError(
-                f"state.{name} must be {np.dtype(dtype).name}{list(shape)}, "
-                f"got {kind}{list(found)}{hint}"
+                f"state.{name} must be {np.dtype(dtype).name}{_written(shape)}, got "
+                + described(field)
+                + ("; for a batch of states use jax.vmap" if is_batch else "")
             )
 
 
-def _is_batch_of(shape: tuple[int, ...], found: tuple[int, ...]) -> bool:
-    return len(found) > len(shape) and found[len(found) - len(shape) :] == shape
+def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    pairs = zip(found, shape, strict=False)
+    return len(found) == len(shape) and all(a == b if b else a >= 1 for a, b in pairs)
 
 
-@functools.cache
-def _field_specs(num_features: int) -> dict[str, tuple[tuple[int, ...], type]]:
-    cell = ((2,), np.int32)
-    flag = ((), np.bool_)
-    return {
-        "board": (BOARD_SHAPE, np.uint8),
-        "palette": ((NUM_OBJECTS, num_features), np.uint8),
-        "agent": cell,
-        "tool": cell,
-        "tool_extent": cell,
-        "food": cell,
-        "time": ((), np.int32),
-        "terminated": flag,
-        "truncated": flag,
-    }
+def _written(shape: tuple[int | None, ...]) -> str:
+    return f"[{', '.join(str(size or 'N') for size in shape)}]"
 
 
-def _integers(name: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> Any:
-    """Converts `value` to `dtype` after checking kind, shape (None: any >= 1) and range."""
+def _converted(name: str, value: Any) -> np.ndarray:
+    """Converts `value` to the shape and dtype of a field."""
     array = np.asarray(integer_array(name, value))
-    wanted = ", ".join("N >= 1" if size is None else str(size) for size in shape)
-    matches = array.ndim == len(shape) and all(
-        size == want if want is not None else size >= 1
-        for size, want in zip(array.shape, shape, strict=True)
-    )
-    if not matches:
-        raise ValueError(f"{name} must have shape ({wanted}), got {array.shape}")
+    shape, dtype = _FIELDS[name]
+    if not _fits(array.shape, shape):
+        raise ValueError(f"{name} must be integer{_written(shape)}, got {described(array)}")
     limits = np.iinfo(dtype)
-    if array.min() < limits.min or array.max() > limits.max:
-        outside = array[(array < limits.min) | (array > limits.max)][0]
-        raise ValueError(f"{name} holds {outside}; allowed: {limits.min} to {limits.max}")
+    outside = array[(array < limits.min) | (array > limits.max)]
+    if outside.size:
+        raise ValueError(f"{name} holds {outside[0]}; allowed: {limits.min} to {limits.max}")
     return array.astype(dtype)
 
 
@@ -337,68 +299,38 @@ def _parse_picture(rows: str | Sequence[str]) -> np.ndarray:
     """Reads the object codes u8[12, 12] of a picture."""
     if isinstance(rows, str):
         rows = [line.strip() for line in rows.strip().splitlines()]
-    if not isinstance(rows, Sequence):
-        raise ValueError(f"the picture must be one string or rows, got {type(rows).__name__}")
-    if len(rows) != BOARD_SIZE:
-        raise ValueError(f"the picture must have {BOARD_SIZE} rows, got {len(rows)}")
+    if not isinstance(rows, Sequence) or len(rows) != BOARD_SIZE:
+        found = len(rows) if isinstance(rows, Sequence) else type(rows).__name__
+        raise ValueError(f"the picture must be one string or {BOARD_SIZE} rows, got {found}")
     for index, line in enumerate(rows):
-        if not isinstance(line, str):
-            raise ValueError(f"row {index} must be a string, got {type(line).__name__}")
-        if len(line) != BOARD_SIZE:
-            raise ValueError(
-                f"row {index} must have {BOARD_SIZE} characters, got {len(line)}: {line!r}"
-            )
+        if not isinstance(line, str) or len(line) != BOARD_SIZE:
+            raise ValueError(f"row {index} must have {BOARD_SIZE} characters, got {line!r}")
         for column, char in enumerate(line):
             if char not in OBJECT_CHARS:
-                allowed = ", ".join(
-                    f"{char!r} {name}"
-                    for char, name in zip(OBJECT_CHARS, OBJECT_NAMES, strict=True)
-                )
+                known = zip(OBJECT_CHARS, OBJECT_NAMES, strict=True)
                 raise ValueError(
-                    f"row {index}, column {column}: unknown character {char!r}; allowed: {allowed}"
+                    f"row {index}, column {column}: unknown character {char!r}; allowed: "
+                    + ", ".join(f"{char!r} {name}" for char, name in known)
                 )
     return np.array([[OBJECT_CHARS.index(char) for char in line] for line in rows], np.uint8)
 
 
-def _refuse_drawn(codes: np.ndarray, code: int, given: Any) -> None:
-    drawn = np.argwhere(codes == code)
-    if len(drawn):
-        raise ValueError(
-            f"{OBJECT_NAMES[code]} is given as {given} and drawn at "
-            f"{tuple(drawn[0].tolist())}; allowed: one of the two"
-        )
-
-
-def _drawn_cell(codes: np.ndarray, code: int, given: Any) -> Any:
-    """Returns the only cell drawn as `code`, or `given`."""
+def _place(codes: np.ndarray, code: int, given: Any, longest: int = 1) -> tuple[Any, Any]:
+    """Returns top-left cell and extent of the bar drawn as `code`, or the cell `given`."""
+    cells, name = np.argwhere(codes == code), OBJECT_NAMES[code]
+    drawn = [tuple(cell) for cell in cells.tolist()]
     if given is not None:
-        _refuse_drawn(codes, code, given)
-        return given
-    drawn = np.argwhere(codes == code)
-    if len(drawn) != 1:
-        name, char = OBJECT_NAMES[code], OBJECT_CHARS[code]
-        cells = [tuple(cell) for cell in drawn.tolist()]
+        if drawn:
+            raise ValueError(
+                f"{name} is given as {given} and drawn at {drawn}; allowed: one of the two"
+            )
+        return given, None
+    extent = np.ptp(cells, axis=0) + 1 if drawn else None
+    if extent is None or sorted(extent) != [1, len(drawn)] or len(drawn) > longest:
+        shape = f"one straight bar of 1 to {longest} cells" if longest > 1 else "exactly one cell"
+        keywords = f"{name}= and {name}_extent=" if longest > 1 else f"{name}="
         raise ValueError(
-            f"the picture must hold exactly one {name} {char!r}, got {len(drawn)}: {cells}; "
-            f"or none, with {name}= given"
+            f"the {name} {OBJECT_CHARS[code]!r} must be drawn as {shape}, got {len(drawn)}: "
+            f"{drawn}; or not drawn and given by {keywords}"
         )
-    return drawn[0]
-
-
-def _drawn_bar(codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns corner and extent of the cells drawn as tool, which must form a bar."""
-    drawn = np.argwhere(codes == TOOL)
-    if not len(drawn):
-        raise ValueError(
-            f"the picture must hold the tool {OBJECT_CHARS[TOOL]!r}, or tool= and tool_extent= "
-            "be given"
-        )
-    corner = drawn.min(axis=0)
-    extent = drawn.max(axis=0) - corner + 1
-    if extent.prod() != len(drawn):
-        cells = [tuple(cell) for cell in drawn.tolist()]
-        raise ValueError(
-            f"the tool is drawn at {cells}; allowed: one straight bar of 1 to "
-            f"{MAX_TOOL_LENGTH} neighbouring cells"
-        )
-    return corner, extent
+    return cells[0], extent
