@@ -1,51 +1,174 @@
-"""Environment steps per second for the eight task sets: `python -m benchmarks.env_throughput`.
+"""Environment steps per second: `python -m benchmarks.env_throughput`.
 
-Random actions, auto-reset with fresh transfers, every observation consumed; see
-`benchmarks.harness.measure_throughput` for how.
+Environments take random actions and start over by themselves, each time with a new task. In every
+step a pattern consumes the observations, as a user's program would.
 """
 
 import dataclasses
-import pathlib
+from collections.abc import Callable
+from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 import trap_tube_jax as tt
+from agents.command_line import Flag
 from benchmarks import harness
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
 from trap_tube_jax.vector import VectorEnvironment
 
-REFERENCE_STEPS_PER_S = 2_400  # the paper's reference environment, one process
+DENSE_UNITS = 64
+ONE_HOT_LEVELS = 8
+
+PatternName = Literal["bytes", "sum", "mean", "dense", "one-hot", "last"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Arguments:
-    """What to measure.
+class StepOptions(harness.Options):
+    """Options of the benchmarks that step environments.
 
     Attributes:
-      sets: ids or short names of task sets.
+      sets: task sets, by id or short name.
       num_envs: batch sizes, each a multiple of `devices`.
-      num_steps: steps of each environment per timed call; episodes last up to 50.
-      repeats: timed calls; the median counts.
-      devices: devices to divide the environments over; a CPU is made to appear as so many.
-      plain: measure `jax.vmap` of an `AutoReset`, the fast path's reference, instead.
-      json: file to write the record to; refused unless all is of committed code.
+      num_steps: steps of each environment in a timed call; episodes last up to 50.
+      devices: number of devices that share the environments; a CPU is split into so many.
     """
 
-    sets: tuple[str, ...] = tuple(task_set.short for task_set in tt.PAPER_TASK_SETS)
-    num_envs: tuple[int, ...] = (16, 256, 1024, 4096, 16384)
+    sets: tuple[str, ...] = ("pstsy", "base")
+    num_envs: tuple[int, ...] = (4096,)
     num_steps: int = 100
-    repeats: int = 20
     devices: int = 1
-    plain: bool = False
-    json: pathlib.Path | None = None
+
+    def check(self) -> None:
+        """Checks the options and sets the number of devices; see `harness.Options.check`."""
+        check_integer("num_steps", self.num_steps)
+        check_integer("devices", self.devices)
+        for num_envs in self.num_envs:
+            if check_integer("num_envs", num_envs) % self.devices:
+                raise ValueError(
+                    f"num_envs must be multiples of devices={self.devices}, got {num_envs}"
+                )
+        use_devices(self.devices)
+        super().check()
 
 
-def subject(task_set: str, *, plain: bool = False) -> harness.Subject:
-    """A task set under the fast path, or under its plain reference."""
+@dataclasses.dataclass(frozen=True)
+class Options(StepOptions):
+    """Options of this benchmark.
+
+    Attributes:
+      patterns: uses of the observations: `bytes` folds every byte into an array of their size,
+        `sum` adds them in int32, `mean` averages in float32, `dense` casts to float32 and applies
+        a layer of 64 units, `one-hot` counts the values of a flattened one-hot of 8 levels, `last`
+        keeps the last observation alone.
+      plain: measures `jax.vmap` of an `AutoReset` instead of a `VectorEnvironment`.
+    """
+
+    patterns: tuple[PatternName, ...] = ("bytes",)
+    plain: Flag = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """A batch of environments under random actions.
+
+    Attributes:
+      name: name in tables.
+      reset: keys [B] -> (state, timestep).
+      step: (state, actions [B, ...]) -> (state, timestep); starts over after an episode's end.
+      sample_actions: (key, shape) -> actions [*shape, ...].
+      observe: timestep -> observations [B, ...]; by default the timestep itself.
+    """
+
+    name: str
+    reset: Callable[[jax.Array], tuple[Any, Any]]
+    step: Callable[[Any, jax.Array], tuple[Any, Any]]
+    sample_actions: Callable[[jax.Array, tuple[int, ...]], jax.Array]
+    observe: Callable[[Any], jax.Array] = lambda timestep: timestep
+
+
+@dataclasses.dataclass(frozen=True)
+class Pattern:
+    """A use of observations [B, ...] in every step: total <- join(total, read(observations))."""
+
+    read: Callable[[jax.Array], jax.Array]
+    join: Callable[[jax.Array, jax.Array], jax.Array] = jnp.add
+
+
+@dataclasses.dataclass(frozen=True)
+class Throughput:
+    """Speed of a subject.
+
+    Attributes:
+      name: name of the subject.
+      pattern: name of the pattern.
+      num_envs: B, environments on all devices together.
+      num_steps: steps of each environment in a call.
+      devices: number of devices.
+      steps_per_s: steps per second of all environments together, by the median call.
+      observation_bytes: size of one environment's observation.
+      timing: seconds of a call.
+    """
+
+    name: str
+    pattern: str
+    num_envs: int
+    num_steps: int
+    devices: int
+    steps_per_s: float
+    observation_bytes: int
+    timing: harness.Timing
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Bytes of observations per second."""
+        return self.steps_per_s * self.observation_bytes
+
+
+def bits(observations: jax.Array) -> jax.Array:
+    """Returns observations [B, ...] as unsigned integers [B, K] of the same width."""
+    rows = flat(observations)
+    if rows.dtype == jnp.bool_:
+        return rows.astype(jnp.uint8)
+    return jax.lax.bitcast_convert_type(rows, jnp.dtype(f"uint{8 * rows.dtype.itemsize}"))
+
+
+def flat(observations: jax.Array) -> jax.Array:
+    """Returns observations [B, ...] as rows [B, K]."""
+    return observations.reshape(len(observations), -1)
+
+
+def dense(observations: jax.Array) -> jax.Array:
+    """Casts to float32 and applies a layer: f32[B, DENSE_UNITS]."""
+    rows = flat(observations).astype(jnp.float32)
+    kernel = np.random.default_rng(0).standard_normal((rows.shape[1], DENSE_UNITS), np.float32)
+    return rows @ kernel
+
+
+def one_hot_counts(observations: jax.Array) -> jax.Array:
+    """Counts the entries of a flattened one-hot of the bytes' top 3 bits: f32[8 K]."""
+    levels = flat(observations) // (256 // ONE_HOT_LEVELS)
+    return jnp.sum(flat(jax.nn.one_hot(levels, ONE_HOT_LEVELS, dtype=jnp.float32)), axis=0)
+
+
+PATTERNS: dict[PatternName, Pattern] = {
+    "bytes": Pattern(bits, jnp.bitwise_xor),
+    "sum": Pattern(lambda observations: observations.astype(jnp.int32).sum()),
+    "mean": Pattern(lambda observations: observations.astype(jnp.float32).mean()),
+    "dense": Pattern(dense),
+    "one-hot": Pattern(one_hot_counts),
+    "last": Pattern(lambda observations: observations, lambda _, last: last),
+}
+
+
+def task_set_subject(task_set: str, *, plain: bool = False) -> Subject:
+    """Returns a task set as a `VectorEnvironment` or, if `plain`, by `jax.vmap`."""
     env = tt.make(task_set)
     if plain:
         auto_reset = tt.AutoReset(env)
@@ -53,56 +176,132 @@ def subject(task_set: str, *, plain: bool = False) -> harness.Subject:
     else:
         vector = VectorEnvironment(env)
         reset, step = vector.reset, vector.step
-    return harness.Subject(task_set, reset, step, sample_actions, lambda each: each.observation)
+    return Subject(task_set, reset, step, sample_actions, lambda timestep: timestep.observation)
 
 
 def sample_actions(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Uniform actions i32[*shape, 2] = (grasp, move)."""
+    """Draws uniform actions i32[*shape, 2] = (grasp, move)."""
     return jax.random.randint(key, (*shape, 2), 0, NUM_DIRECTIONS)
 
 
-def main(arguments: Arguments) -> list[harness.Throughput]:
-    """Measures, prints a table, and writes JSON if asked to."""
-    harness.check_counts(
-        arguments.num_envs,
-        num_steps=arguments.num_steps,
-        repeats=arguments.repeats,
-        devices=arguments.devices,
+def measure_throughput(
+    subject: Subject, num_envs: int, options: StepOptions, pattern: PatternName = "bytes"
+) -> Throughput:
+    """Steps a subject by random actions, which are drawn before the clock starts.
+
+    Each call continues from the states of the one before. Devices step their shares of the
+    environments and exchange nothing.
+    """
+    devices, use = options.devices, PATTERNS[pattern]
+
+    def reset(keys: jax.Array) -> Any:
+        state, timestep = subject.reset(keys)
+        observations = subject.observe(timestep)
+        return (state, jnp.zeros_like(use.read(observations))), observations
+
+    def run(carry: Any, actions: jax.Array) -> Any:
+        def step(carry: Any, actions: jax.Array) -> tuple[Any, None]:
+            state, total = carry
+            state, timestep = subject.step(state, actions)
+            return (state, use.join(total, use.read(subject.observe(timestep)))), None
+
+        return jax.lax.scan(step, carry, actions)[0]
+
+    own_envs = num_envs // devices
+    keys = jax.random.split(jax.random.key(0), num_envs).reshape(devices, own_envs)
+    actions = subject.sample_actions(jax.random.key(1), (devices, options.num_steps, own_envs))
+    carry, observations = jax.jit(on_devices(reset, devices))(keys)
+    program, compile_s = harness.compiled(on_devices(run, devices), carry, actions)
+
+    def call() -> jax.Array:
+        nonlocal carry
+        carry = program(carry, actions)
+        return carry[1]
+
+    timing = harness.measure_compiled(call, compile_s, options.repeats)
+    return Throughput(
+        name=subject.name,
+        pattern=pattern,
+        num_envs=num_envs,
+        num_steps=options.num_steps,
+        devices=devices,
+        steps_per_s=num_envs * options.num_steps / timing.median_s,
+        observation_bytes=observations.nbytes // num_envs,
+        timing=timing,
     )
-    harness.use_devices(arguments.devices)
-    harness.check_recordable(arguments.json)
-    subjects = [subject(name, plain=arguments.plain) for name in arguments.sets]
+
+
+def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]:
+    """Returns a function that runs on every device by itself.
+
+    Its arguments and results have the devices as an additional first axis.
+    """
+
+    def own(*arrays: Any) -> Any:
+        result = function(*jax.tree.map(lambda x: x[0], arrays))
+        return jax.tree.map(lambda x: x[None], result)
+
+    if devices == 1:
+        return own
+    mesh = jax.make_mesh((devices,), ("devices",), axis_types=(jax.sharding.AxisType.Auto,))
+    part = jax.sharding.PartitionSpec("devices")
+    return jax.shard_map(own, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+
+
+def use_devices(number: int) -> None:
+    """Splits a CPU into this many devices; call it before the first use of JAX.
+
+    Raises:
+      ValueError: JAX uses fewer accelerators.
+    """
+    if number > 1:
+        jax.config.update("jax_num_cpu_devices", number)
+    if number > jax.device_count():
+        raise ValueError(
+            f"devices must be at most {jax.device_count()}, the number of accelerators, got "
+            f"{number}; JAX_PLATFORMS=cpu splits the CPU instead"
+        )
+
+
+def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
+    """Returns the bytes per second that a loop over a large array writes, reading as many."""
+    source = jnp.zeros(num_bytes // 4, jnp.uint32)
+
+    def rewrite(array: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, passes, lambda i, old: old ^ i.astype(jnp.uint32), array)
+
+    return passes * num_bytes / harness.measure(rewrite, source).median_s
+
+
+def main(options: Options) -> list[Throughput]:
+    """Measures, prints a table and writes the record."""
+    options.check()
+    subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
     console = Console()
     console.print(harness.machine())
-    bandwidth = harness.copy_bandwidth()
+    bandwidth = copy_bandwidth()
     console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
-    table = Table("set", "environments", "M steps/s", "x reference", "of copy", "compile, s")
-    results = []
-    for measured in subjects:
-        for num_envs in arguments.num_envs:
-            result = harness.measure_throughput(
-                measured,
-                num_envs,
-                num_steps=arguments.num_steps,
-                repeats=arguments.repeats,
-                devices=arguments.devices,
-            )
-            results.append(result)
-            table.add_row(
-                measured.name,
-                f"{num_envs:,}",
-                f"{result.steps_per_s / 1e6:.3f}",
-                f"{result.steps_per_s / REFERENCE_STEPS_PER_S:,.0f}",
-                f"{result.bytes_per_s / bandwidth:.0%}",
-                f"{result.timing.compile_s:.1f}",
-            )
+    results = [
+        measure_throughput(subject, num_envs, options, pattern)
+        for subject in subjects
+        for num_envs in options.num_envs
+        for pattern in options.patterns
+    ]
+    table = Table("set", "environments", "pattern", "M steps/s", "of copy", "compile, s")
+    for result in results:
+        table.add_row(
+            result.name,
+            f"{result.num_envs:,}",
+            result.pattern,
+            f"{result.steps_per_s / 1e6:.3f}",
+            f"{result.bytes_per_s / bandwidth:.0%}",
+            f"{result.timing.compile_s:.1f}",
+        )
     console.print(table)
-    if arguments.json is not None:
-        extra = {"plain": arguments.plain, "copy_bytes_per_s": bandwidth}
-        harness.write_record(arguments.json, "env_throughput", arguments, results, **extra)
+    harness.write_record("env_throughput", options, results, copy_bytes_per_s=bandwidth)
     return results
 
 
 if __name__ == "__main__":
     with plain_errors():
-        main(tyro.cli(Arguments, description=__doc__))
+        main(tyro.cli(Options, description=__doc__))

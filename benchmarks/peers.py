@@ -1,13 +1,12 @@
-"""This environment beside other JAX gridworlds: `python -m benchmarks.peers`.
+"""This environment and other JAX gridworlds: `python -m benchmarks.peers`.
 
-Every subject runs under the same harness in the same process: random actions, auto-reset,
-every byte of every observation consumed. The peers come with the extra `[bench]`; one that
-cannot be imported is skipped with its reason.
+All take random actions and start over by themselves in one process, and a user's program consumes
+every byte of every observation. The peers come with the extra `[bench]`. A peer that cannot be
+imported or fails is skipped, and the reason is printed.
 """
 
-import dataclasses
-import pathlib
-from collections.abc import Callable
+import importlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,41 +16,19 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import env_throughput, harness
+from benchmarks.env_throughput import StepOptions, Subject, Throughput
 from trap_tube_jax.command_line import plain_errors
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
-    """What to measure.
+def gymnax_breakout() -> Subject:
+    """Returns MinAtar Breakout of gymnax; its step starts over by itself and takes a key."""
+    env, params = importlib.import_module("gymnax").make("Breakout-MinAtar")
 
-    Attributes:
-      num_envs: batch size, a multiple of `devices`.
-      num_steps: steps of each environment per timed call.
-      repeats: timed calls; the median counts.
-      devices: devices to divide the environments over; a CPU is made to appear as so many.
-      sets: our own task sets in the table; the first is the ratios' numerator.
-      json: file to write the record to; refused unless all is of committed code.
-    """
-
-    num_envs: int = 4096
-    num_steps: int = 100
-    repeats: int = 5
-    devices: int = 1
-    sets: tuple[str, ...] = ("pstsy", "base")
-    json: pathlib.Path | None = None
-
-
-def gymnax_breakout() -> harness.Subject:
-    """MinAtar Breakout of gymnax; its step resets by itself and takes a key."""
-    import gymnax  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-
-    env, params = gymnax.make("Breakout-MinAtar")
-
-    def reset(keys):
+    def reset(keys: jax.Array) -> Any:
         observation, state = jax.vmap(env.reset, (0, None))(keys, params)
         return (state, keys[0]), observation
 
-    def step(carry, actions):
+    def step(carry: Any, actions: jax.Array) -> Any:
         state, key = carry
         key, step_keys = _split(key, len(actions))
         observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(
@@ -59,152 +36,135 @@ def gymnax_breakout() -> harness.Subject:
         )
         return (state, key), observation
 
-    return harness.Subject("gymnax Breakout", reset, step, _actions(env.num_actions))
+    return Subject("gymnax Breakout", reset, step, _actions(env.num_actions))
 
 
-def pgx_breakout() -> harness.Subject:
-    """MinAtar Breakout of pgx under its own auto-reset, which takes a key."""
-    import pgx  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-    from pgx.experimental import (  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-        auto_reset,
-    )
+def pgx_breakout() -> Subject:
+    """Returns MinAtar Breakout of pgx under its own auto-reset, which takes a key."""
+    env = importlib.import_module("pgx").make("minatar-breakout")
+    auto_step = importlib.import_module("pgx.experimental").auto_reset(env.step, env.init)
 
-    env: Any = pgx.make("minatar-breakout")
-    auto_step = auto_reset(env.step, env.init)
-
-    def reset(keys):
+    def reset(keys: jax.Array) -> Any:
         state = jax.vmap(env.init)(keys)
         return (state, keys[0]), state.observation
 
-    def step(carry, actions):
+    def step(carry: Any, actions: jax.Array) -> Any:
         state, key = carry
         key, step_keys = _split(key, len(actions))
         state = jax.vmap(auto_step)(state, actions, step_keys)
         return (state, key), state.observation
 
-    return harness.Subject("pgx Breakout", reset, step, _actions(env.num_actions))
+    return Subject("pgx Breakout", reset, step, _actions(env.num_actions))
 
 
-def navix_doorkey() -> harness.Subject:
-    """DoorKey-8x8 of Navix, which resets by itself."""
-    import navix  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-
-    env = navix.make("Navix-DoorKey-8x8-v0")
-
-    def reset(keys):
-        timestep = jax.vmap(env.reset)(keys)
-        return timestep, timestep.observation
-
-    def step(timestep, actions):
-        timestep = jax.vmap(env.step)(timestep, actions)
-        return timestep, timestep.observation
-
-    return harness.Subject("Navix DoorKey-8x8", reset, step, _actions(len(env.action_set)))
-
-
-def xland_doorkey() -> harness.Subject:
-    """DoorKey-8x8 of XLand-MiniGrid under its own auto-reset."""
-    import xminigrid  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-    from xminigrid.wrappers import (  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-        GymAutoResetWrapper,
-    )
-
-    env, params = xminigrid.make("MiniGrid-DoorKey-8x8")
-    env = GymAutoResetWrapper(env)
-
-    def reset(keys):
-        timestep = jax.vmap(env.reset, (None, 0))(params, keys)
-        return timestep, timestep.observation
-
-    def step(timestep, actions):
-        timestep = jax.vmap(env.step, (None, 0, 0))(params, timestep, actions)
-        return timestep, timestep.observation
-
-    return harness.Subject("XLand DoorKey-8x8", reset, step, _actions(env.num_actions(params)))
-
-
-def jumanji_snake() -> harness.Subject:
-    """Snake of Jumanji under its own auto-reset."""
-    import jumanji  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-    from jumanji.wrappers import (  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
-        AutoResetWrapper,
-    )
-
-    env: Any = AutoResetWrapper(jumanji.make("Snake-v1"))
+def navix_doorkey() -> Subject:
+    """Returns DoorKey-8x8 of Navix, which starts over by itself."""
+    env = importlib.import_module("navix").make("Navix-DoorKey-8x8-v0")
     reset, step = jax.vmap(env.reset), jax.vmap(env.step)
-    return harness.Subject(
-        "Jumanji Snake", reset, step, _actions(4), lambda each: each.observation.grid
+    return _stateless("Navix DoorKey-8x8", reset, step, len(env.action_set))
+
+
+def xland_doorkey() -> Subject:
+    """Returns DoorKey-8x8 of XLand-MiniGrid under its own auto-reset."""
+    env, params = importlib.import_module("xminigrid").make("MiniGrid-DoorKey-8x8")
+    env = importlib.import_module("xminigrid.wrappers").GymAutoResetWrapper(env)
+
+    def reset(keys: jax.Array) -> Any:
+        return jax.vmap(env.reset, (None, 0))(params, keys)
+
+    def step(timestep: Any, actions: jax.Array) -> Any:
+        return jax.vmap(env.step, (None, 0, 0))(params, timestep, actions)
+
+    return _stateless("XLand DoorKey-8x8", reset, step, env.num_actions(params))
+
+
+def jumanji_snake() -> Subject:
+    """Returns Snake of Jumanji under its own auto-reset."""
+    env = importlib.import_module("jumanji").make("Snake-v1")
+    env = importlib.import_module("jumanji.wrappers").AutoResetWrapper(env)
+    reset, step = jax.vmap(env.reset), jax.vmap(env.step)
+    return Subject(
+        "Jumanji Snake", reset, step, _actions(4), lambda timestep: timestep.observation.grid
     )
 
 
-PEERS: tuple[tuple[str, Callable[[], harness.Subject]], ...] = (
-    ("gymnax Breakout", gymnax_breakout),
-    ("pgx Breakout", pgx_breakout),
-    ("Navix DoorKey-8x8", navix_doorkey),
-    ("XLand DoorKey-8x8", xland_doorkey),
-    ("Jumanji Snake", jumanji_snake),
-)
+PEERS: dict[str, Callable[[], Subject]] = {
+    "gymnax Breakout": gymnax_breakout,
+    "pgx Breakout": pgx_breakout,
+    "Navix DoorKey-8x8": navix_doorkey,
+    "XLand DoorKey-8x8": xland_doorkey,
+    "Jumanji Snake": jumanji_snake,
+}
+INSTALL = " (pip install -e '.[bench]')"
 
 
-INSTALL = " (pip install 'trap-tube-jax[bench]')"
-
-
-def run(arguments: Arguments) -> tuple[list[harness.Throughput], dict[str, str]]:
-    """Measures our own sets and every peer; returns results and reasons of the skipped peers.
+def measure(options: StepOptions) -> tuple[list[Throughput], dict[str, str]]:
+    """Measures the task sets and all peers; returns results, and reasons by skipped peer.
 
     Raises:
-      ValueError: one of our own sets is unknown, or cannot be measured.
+      ValueError: a task set is unknown.
     """
-
-    def measure(subject: harness.Subject) -> harness.Throughput:
-        return harness.measure_throughput(
-            subject,
-            arguments.num_envs,
-            num_steps=arguments.num_steps,
-            repeats=arguments.repeats,
-            devices=arguments.devices,
-        )
-
-    own = [env_throughput.subject(name) for name in arguments.sets]
-    results, skipped = [measure(subject) for subject in own], {}
-    for name, make_subject in PEERS:
+    own = [env_throughput.task_set_subject(name) for name in options.sets]
+    results = _measure(own, options)
+    skipped = {}
+    for name, make_subject in PEERS.items():
         try:
-            results.append(measure(make_subject()))
-        except Exception as error:  # whatever breaks in a peer must not break the others
+            results += _measure([make_subject()], options)
+        except Exception as error:  # a broken peer must not break the others
             first_line = next(iter(str(error).splitlines()), "")
             hint = INSTALL if isinstance(error, ImportError) else ""
             skipped[name] = f"{type(error).__name__}: {first_line}{hint}"
     return results, skipped
 
 
-def main(arguments: Arguments) -> None:
-    """Measures, prints a table and the skipped peers, and writes JSON if asked to."""
-    harness.check_counts(
-        (arguments.num_envs,),
-        num_steps=arguments.num_steps,
-        repeats=arguments.repeats,
-        devices=arguments.devices,
-    )
-    harness.use_devices(arguments.devices)
-    harness.check_recordable(arguments.json)
+def main(options: StepOptions) -> None:
+    """Measures, prints a table and the skipped peers, and writes the record."""
+    options.check()
     console = Console()
     console.print(harness.machine())
-    results, skipped = run(arguments)
-    table = Table("environment", "M steps/s", "ratio", "observation, B", "GB/s", "compile, s")
-    for result in results:
+    results, skipped = measure(options)
+    first = {result.num_envs: result.steps_per_s for result in reversed(results)}
+    columns = ("envs", "M steps/s", "ratio", "µs/step", "B/obs.", "GB/s")
+    table = Table("subject", *columns, "compile, s")
+    for result in sorted(results, key=lambda result: result.num_envs):
         table.add_row(
             result.name,
+            f"{result.num_envs:,}",
             f"{result.steps_per_s / 1e6:.2f}",
-            f"{results[0].steps_per_s / result.steps_per_s:.1f}",
+            f"{first[result.num_envs] / result.steps_per_s:.1f}",
+            f"{1e6 / result.steps_per_s:.3f}",
             f"{result.observation_bytes}",
             f"{result.bytes_per_s / 1e9:.2f}",
             f"{result.timing.compile_s:.1f}",
         )
     console.print(table)
+    console.print("ratio: speed of the first subject over this one; µs of one environment's step")
     for name, reason in skipped.items():
         console.print(f"skipped {name}: {reason}", markup=False)
-    if arguments.json is not None:
-        harness.write_record(arguments.json, "peers", arguments, results, skipped=skipped)
+    harness.write_record("peers", options, results, skipped=skipped)
+
+
+def _measure(subjects: Sequence[Subject], options: StepOptions) -> list[Throughput]:
+    return [
+        env_throughput.measure_throughput(subject, num_envs, options)
+        for subject in subjects
+        for num_envs in options.num_envs
+    ]
+
+
+def _stateless(
+    name: str, reset: Callable[..., Any], step: Callable[..., Any], num_actions: int
+) -> Subject:
+    """Returns a subject whose timestep is its whole state."""
+
+    def twice(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            timestep = function(*arguments)
+            return timestep, timestep.observation
+
+        return call
+
+    return Subject(name, twice(reset), twice(step), _actions(num_actions))
 
 
 def _actions(num_actions: int) -> Callable[[jax.Array, tuple[int, ...]], jax.Array]:
@@ -215,11 +175,11 @@ def _actions(num_actions: int) -> Callable[[jax.Array, tuple[int, ...]], jax.Arr
 
 
 def _split(key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
-    """The next key, and `number` keys for one step."""
+    """Returns the next key, and `number` keys for one step."""
     next_key, step_key = jax.random.split(key)
     return next_key, jax.random.split(step_key, number)
 
 
 if __name__ == "__main__":
     with plain_errors():
-        main(tyro.cli(Arguments, description=__doc__))
+        main(tyro.cli(StepOptions, description=__doc__))

@@ -1,15 +1,15 @@
-"""Where the time of one training iteration goes: `python -m benchmarks.train_throughput`.
+"""Where the time of a training iteration goes: `python -m benchmarks.train_throughput`.
 
-Times a whole iteration, then its parts by themselves on the same episodes, and compares the
-useful arithmetic of encoder and recurrent part, which is nearly all there is, with a large matrix
-product. The parts are separate programs, so they add up to the iteration only roughly.
+Times a whole iteration, then rollout, encoder and recurrent part by themselves on the same
+episodes. The parts are separate programs, so their times add up to the iteration only roughly.
+Useful arithmetic is compared with a large matrix product.
 """
 
 import dataclasses
+import functools
 import math
-import pathlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from agents import Config, make_train
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import take
 from agents.acting.rollout import Trajectory
+from agents.config import PRESETS
 from agents.curiosity import Experience
 from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
@@ -30,26 +31,27 @@ from trap_tube_jax import task_set
 from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
 
-MATRIX = 4096
+MATRIX_SIZE = 4096
 
 
 @dataclasses.dataclass(frozen=True)
-class Arguments:
-    """What to measure.
+class Options(harness.Options):
+    """Options of this benchmark.
 
     Attributes:
-      preset: the settings, those of `agents.train`.
-      env: task sets to train on, by id or short name.
-      warm: iterations of training before the clock starts.
-      repeats: timed calls; the median counts.
-      json: file to write the record to; refused unless all is of committed code.
+      preset: settings of training.
+      sets: task sets to train on, by id or short name.
+      warm: iterations of training before the measurement.
     """
 
-    preset: str = "paper"
-    env: tuple[str, ...] = ("base", "pstsy")
+    preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "paper"
+    sets: tuple[str, ...] = ("base", "pstsy")
     warm: int = 0
-    repeats: int = 3
-    json: pathlib.Path | None = None
+
+    def check(self) -> None:
+        """Checks the options; see `harness.Options.check`."""
+        check_integer("warm", self.warm, minimum=0)
+        super().check()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,20 +59,20 @@ class Part:
     """A part of the iteration, or all of it.
 
     Attributes:
-      env: short name of the task set.
-      name: what is timed.
-      timing: of one iteration's worth of it.
-      flop: useful floating-point operations of matrix products in it. The encoder's: each distinct
-        observation whole, once per minibatch and derivative, nothing recomputed, no padding.
-        Windows that observations share count in each, though they are encoded once. Those of GRU
-        and heads: each step that was taken, once per epoch and derivative; twice where the
-        curiosity needs the GRU's output after the step.
+      task_set: short name of the task set.
+      name: name of the part.
+      steps_per_s: environment steps of the iteration, per second of this part.
+      flop: useful floating-point operations: matrix products alone, without padding or anything
+        computed again. The encoder counts each distinct observation of a minibatch; GRU and heads
+        count each step taken, twice where the curiosity needs the output after the step.
+      timing: seconds of the part in one iteration.
     """
 
-    env: str
+    task_set: str
     name: str
-    timing: harness.Timing
+    steps_per_s: float
     flop: float
+    timing: harness.Timing
 
     @property
     def flops(self) -> float:
@@ -82,9 +84,9 @@ class Flop(NamedTuple):
     """Useful operations of an iteration.
 
     Attributes:
-      play: of the rollout.
-      encode: of the encoder in all gradient steps.
-      core: of GRU and heads in all gradient steps.
+      play: operations of the rollout.
+      encode: operations of the encoder in all gradient steps.
+      core: operations of GRU and heads in all gradient steps.
     """
 
     play: float
@@ -93,40 +95,113 @@ class Flop(NamedTuple):
 
 
 def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
-    """The iteration and its parts; see `Arguments`."""
-    train = make_train(config)
-    state = jax.jit(train.init)(jax.random.key(0))
-    iterate = jax.jit(train.iterate)
+    """Measures the iteration and its parts after `warm` iterations of training."""
+    learner = make_train(config)
+    state = jax.jit(learner.init)(jax.random.key(0))
+    iterate = jax.jit(learner.iterate)
     for _ in range(warm):
         state, _ = iterate(state)
     reset_key, action_key = jax.random.split(state.key)
     reset_keys = jax.random.split(reset_key, config.episodes_per_iteration)
 
-    def play(train: Learner, state: TrainState) -> Trajectory:
-        return train.play(state.params, reset_keys, action_key)
+    def play(state: TrainState) -> Trajectory:
+        return learner.play(state.params, reset_keys, action_key)
 
-    trajectory = _jitted(play, train, state)()
-    rewards, _ = jax.jit(train.intrinsic_reward)(state, trajectory)
-    batch, _ = jax.jit(train.make_batch)(state, trajectory, rewards)
-    flop = useful_flop(train, state, batch)
-    parts: list[tuple[str, Callable[[], Any], float]] = [
-        ("iteration", _jitted(Learner.iterate, train, state), sum(flop)),
-        ("rollout", _jitted(play, train, state), flop.play),
-        ("encoder", _jitted(_encoder_only, train, state, batch), flop.encode),
-        (
-            "recurrent part and heads",
-            _jitted(_core_only, train, state, batch, trajectory),
-            flop.core,
-        ),
-        ("optimiser", _jitted(_optimizer_only, train, state), 0.0),
+    trajectory = jax.jit(play)(state)
+    rewards, _ = jax.jit(learner.intrinsic_reward)(state, trajectory)
+    batch, _ = jax.jit(learner.make_batch)(state, trajectory, rewards)
+    params, features = state.params, trajectory.features
+    flop = useful_flop(learner, state, batch)
+    encoder = functools.partial(encoder_gradients, learner)
+    core = functools.partial(core_gradients, learner)
+    parts: list[tuple[str, float, Callable[..., Any], tuple[Any, ...]]] = [
+        ("iteration", sum(flop), learner.iterate, (state,)),
+        ("rollout", flop.play, play, (state,)),
+        ("encoder", flop.encode, encoder, (params, batch)),
+        ("recurrent part and heads", flop.core, core, (params, batch, features)),
     ]
     short = task_set(config.env_id).short
-    return [Part(short, name, harness.measure(run, repeats), flop) for name, run, flop in parts]
+    steps = float(jnp.sum(batch.episodes.mask))
+    results = []
+    for name, useful, function, arguments in parts:
+        timing = harness.measure(function, *arguments, repeats=repeats)
+        results.append(Part(short, name, steps / timing.median_s, useful, timing))
+    return results
 
 
-def useful_flop(train: Learner, state: TrainState, batch: Batch) -> Flop:
-    """The useful operations of an iteration with these episodes; see `Part`."""
-    config, agent = train.config, train.agent
+def encoder_gradients(learner: Learner, params: Params, batch: Batch) -> Params:
+    """Sums the encoder's gradients over all minibatches, for some loss of its features."""
+
+    def loss(params: Params, part: Batch) -> jax.Array:
+        features = encode_episodes(
+            learner.agent.encode_rows,
+            {"encoder": params["encoder"]},
+            part.episodes,
+            part.observation_id,
+            chunk=learner.config.encode_chunk_size,
+        )
+        return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
+
+    def gradient(places: jax.Array) -> Params:
+        return jax.grad(loss)(params, take(batch, places))
+
+    return _sum_over_minibatches(learner.config, gradient, params)
+
+
+def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax.Array) -> Params:
+    """Sums the gradients of GRU, heads and curiosity, from features f32[T + 1, B, F]."""
+
+    def gradient(places: jax.Array) -> Params:
+        by_params, by_features = jax.grad(_core_loss, (1, 2))(
+            learner, params, features[:, places], take(batch, places)
+        )
+        # The derivative by the features is part of the work, so something must need it.
+        return jax.tree.map(lambda x: x + 1e-30 * jnp.sum(by_features), by_params)
+
+    return _sum_over_minibatches(learner.config, gradient, params)
+
+
+def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batch) -> jax.Array:
+    """Returns the sum of squares of everything that the loss terms are computed from."""
+    agent, curiosity = learner.agent, learner.curiosity
+    given = (params, features, part.episodes.action, part.episodes.reward)
+    if curiosity.needs_embeddings:
+        embedding, following = agent.unroll_both(*given)
+        experience = Experience(
+            part.episodes,
+            part.observation_id,
+            features[..., :0],
+            embedding,
+            following,
+            agent.embed_action(params, part.episodes.action),
+        )
+        own = curiosity.losses(params["curiosity"], experience)
+    else:
+        embedding, own = agent.unroll(*given), {}
+    everything = jax.tree.leaves((agent.policy_and_value(params, embedding), own))
+    return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
+
+
+def _minibatches(config: Config) -> jax.Array:
+    """Draws the episodes i32[gradient steps, minibatch_size] of all gradient steps."""
+    keys = jax.random.split(jax.random.key(0), config.epochs)
+    orders = jax.vmap(lambda key: jax.random.permutation(key, config.episodes_per_iteration))(keys)
+    return orders.reshape(-1, config.minibatch_size)
+
+
+def _sum_over_minibatches(
+    config: Config, gradient: Callable[[jax.Array], Params], params: Params
+) -> Params:
+    def add(total: Params, places: jax.Array) -> tuple[Params, None]:
+        return jax.tree.map(jnp.add, total, gradient(places)), None
+
+    zero = jax.tree.map(jnp.zeros_like, params)
+    return jax.lax.scan(add, zero, _minibatches(config))[0]
+
+
+def useful_flop(learner: Learner, state: TrainState, batch: Batch) -> Flop:
+    """Counts the useful operations of an iteration with these episodes; see `Part`."""
+    config, agent = learner.config, learner.agent
 
     def step(params: Params, features: jax.Array) -> Any:
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
@@ -139,9 +214,8 @@ def useful_flop(train: Learner, state: TrainState, batch: Batch) -> Flop:
     per_step = matrix_flop(jax.make_jaxpr(step)(state.params, features))
     distinct = float(jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch))
     steps = float(jnp.sum(batch.episodes.mask))
-    outputs = 2 if train.curiosity.needs_embeddings else 1
-    # One pass forward, and one each for the derivatives by inputs and by kernels.
-    passes = 3 * config.epochs
+    outputs = 2 if learner.curiosity.needs_embeddings else 1
+    passes = 3 * config.epochs  # one forward, and one each for the derivatives by input and kernel
     return Flop(
         play=per_observation * float(jnp.max(batch.observation_id) + 1) + per_step * steps,
         encode=passes * per_observation * distinct,
@@ -149,11 +223,18 @@ def useful_flop(train: Learner, state: TrainState, batch: Batch) -> Flop:
     )
 
 
-def matrix_flop(jaxpr: ClosedJaxpr | Jaxpr) -> float:
-    """Floating-point operations of all matrix products in a function's jaxpr.
+def _distinct_per_epoch(config: Config, batch: Batch) -> jax.Array:
+    """Returns the mean over epochs of the minibatches' distinct observations, summed, f32[]."""
 
-    The body of a loop counts once.
-    """
+    def count(places: jax.Array) -> jax.Array:
+        ids = jnp.sort(batch.observation_id[:, places].reshape(-1))
+        return 1 + jnp.sum(ids[1:] != ids[:-1])
+
+    return jnp.sum(jax.lax.map(count, _minibatches(config))) / config.epochs
+
+
+def matrix_flop(jaxpr: ClosedJaxpr | Jaxpr) -> float:
+    """Counts the operations of all matrix products in a jaxpr; the body of a loop counts once."""
     inner = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
     total = 0.0
     for equation in inner.eqns:
@@ -170,150 +251,39 @@ def matrix_flop(jaxpr: ClosedJaxpr | Jaxpr) -> float:
 
 
 def matrix_product_flops() -> float:
-    """Floating-point operations per second of a large float32 matrix product."""
-    matrix = jnp.ones((MATRIX, MATRIX))
-    multiply = jax.jit(jnp.matmul)
-    timing = harness.measure(lambda: multiply(matrix, matrix))
-    return 2.0 * MATRIX**3 / timing.median_s
+    """Returns the operations per second of a large float32 matrix product."""
+    matrix = jnp.ones((MATRIX_SIZE, MATRIX_SIZE))
+    return 2.0 * MATRIX_SIZE**3 / harness.measure(jnp.matmul, matrix, matrix).median_s
 
 
-def _minibatches(config: Config) -> jax.Array:
-    """i32[epochs * minibatches, minibatch]: episodes, shuffled anew in each epoch."""
-    keys = jax.random.split(jax.random.key(0), config.epochs)
-    orders = jax.vmap(lambda key: jax.random.permutation(key, config.episodes_per_iteration))(keys)
-    return orders.reshape(-1, config.minibatch_size)
-
-
-def _distinct_per_epoch(config: Config, batch: Batch) -> jax.Array:
-    """f32[]: distinct observations summed over an epoch's minibatches, on average."""
-
-    def count(episodes: jax.Array) -> jax.Array:
-        names = jnp.sort(batch.observation_id[:, episodes].reshape(-1))
-        return 1 + jnp.sum(names[1:] != names[:-1])
-
-    return jnp.sum(jax.lax.map(count, _minibatches(config))) / config.epochs
-
-
-def _accumulate(config: Config, gradient: Callable[[jax.Array], Params], params: Params) -> Params:
-    """The sum of a gradient over all minibatches of all epochs."""
-
-    def add(total: Params, episodes: jax.Array) -> tuple[Params, None]:
-        return jax.tree.map(jnp.add, total, gradient(episodes)), None
-
-    zero = jax.tree.map(jnp.zeros_like, params)
-    return jax.lax.scan(add, zero, _minibatches(config))[0]
-
-
-def _encoder_only(train: Learner, state: TrainState, batch: Batch) -> Params:
-    def total(params: Params, part: Batch) -> jax.Array:
-        features = encode_episodes(
-            train.agent.encode_rows,
-            {"encoder": params["encoder"]},
-            part.episodes,
-            part.observation_id,
-            chunk=train.config.encode_chunk_size,
-        )
-        return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
-
-    return _accumulate(
-        train.config,
-        lambda episodes: jax.grad(total)(state.params, take(batch, episodes)),
-        state.params,
-    )
-
-
-def _core_only(train: Learner, state: TrainState, batch: Batch, trajectory: Trajectory) -> Params:
-    agent = train.agent
-
-    def total(params: Params, features: jax.Array, part: Batch) -> jax.Array:
-        given = (params, features, part.episodes.action, part.episodes.reward)
-        if train.curiosity.needs_embeddings:
-            embedding, following = agent.unroll_both(*given)
-            experience = Experience(
-                part.episodes,
-                part.observation_id,
-                features[..., :0],
-                embedding,
-                following,
-                agent.embed_action(params, part.episodes.action),
-            )
-            own = train.curiosity.losses(params["curiosity"], experience)
-        else:
-            embedding, own = agent.unroll(*given), {}
-        everything = jax.tree.leaves((agent.policy_and_value(params, embedding), own))
-        return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
-
-    def gradient(episodes: jax.Array) -> Params:
-        features = trajectory.features[:, episodes]
-        by_params, by_features = jax.grad(total, (0, 1))(
-            state.params, features, take(batch, episodes)
-        )
-        # The derivative by the features is part of the work, so something must need it.
-        return jax.tree.map(lambda x: x + 1e-30 * jnp.sum(by_features), by_params)
-
-    return _accumulate(train.config, gradient, state.params)
-
-
-def _optimizer_only(train: Learner, state: TrainState) -> Params:
-    optimizer = train.optimizer
-
-    def update(carry: Any, _: jax.Array) -> tuple[Any, None]:
-        params, opt_state = carry
-        updates, opt_state = optimizer.update(params, opt_state, params)
-        return (jax.tree.map(jnp.add, params, updates), opt_state), None
-
-    steps = train.config.epochs * (
-        train.config.episodes_per_iteration // train.config.minibatch_size
-    )
-    return jax.lax.scan(update, (state.params, state.opt_state), jnp.arange(steps))[0][0]
-
-
-def _jitted(function: Callable[..., Any], train: Learner, *arrays: Any) -> Callable[[], Any]:
-    """A program of its own, which its first call compiles, whatever has been compiled before."""
-    compiled = jax.jit(lambda *x: function(train, *x))
-    return lambda: compiled(*arrays)
-
-
-def main(arguments: Arguments) -> list[Part]:
-    """Measures, prints a table, and writes JSON if asked to."""
-    check_integer("warm", arguments.warm, minimum=0)
-    check_integer("repeats", arguments.repeats)
-    configs = [Config.preset(arguments.preset, env_id=task_set(env).id) for env in arguments.env]
-    harness.check_recordable(arguments.json)
+def main(options: Options) -> list[Part]:
+    """Measures, prints a table and writes the record."""
+    options.check()
+    configs = [Config.preset(options.preset, env_id=task_set(each).id) for each in options.sets]
     console = Console()
     console.print(harness.machine())
     peak = matrix_product_flops()
-    console.print(f"matrix product {MATRIX} x {MATRIX}: {peak / 1e9:.0f} GFLOP/s")
-    columns = ("set", "part", "seconds", "share", "compile, s", "useful GFLOP/s", "of peak")
-    table = Table(*columns, title=f"preset {arguments.preset}")
+    console.print(f"matrix product {MATRIX_SIZE} x {MATRIX_SIZE}: {peak / 1e9:.0f} GFLOP/s")
+    columns = ("set", "part", "seconds", "steps/s", "compile, s", "useful GFLOP/s", "of peak")
+    table = Table(*columns, title=f"preset {options.preset}")
     results: list[Part] = []
     for config in configs:
-        parts = measure(config, warm=arguments.warm, repeats=arguments.repeats)
-        results += parts
-        for part in parts:
-            table.add_row(
-                part.env,
-                part.name,
-                f"{part.timing.median_s:.2f}",
-                f"{part.timing.median_s / parts[0].timing.median_s:.0%}",
-                f"{part.timing.compile_s:.1f}",
-                f"{part.flops / 1e9:.0f}" if part.flop else "",
-                f"{part.flops / peak:.0%}" if part.flop else "",
-            )
-    console.print(table)
-    if arguments.json is not None:
-        harness.write_record(
-            arguments.json,
-            "train_throughput",
-            arguments,
-            results,
-            preset=arguments.preset,
-            warm=arguments.warm,
-            matrix_product_flops=peak,
+        results += measure(config, warm=options.warm, repeats=options.repeats)
+    for part in results:
+        table.add_row(
+            part.task_set,
+            part.name,
+            f"{part.timing.median_s:.2f}",
+            f"{part.steps_per_s:,.0f}",
+            f"{part.timing.compile_s:.1f}",
+            f"{part.flops / 1e9:.0f}",
+            f"{part.flops / peak:.0%}",
         )
+    console.print(table)
+    harness.write_record("train_throughput", options, results, matrix_product_flops=peak)
     return results
 
 
 if __name__ == "__main__":
     with plain_errors():
-        main(tyro.cli(Arguments, description=__doc__))
+        main(tyro.cli(Options, description=__doc__))

@@ -60,19 +60,3 @@ def own_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
     from trap_tube_jax import registry  # noqa: PLC0415  after the settings above
 
     monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
-
-
-@pytest.fixture
-def timed(monkeypatch):
-    """What the measured functions have returned; each takes two seconds."""
-    from benchmarks import harness  # noqa: PLC0415  after the settings above
-    from timings import TIMING  # noqa: PLC0415
-
-    returned = []
-
-    def measure(function, repeats=5):
-        returned.append(function())
-        return TIMING
-
-    monkeypatch.setattr(harness, "measure", measure)
-    return returned

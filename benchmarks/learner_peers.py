@@ -1,0 +1,259 @@
+"""Our learner and plain recurrent PPO with ICM: `python -m benchmarks.learner_peers`.
+
+Times a whole iteration, rollout and update, of `agents.ppo` and of the program in
+`agents/examples/plain_ppo.py`, in turn within one process. Settings are those of preset `paper`,
+with fewer episodes and epochs. There are two networks:
+
+    paper   the paper's, in our own environment
+    dense   encoder and GRU of 128 units, as in PureJaxRL's recurrent PPO; the plain program plays
+            through the gymnax adapter, which needs the extra `[interop]`
+
+`plain` is one compiled program, as is usual in JAX. `plain-by-step` is a call from Python for each
+gradient step: XLA's CPU backend is slow at the derivatives of convolutions in a loop.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import agents.networks
+import trap_tube_jax as tt
+from agents import Config, make_train
+from agents.examples import plain_ppo
+from benchmarks import harness
+from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.state import State, TimeStep
+
+NetworkName = Literal["paper", "dense"]
+ProgramName = Literal["ours", "plain", "plain-by-step"]
+UNITS = 128  # of PureJaxRL's encoder and GRU
+
+
+class DenseEncoder(nn.Module):
+    """Encodes u8[..., 12, 12, N] to f32[..., UNITS] by one layer."""
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """Flattens the features, scaled to [-1, 1]."""
+        flat = observation.reshape(*observation.shape[:-3], -1)
+        return nn.swish(plain_ppo.dense(UNITS)(flat / 127.5 - 1))
+
+
+agents.networks.register("dense", lambda config: DenseEncoder())
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(harness.Options):
+    """Options of this benchmark.
+
+    Attributes:
+      sets: task sets to train on, by id or short name.
+      networks: networks to train.
+      programs: programs to compare; the first is compared with the others.
+      episodes_per_iteration: episodes of an iteration; the paper has 1,024.
+      minibatch_size: episodes of a gradient step; the paper has 128.
+      epochs: passes over the episodes; the paper has 10.
+    """
+
+    repeats: int = 3
+    sets: tuple[str, ...] = ("base",)
+    networks: tuple[NetworkName, ...] = ("paper", "dense")
+    programs: tuple[ProgramName, ...] = ("ours", "plain", "plain-by-step")
+    episodes_per_iteration: int = 64
+    minibatch_size: int = 8
+    epochs: int = 1
+
+    def config(self, task_set: str, network: NetworkName) -> Config:
+        """Returns the settings of training."""
+        size = {"encoder": "dense", "hidden": UNITS} if network == "dense" else {}
+        return Config.preset(
+            "paper",
+            env_id=tt.task_set(task_set).id,
+            episodes_per_iteration=self.episodes_per_iteration,
+            minibatch_size=self.minibatch_size,
+            epochs=self.epochs,
+            **size,
+        )
+
+
+class ThroughGymnax:
+    """A task set by the gymnax adapter, as the plain program plays it."""
+
+    def __init__(self, config: Config):
+        """Makes the environment of a config.
+
+        Raises:
+          ImportError: gymnax is not installed.
+        """
+        from trap_tube_jax.adapters import to_gymnax  # noqa: PLC0415  needs the extra
+
+        self._env, self._params = to_gymnax.make(config.env_id, flat_actions=False)
+        self.observation_spec = self._env.observation_space()
+        self.max_steps = config.step_limit(config.env_id)
+
+    def reset(self, key: jax.Array) -> tuple[tuple[State, jax.Array], TimeStep]:
+        """Draws a task."""
+        key, reset_key = jax.random.split(key)
+        observation, state = self._env.reset(reset_key, self._params)
+        flags = (state.terminated, state.truncated)
+        return (state, key), TimeStep(observation, jnp.zeros(()), *flags, jnp.ones(()))
+
+    def step(self, state: tuple[State, jax.Array], action: jax.Array) -> tuple[Any, TimeStep]:
+        """Takes one action; the next task follows the end of an episode."""
+        key, step_key = jax.random.split(state[1])
+        stepped = self._env.step(step_key, state[0], action, self._params)
+        observation, inner, reward, _, info = stepped
+        flags = (info["terminated"], info["truncated"], info["discount"])
+        return (inner, key), TimeStep(observation, reward, *flags)
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """Speed of one program.
+
+    Attributes:
+      task_set: short name of the task set.
+      network: name of the network.
+      program: name of the program.
+      steps_per_s: environment steps per second of iterations, rollout and update.
+      timing: seconds of an iteration.
+    """
+
+    task_set: str
+    network: str
+    program: str
+    steps_per_s: float
+    timing: harness.Timing
+
+
+@dataclasses.dataclass
+class Program:
+    """Iterations of a learner, each from the state that the one before returned.
+
+    Attributes:
+      iterate: state -> (state, environment steps taken), compiled.
+      state: state of training.
+      compile_s: seconds of tracing and compiling.
+      steps: environment steps of the last iteration.
+    """
+
+    iterate: Callable[[Any], tuple[Any, jax.Array]]
+    state: Any
+    compile_s: float
+    steps: Any = 0
+
+    def run(self) -> Any:
+        """Runs one iteration; returns the new state."""
+        self.state, self.steps = self.iterate(self.state)
+        return self.state
+
+
+def our_program(config: Config) -> Program:
+    """Compiles an iteration of `agents.ppo`."""
+    learner = make_train(config)
+
+    def iterate(state: Any) -> tuple[Any, jax.Array]:
+        after, _ = learner.iterate(state)
+        return after, after.transitions - state.transitions
+
+    state = jax.jit(learner.init)(jax.random.key(0))
+    program, compile_s = harness.compiled(iterate, state)
+    return Program(program, state, compile_s)
+
+
+def plain_program(learner: plain_ppo.PlainPPO) -> Program:
+    """Compiles an iteration of the plain program as a whole."""
+
+    def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
+        state, batch, minibatches = learner.collect(state)
+        update = lambda state, places: learner.update(state, batch, places)  # noqa: E731
+        state, _ = jax.lax.scan(update, state, minibatches)
+        return state, jnp.sum(batch[0].mask)
+
+    state = jax.jit(learner.init)(jax.random.key(0))
+    program, compile_s = harness.compiled(iterate, state)
+    return Program(program, state, compile_s)
+
+
+def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
+    """Compiles an iteration of the plain program as two functions, called from Python."""
+    state = jax.jit(learner.init)(jax.random.key(0))
+    collect, collect_s = harness.compiled(learner.collect, state)
+    _, batch, minibatches = jax.eval_shape(learner.collect, state)
+    places = jax.ShapeDtypeStruct(minibatches.shape[1:], minibatches.dtype)
+    update, update_s = harness.compiled(learner.update, state, batch, places)
+
+    def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
+        state, batch, minibatches = collect(state)
+        for places in minibatches:
+            state, _ = update(state, batch, places)
+        return state, jnp.sum(batch[0].mask)
+
+    return Program(iterate, state, collect_s + update_s)
+
+
+def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed]:
+    """Measures our program and the plain ones in turn, after a round to warm up."""
+    config = options.config(task_set, network)
+    env, encoder = None, None
+    if network == "dense":
+        env, encoder = ThroughGymnax(config), DenseEncoder()
+    plain = plain_ppo.make_train(config, env, encoder)
+    compile_program: dict[ProgramName, Callable[[], Program]] = {
+        "ours": lambda: our_program(config),
+        "plain": lambda: plain_program(plain),
+        "plain-by-step": lambda: plain_program_by_step(plain),
+    }
+    programs = {name: compile_program[name]() for name in options.programs}
+    calls: dict[str, list[float]] = {name: [] for name in programs}
+    for _ in range(options.repeats + 1):
+        for name, program in programs.items():
+            calls[name].append(harness.seconds(program.run))
+    speeds = []
+    for name, program in programs.items():
+        timing = harness.Timing.of(program.compile_s, calls[name][1:])
+        steps_per_s = float(program.steps) / timing.median_s
+        speeds.append(Speed(task_set, network, name, steps_per_s, timing))
+    return speeds
+
+
+def main(options: Options) -> list[Speed]:
+    """Measures, prints a table and writes the record."""
+    options.check()
+    cases: list[tuple[str, NetworkName]] = [
+        (name, network) for name in options.sets for network in options.networks
+    ]
+    for case in cases:
+        options.config(*case)  # checks the settings
+    console = Console()
+    console.print(harness.machine())
+    results = []
+    columns = ("set", "network", "program", "s/iteration", "steps/s", "ratio", "compile, s")
+    table = Table(*columns)
+    for case in cases:
+        speeds = measure(*case, options)
+        results += speeds
+        for speed in speeds:
+            table.add_row(
+                *case,
+                speed.program,
+                f"{speed.timing.median_s:.3f}",
+                f"{speed.steps_per_s:,.0f}",
+                f"{speeds[0].steps_per_s / speed.steps_per_s:.1f}",
+                f"{speed.timing.compile_s:.1f}",
+            )
+    console.print(table)
+    harness.write_record("learner_peers", options, results)
+    return results
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,106 @@
+"""Timing, records, and the command lines of all benchmarks."""
+
+import dataclasses
+import json
+import re
+import runpy
+import shlex
+import sys
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import pytest
+import tyro
+
+from benchmarks import env_throughput, harness, learner_peers, peers, train_throughput
+from paths import ROOT
+from timings import TIMING
+
+RESULTS = ROOT / "benchmarks" / "results"
+MODULES = [env_throughput, peers, train_throughput, learner_peers]
+OPTIONS = {
+    "env_throughput": env_throughput.Options,
+    "peers": env_throughput.StepOptions,
+    "train_throughput": train_throughput.Options,
+    "learner_peers": learner_peers.Options,
+}
+
+
+def test_timing_separates_compilation_from_calls_and_leaves_out_the_first(monkeypatch):
+    clock = iter([0, 7, 10, 99, 100, 102, 110, 111, 120, 123])
+    monkeypatch.setattr(harness, "time", SimpleNamespace(perf_counter=clock.__next__))
+    assert harness.measure(jnp.sin, jnp.ones(()), repeats=3) == TIMING
+
+
+def test_a_record_names_command_machine_and_results(tmp_path, monkeypatch):
+    monkeypatch.setattr(harness, "commit", lambda: "abc")
+    monkeypatch.setattr(harness, "provenance", lambda: {"commit": "abc"})
+    options = env_throughput.Options(num_envs=(4, 8), plain=True, output=tmp_path / "a" / "b.json")
+    harness.write_record("env_throughput", options, [TIMING], more=1)
+    record = json.loads((tmp_path / "a" / "b.json").read_text())
+    assert (record["benchmark"], record["more"]) == ("env_throughput", 1)
+    assert record["machine"] == {"commit": "abc", "devices": 1}
+    assert record["results"] == [dataclasses.asdict(TIMING)]
+    assert record["command"] == "python -m benchmarks.env_throughput --num-envs 4 8 --plain"
+    given = tyro.cli(env_throughput.Options, args=shlex.split(record["command"])[3:])
+    assert given == dataclasses.replace(options, output=None)
+
+
+def test_recorded_commands_can_be_given():
+    records = [json.loads(path.read_text()) for path in RESULTS.glob("*.json")]
+    records = [record for record in records if record.get("schema") == harness.SCHEMA]
+    assert records
+    for record in records:
+        words = shlex.split(record["command"])
+        assert words[:3] == ["python", "-m", f"benchmarks.{record['benchmark']}"]
+        tyro.cli(OPTIONS[record["benchmark"]], args=words[3:])
+        assert re.fullmatch("[0-9a-f]{12}", record["machine"]["commit"])
+        assert all(result["timing"]["compile_s"] > 0 for result in record["results"])
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "message"),
+    [
+        (env_throughput, ("--num-steps", "0"), "num_steps must be an integer >= 1, got 0"),
+        (env_throughput, ("--num-envs", "4", "0"), "num_envs must be an integer >= 1, got 0"),
+        (peers, ("--num-envs", "3", "--devices", "2"), "num_envs must be multiples of devices=2"),
+        (train_throughput, ("--warm", "-1"), "warm must be an integer >= 0, got -1"),
+        (train_throughput, ("--preset", "typo"), "unknown preset 'typo'; allowed: paper, "),
+        (learner_peers, ("--minibatch-size", "5"), "minibatch_size must divide "),
+        *((module, ("--output", "x"), "a record needs committed code") for module in MODULES),
+        *((module, ("--repeats", "0"), "repeats must be an integer >= 1") for module in MODULES),
+        *((module, ("--sets", "typo"), "unknown task set 'typo'; allowed: ") for module in MODULES),
+    ],
+)
+def test_a_wrong_option_ends_in_one_line_before_measuring(
+    capsys, monkeypatch, module, arguments, message
+):
+    def fail(*args, **kwargs):
+        raise AssertionError("began before the check")
+
+    monkeypatch.setattr(harness, "compiled", fail)
+    monkeypatch.setattr(harness, "commit", lambda: "abc-dirty")
+    monkeypatch.setattr(sys, "argv", ["x", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        runpy.run_path(module.__file__, run_name="__main__")
+    error = capsys.readouterr().err
+    assert (stopped.value.code, error.count("\n")) == (2, 1)
+    assert error.startswith(f"error: {message}")
+
+
+def test_tables_of_speeds_are_of_their_records():
+    """A table marked `<!-- speeds: NAME NAME -->` has a row for each batch size of a record."""
+    page = (RESULTS / "throughput.md").read_text()
+    tables = re.findall(r"<!-- speeds: (.*?) -->\n\n(.*?)\n\n", page, re.DOTALL)
+    assert tables
+    for names, table in tables:
+        head, _, *rows = [line.strip("| ").split(" | ") for line in table.splitlines()]
+        shown = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
+        for name in names.split():
+            record = json.loads((RESULTS / f"{name}.json").read_text())
+            for each in record["results"]:
+                if each["num_envs"] >= 4096:
+                    devices = f"{each['devices']} device" + "s" * (each["devices"] > 1)
+                    commit = f"commit `{record['machine']['commit'][:7]}`"
+                    row = f"{devices}, {each['num_envs']:,} environments, {commit}"
+                    assert shown[row][each["name"]] == f"{each['steps_per_s'] / 1e6:.1f}"
