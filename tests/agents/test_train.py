@@ -78,6 +78,8 @@ def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
 def test_training_ends_without_a_traceback_where(vanishes, tmp_path):
     arguments = ["--iterations", 100_000, "--out", tmp_path, "--name", "x"]
     with start("agents.train", *options(), *arguments) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
         read_iterations(process, 1)
         if vanishes == "pipe":
             process.stdout.close()

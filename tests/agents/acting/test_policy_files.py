@@ -25,7 +25,7 @@ def test_a_stored_policy_is_the_same(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def header(iteration=1, **settings):
+def header(iteration: int | str = 1, **settings):
     values = {"config": {**CONFIG.to_dict(), **settings}, "iteration": iteration}
     return {"policy": json.dumps(values)}
 
