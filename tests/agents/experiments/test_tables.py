@@ -12,13 +12,7 @@ from agents.experiments import figures, report, tables
 from paths import ROOT
 
 RESULTS = ROOT / "benchmarks" / "results"
-PAGES = {
-    "exp2_best": "best_preset.md",
-    "exp2_curiosities": "curiosities.md",
-    "exp2_long": "best_preset.md",
-    "exp2_paper_encoder": "curiosities.md",
-    "fast_base": "fast_preset.md",
-}
+RECORDS = ("exp2_best", "exp2_curiosities", "exp2_long", "exp2_paper_encoder", "fast_base")
 ABOUT = {"title": "x", "train_set": "pstsy", "threshold": 1.0}
 
 
@@ -130,12 +124,11 @@ def test_many_algorithms_are_points_and_bars_but_not_lines(tmp_path):
     assert axis.lines[0].get_xdata().tolist() == [30, 40]
 
 
-@pytest.mark.parametrize(("record", "page"), PAGES.items())
-def test_the_pages_have_the_tables_of_the_records(record, page, tmp_path):
+@pytest.mark.parametrize("record", RECORDS)
+def test_the_tables_of_the_records_fit_a_terminal(record, tmp_path):
     copy = shutil.copytree(RESULTS / record, tmp_path / record)
     shown = report.write(copy)
-    _, _, table = (copy / "table.md").read_text().partition("**Test tasks solved, %**\n\n")
-    assert table.partition("\n\n")[0] in (RESULTS / page).read_text()
+    assert "**Test tasks solved, %**" in (copy / "table.md").read_text()
     assert max(map(len, shown.splitlines()[:-5])) <= report.WIDTH
 
 
