@@ -31,6 +31,8 @@ def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:
     """
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
+    except jax.errors.TracerArrayConversionError:  # a sequence of traced numbers
+        array = jnp.asarray(value)
     except ValueError as error:
         raise ValueError(f"{name} must be a rectangular array of integers: {error}") from None
     if not jnp.issubdtype(array.dtype, np.integer):
