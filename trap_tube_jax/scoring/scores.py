@@ -184,5 +184,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """
     from scipy.stats import binomtest  # noqa: PLC0415  importing the environment must stay light
 
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"need 0 <= successes <= trials > 0, got {successes} of {trials}")
     low, high = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return float(low), float(high)

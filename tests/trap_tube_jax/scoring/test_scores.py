@@ -31,7 +31,7 @@ def test_wilson_interval(successes, trials, low, high):
 
 @pytest.mark.parametrize(("successes", "trials"), [(1, 0), (-1, 5), (6, 5)])
 def test_wilson_interval_refuses(successes, trials):
-    with pytest.raises(ValueError, match=r"\b(k|n)\b"):
+    with pytest.raises(ValueError, match="successes <= trials"):
         wilson_interval(successes, trials)
 
 
