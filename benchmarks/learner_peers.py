@@ -205,7 +205,7 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
     env, encoder = None, None
     if network == "dense":
         env, encoder = ThroughGymnax(config), DenseEncoder()
-    plain = plain_ppo.make_train(config, env, encoder)
+    plain = plain_ppo.PlainPPO(config, env, encoder)
     compile_program: dict[ProgramName, Callable[[], Program]] = {
         "ours": lambda: our_program(config),
         "plain": lambda: plain_program(plain),

@@ -137,7 +137,6 @@ def encoder_gradients(learner: Learner, params: Params, batch: Batch) -> Params:
             learner.agent.encode_rows,
             {"encoder": params["encoder"]},
             part.episodes,
-            part.observation_id,
             chunk=learner.config.encode_chunk_size,
         )
         return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
@@ -164,20 +163,15 @@ def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax
 def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batch) -> jax.Array:
     """Returns the sum of squares of everything that the loss terms are computed from."""
     agent, curiosity = learner.agent, learner.curiosity
-    given = (params, features, part.episodes.action, part.episodes.reward)
-    if curiosity.needs_embeddings:
-        embedding, following = agent.unroll_both(*given)
-        experience = Experience(
-            part.episodes,
-            part.observation_id,
-            features[..., :0],
-            embedding,
-            following,
-            agent.embed_action(params, part.episodes.action),
-        )
+    episodes, both = part.episodes, curiosity.needs_next_embedding
+    embedding, following = agent.unroll(
+        params, features, episodes.action, episodes.reward, both=both
+    )
+    own = {}
+    if both:
+        actions = agent.embed_action(params, episodes.action)
+        experience = Experience(episodes, features[..., :0], embedding, following, actions)
         own = curiosity.losses(params["curiosity"], experience)
-    else:
-        embedding, own = agent.unroll(*given), {}
     everything = jax.tree.leaves((agent.policy_and_value(params, embedding), own))
     return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 
@@ -214,10 +208,10 @@ def useful_flop(learner: Learner, state: TrainState, batch: Batch) -> Flop:
     per_step = matrix_flop(jax.make_jaxpr(step)(state.params, features))
     distinct = float(jax.jit(lambda batch: _distinct_per_epoch(config, batch))(batch))
     steps = float(jnp.sum(batch.episodes.mask))
-    outputs = 2 if learner.curiosity.needs_embeddings else 1
+    outputs = 2 if learner.curiosity.needs_next_embedding else 1
     passes = 3 * config.epochs  # one forward, and one each for the derivatives by input and kernel
     return Flop(
-        play=per_observation * float(jnp.max(batch.observation_id) + 1) + per_step * steps,
+        play=per_observation * float(jnp.max(batch.episodes.observation_id) + 1) + per_step * steps,
         encode=passes * per_observation * distinct,
         core=passes * outputs * per_step * steps,
     )
@@ -227,7 +221,7 @@ def _distinct_per_epoch(config: Config, batch: Batch) -> jax.Array:
     """Returns the mean over epochs of the minibatches' distinct observations, summed, f32[]."""
 
     def count(places: jax.Array) -> jax.Array:
-        ids = jnp.sort(batch.observation_id[:, places].reshape(-1))
+        ids = jnp.sort(batch.episodes.observation_id[:, places].reshape(-1))
         return 1 + jnp.sum(ids[1:] != ids[:-1])
 
     return jnp.sum(jax.lax.map(count, _minibatches(config))) / config.epochs

@@ -12,9 +12,10 @@ import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.episodes import Episodes
+from agents.acting.frames import Frame
 from agents.acting.rollout import Trajectory
 from agents.networks.agent import Agent, Params
-from trap_tube_jax.objects import AGENT, BASE_COLORS, FOOD, GROUND, TOOL, TUBE1
+from trap_tube_jax.objects import AGENT, BASE_COLORS, BOARD_SIZE, FOOD, GROUND, TOOL, TUBE1
 
 PARAMETER_NAMES = {
     "encoder/conv1": "conv1",
@@ -109,9 +110,12 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
     reward = jnp.asarray(recording.steps("batch/reward"))
     cells = replay(initial, action)
     features = jax.vmap(lambda image: agent.encode(params, image))(jnp.asarray(images))
-    embedding = agent.unroll(params, features, action, reward)
+    embedding, _ = agent.unroll(params, features, action, reward)
     actions, value = agent.policy_and_value(params, embedding)
+    boards = np.reshape(images, (-1, BOARD_SIZE**2 * 3))
+    _, observation_id = np.unique(boards, axis=0, return_inverse=True)
     return Trajectory(
+        frame=Frame.of(jnp.zeros(action.shape[1], jnp.int32)),
         episodes=Episodes(
             layout=initial,
             cells=cells,
@@ -119,6 +123,7 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
             reward=reward,
             discount=jnp.full_like(reward, jnp.nan),  # which the baseline does not look at
             mask=jnp.asarray(recording.steps("batch/weight")),
+            observation_id=jnp.asarray(observation_id.reshape(images.shape[:2]), jnp.int32),
         ),
         features=features,
         embedding=embedding,

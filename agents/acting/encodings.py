@@ -1,7 +1,7 @@
 """Fast path: features of all observations of episodes, each distinct observation encoded once.
 
-`encode_episodes` encodes episodes that have been played. `Cache` encodes observations while
-episodes are played, and finds those that any of them has met before.
+`Cache` encodes observations while episodes are played, and finds those that any of them has met
+before. `encode_episodes` encodes episodes that have been played.
 """
 
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from agents.acting.episodes import Episodes, place
 from agents.networks import chunks
 from agents.networks.agent import Agent, Params
-from agents.networks.grouping import group, slots
+from agents.networks.grouping import group, group_rows, slots
 from trap_tube_jax.observation import observe
 from trap_tube_jax.positions import position_id
 from trap_tube_jax.state import State
@@ -21,12 +21,7 @@ CACHE_BITS = 20  # of an observation's hash, in the table of `Cache`
 
 
 def encode_episodes(
-    encode_rows: chunks.RowFn,
-    params: Any,
-    episodes: Episodes,
-    observation_id: jax.Array,
-    *,
-    chunk: int,
+    encode_rows: chunks.RowFn, params: Any, episodes: Episodes, *, chunk: int
 ) -> Any:
     """Encodes all observations to f32[T + 1, B, F], or to a tree of such arrays.
 
@@ -34,11 +29,10 @@ def encode_episodes(
       encode_rows: encodes observations u8[chunk, 12, 12, N]; see `chunks.map_rows`.
       params: parameters of `encode_rows`, by which the features are differentiable.
       episodes: the episodes.
-      observation_id: i32[T + 1, B], equal only for equal observations.
       chunk: distinct observations encoded at once.
     """
-    shape = observation_id.shape
-    groups = group(observation_id.reshape(-1))
+    shape = episodes.observation_id.shape
+    groups = group(episodes.observation_id.reshape(-1))
     time, episode = groups.representative // shape[1], groups.representative % shape[1]
     rows = jax.vmap(lambda layout, cells: observe(place(layout, cells)))(
         jax.tree.map(lambda x: x[episode], episodes.layout), episodes.cells[time, episode]
@@ -64,13 +58,14 @@ class Cache(NamedTuple):
     newest: jax.Array
 
     @staticmethod
-    def empty(layout_id: jax.Array, num_steps: int, width: int) -> "Cache":
-        """Makes a cache for episodes of `num_steps` steps and features of this width."""
-        shape = (num_steps + 1, len(layout_id))
+    def empty(agent: Agent, params: Params, initial: State, num_steps: int) -> "Cache":
+        """Makes a cache for an episode of `num_steps` steps from each of B initial states."""
+        boards = jax.eval_shape(jax.vmap(observe), initial)
+        batch, width = jax.eval_shape(agent.encode, params, boards).shape
         return Cache(
-            layout_id=layout_id,
-            position=jnp.zeros(shape, jnp.int32),
-            features=jnp.zeros((*shape, width), jnp.float32),
+            layout_id=group_rows(layout_content(initial)).number,
+            position=jnp.zeros((num_steps + 1, batch), jnp.int32),
+            features=jnp.zeros((num_steps + 1, batch, width), jnp.float32),
             newest=jnp.full(2**CACHE_BITS, -1, jnp.int32),
         )
 
@@ -81,9 +76,15 @@ class Cache(NamedTuple):
 
         Encodes at most `encode_chunk_size` observations at once.
         """
+        batch, width = self.features.shape[1:]
         position = jax.vmap(position_id)(state)
         slot = slots(jnp.stack([self.layout_id, position], axis=1), CACHE_BITS)
-        is_known, known = self._look_up(position, slot)
+        met = self.newest[slot]
+        is_known = (
+            (met >= 0)
+            & (self.layout_id[met % batch] == self.layout_id)
+            & (self.position.reshape(-1)[met] == position)
+        )
         # False sorts before true: the distinct unknown observations come first.
         groups = group(is_known.astype(jnp.int32), self.layout_id, position)
         num_new = jnp.max(jnp.where(is_known, -1, groups.number)) + 1
@@ -91,8 +92,8 @@ class Cache(NamedTuple):
         new: Any = chunks.map_rows(
             agent.encode_rows, agent.config.encode_chunk_size, params, rows, num_new
         )
+        known = self.features.reshape(-1, width)[met]
         features = jnp.where(is_known[:, None], known, new[groups.number])
-        batch = len(self.layout_id)
         index = time * batch + jnp.arange(batch, dtype=jnp.int32)
         return features, self._replace(
             position=self.position.at[time].set(position),
@@ -100,10 +101,14 @@ class Cache(NamedTuple):
             newest=self.newest.at[slot].max(index),
         )
 
-    def _look_up(self, position: jax.Array, slot: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Returns which observations are known, bool[B], and their features f32[B, F]."""
-        met = self.newest[slot]
-        same_layout = self.layout_id[met % len(self.layout_id)] == self.layout_id
-        same_position = self.position.reshape(-1)[met] == position
-        features = self.features.reshape(-1, self.features.shape[-1])[met]
-        return (met >= 0) & same_layout & same_position, features
+    def observation_id(self) -> jax.Array:
+        """Returns i32[T + 1, B], equal only for equal observations, counted from 0."""
+        layout_id = jnp.broadcast_to(self.layout_id, self.position.shape)
+        groups = group(layout_id.reshape(-1), self.position.reshape(-1))
+        return groups.number.reshape(self.position.shape)
+
+
+def layout_content(layout: State) -> jax.Array:
+    """Returns rows u8[B, K], equal only for equal boards, palettes and tool extents."""
+    parts = (layout.board, layout.palette, layout.tool_extent.astype(jnp.uint8))
+    return jnp.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)

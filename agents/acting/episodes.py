@@ -17,6 +17,8 @@ CELL_AGENT, CELL_TOOL, CELL_FOOD = 0, 1, 2  # places in `Episodes.cells`
 class Episodes(NamedTuple):
     """B episodes of T steps; after an early end, the last state repeats.
 
+    Step t leads from observation t to observation t + 1.
+
     Attributes:
       layout: B states, whose board, palette and tool extent hold for the episode.
       cells: u8[T + 1, B, 3, 2], (row, column) of agent, tool and food at each observation; see
@@ -25,6 +27,7 @@ class Episodes(NamedTuple):
       reward: f32[T, B], extrinsic.
       discount: f32[T, B], 0 on the step that terminated the episode and after it, else 1.
       mask: f32[T, B], 1 on steps taken before the episode's end, else 0.
+      observation_id: i32[T + 1, B], equal only for equal observations, counted from 0.
     """
 
     layout: State
@@ -33,6 +36,7 @@ class Episodes(NamedTuple):
     reward: jax.Array
     discount: jax.Array
     mask: jax.Array
+    observation_id: jax.Array
 
     @property
     def solved(self) -> jax.Array:

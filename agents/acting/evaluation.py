@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.frames import Frame
-from agents.acting.rollout import Trajectory, rollout
+from agents.acting.rollout import rollout
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
@@ -46,21 +45,11 @@ def evaluate(agent: Agent, params: Params, env: Environment, tasks: State) -> Ev
       env: the dynamics and the step limit; its transfers are not used.
       tasks: B states at time 0.
     """
-    frame, played = play_greedily(agent, params, env, tasks)
-    episodes = played.episodes
-    action = jax.vmap(Frame.original_action)(frame, episodes.action.swapaxes(0, 1))
+    played = rollout(agent, params, env, tasks, key=None)
+    action = played.episodes.action.swapaxes(0, 1)
+    action = jax.vmap(Frame.original_action)(played.frame, action)
     value = played.value[:-1, :, 0].swapaxes(0, 1)
-    return Evaluation(episodes.solved, episodes.length, action, value)
-
-
-def play_greedily(
-    agent: Agent, params: Params, env: Environment, tasks: State
-) -> tuple[Frame, Trajectory]:
-    """Returns the frame of each task, and the episodes in these frames; see `evaluate`."""
-    frame = Frame.of(jnp.zeros(len(tasks.time), jnp.int32))
-    if agent.config.align_to_food:
-        frame = jax.vmap(Frame.facing_food)(jax.vmap(tt.observe)(tasks))
-    return frame, rollout(agent, params, env, jax.vmap(Frame.state)(frame, tasks), key=None)
+    return Evaluation(played.episodes.solved, played.episodes.length, action, value)
 
 
 class Evaluator:
@@ -71,8 +60,8 @@ class Evaluator:
 
         Args:
           config: settings of the policies to evaluate.
-          tasks: the tasks of each set, by name; see `evaluation_tasks`. If `config.max_steps` is
-            None, the names must be those of registered sets, whose limits hold.
+          tasks: the tasks of each set, by name. If `config.max_steps` is None, the names must be
+            those of registered sets, whose limits hold.
 
         Raises:
           ValueError: `config.max_steps` is None, and a set is not registered.
@@ -82,7 +71,7 @@ class Evaluator:
         self._ends = np.cumsum([len(states.time) for states in self.tasks.values()])
         together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
         self._blocks = [take(together, block) for block in blocks(int(self._ends[-1]))]
-        # All sets are played up to the largest limit; `_within` cuts off steps beyond a set's.
+        # All sets are played up to the largest limit; a call cuts off steps beyond a set's.
         longest = max(self.limits.values())
         env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
         agent = Agent(config)
@@ -105,11 +94,14 @@ class Evaluator:
         """Plays all tasks; returns NumPy arrays by the names of the sets."""
         played = [jax.tree.map(np.asarray, self._play(params, states)) for states in self._blocks]
         whole = jax.tree.map(lambda *parts: np.concatenate(parts), *played)
-        starts = [0, *self._ends[:-1]]
-        return {
-            name: _within(take(whole, slice(start, end)), self.limits[name])
-            for name, start, end in zip(self.tasks, starts, self._ends, strict=True)
-        }
+        outcomes = {}
+        for name, start, end in zip(self.tasks, [0, *self._ends], self._ends, strict=False):
+            outcome, limit = take(whole, slice(start, end)), self.limits[name]
+            outcomes[name] = outcome._replace(
+                solved=outcome.solved & (outcome.length <= limit),
+                length=np.minimum(outcome.length, limit),
+            )
+        return outcomes
 
     def scores(
         self,
@@ -137,11 +129,3 @@ class Evaluator:
 def own_and_paper_sets(config: Config) -> tuple[str, ...]:
     """Returns the short names of the paper's eight sets and of the training set."""
     return tuple(dict.fromkeys((*ALL_SETS, tt.task_set(config.env_id).short)))
-
-
-def _within(outcome: Evaluation, limit: int) -> Evaluation:
-    """Truncates the episodes after `limit` steps."""
-    return outcome._replace(
-        solved=outcome.solved & (outcome.length <= limit),
-        length=np.minimum(outcome.length, limit),
-    )

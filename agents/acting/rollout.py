@@ -3,16 +3,17 @@
 Source: paper, section "Experimental Setup".
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from agents.acting.encodings import Cache
 from agents.acting.episodes import Episodes, cells_of
-from agents.acting.identity import layout_ids
+from agents.acting.frames import Frame
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
+from trap_tube_jax.observation import observe
 from trap_tube_jax.state import State
 
 
@@ -20,26 +21,20 @@ class Trajectory(NamedTuple):
     """Episodes and the network's outputs, under the parameters that acted.
 
     Attributes:
-      episodes: B episodes of T steps.
+      frame: B frames in which the episodes were played.
+      episodes: B episodes of T steps, in these frames.
       features: f32[T + 1, B, F], the encoded observations.
       embedding: f32[T, B, hidden], the GRU's outputs.
       log_prob: f32[T, B], of the actions.
       value: f32[T + 1, B, V], of every observation, the last one included, by value head.
     """
 
+    frame: Frame
     episodes: Episodes
     features: jax.Array
     embedding: jax.Array
     log_prob: jax.Array
     value: jax.Array
-
-
-class _Carry(NamedTuple):
-    state: State
-    embedding: jax.Array
-    action_tm1: jax.Array
-    reward_tm1: jax.Array
-    cache: Cache
 
 
 def rollout(
@@ -48,50 +43,46 @@ def rollout(
     """Plays one episode from each of B initial states.
 
     Args:
-      agent: the network.
+      agent: the network; with `align_to_food` it acts in frames that face the food.
       params: its parameters.
       env: the dynamics; `max_steps` is T.
       initial: B states at time 0.
       key: PRNG key of the actions; None takes the most probable ones.
     """
+    batch = len(initial.time)
+    frame = Frame.of(jnp.zeros(batch, jnp.int32))
+    if agent.config.align_to_food:
+        frame = jax.vmap(Frame.facing_food)(jax.vmap(observe)(initial))
+        initial = jax.vmap(Frame.state)(frame, initial)
 
-    def step(carry: _Carry, inputs: tuple[jax.Array, jax.Array | None]) -> tuple[_Carry, dict]:
+    def step(carry: Any, inputs: Any) -> Any:
         time, step_key = inputs
-        before, embedding, action_tm1, reward_tm1, cache = carry
-        features, cache = cache.encode(agent, params, before, time)
+        state, embedding, action_tm1, reward_tm1, cache = carry
+        features, cache = cache.encode(agent, params, state, time)
         embedding = agent.step(params, embedding, features, action_tm1, reward_tm1)
         actions, value = agent.policy_and_value(params, embedding)
         action = actions.mode() if step_key is None else actions.sample(step_key)
-        after, timestep = jax.vmap(env.step)(before, action)
-        record = {
-            "cells": cells_of(before),
+        after, timestep = jax.vmap(env.step)(state, action)
+        taken = {
             "action": action,
             "reward": timestep.reward,
             "discount": timestep.discount,
-            "mask": (~(before.terminated | before.truncated)).astype(jnp.float32),
-            "embedding": embedding,
-            "log_prob": actions.log_prob(action),
-            "value": value,
+            "mask": (~(state.terminated | state.truncated)).astype(jnp.float32),
         }
-        return _Carry(after, embedding, action, timestep.reward, cache), record
+        outputs = (cells_of(state), value, taken, embedding, actions.log_prob(action))
+        return (after, embedding, action, timestep.reward, cache), outputs
 
-    batch = len(initial.time)
-    first = _Carry(
-        state=initial,
-        embedding=agent.initial_state(params, batch),
-        action_tm1=jnp.zeros((batch, 2), jnp.int32),
-        reward_tm1=jnp.zeros(batch, jnp.float32),
-        cache=Cache.empty(layout_ids(initial), env.max_steps, agent.width),
+    first = (
+        initial,
+        agent.initial_state(params, batch),
+        jnp.zeros((batch, 2), jnp.int32),
+        jnp.zeros(batch, jnp.float32),
+        Cache.empty(agent, params, initial, env.max_steps),
     )
     # One more step than the episode has, for the last observation; states do not change any more.
     times = jnp.arange(env.max_steps + 1, dtype=jnp.int32)
     keys = None if key is None else jax.random.split(key, len(times))
-    end, record = jax.lax.scan(step, first, (times, keys))
-    taken = {name: record[name][:-1] for name in ("action", "reward", "discount", "mask")}
-    return Trajectory(
-        episodes=Episodes(layout=initial, cells=record["cells"], **taken),
-        features=end.cache.features,
-        embedding=record["embedding"][:-1],
-        log_prob=record["log_prob"][:-1],
-        value=record["value"],
-    )
+    (*_, cache), (cells, value, *outputs) = jax.lax.scan(step, first, (times, keys))
+    taken, embedding, log_prob = jax.tree.map(lambda x: x[:-1], outputs)
+    episodes = Episodes(initial, cells, **taken, observation_id=cache.observation_id())
+    return Trajectory(frame, episodes, cache.features, embedding, log_prob, value)

@@ -16,21 +16,18 @@ Params = Any
 
 
 class Experience(NamedTuple):
-    """Episodes, and what the networks computed from them.
-
-    Step t leads from observation t to observation t + 1.
+    """Episodes, and what the networks compute from them.
 
     Attributes:
       episodes: B episodes of T steps.
-      observation_id: i32[T + 1, B], equal only for equal observations.
       features: f32[T + 1, B, F], the observations encoded by `Curiosity.encode`.
-      embedding: f32[T, B, H], the GRU's output h at the step; None unless `needs_embeddings`.
-      next_embedding: f32[T, B, H], h', the GRU's output after the step; likewise.
-      action_embedding: f32[T, B, E], the policy's embedding of the action; likewise.
+      embedding: f32[T, B, H], the GRU's output h at the step.
+      next_embedding: f32[T, B, H], h', its output after the step; None unless
+        `Curiosity.needs_next_embedding`.
+      action_embedding: f32[T, B, E], the policy's embedding of the action.
     """
 
     episodes: Episodes
-    observation_id: jax.Array
     features: jax.Array
     embedding: Any = None
     next_embedding: Any = None
@@ -43,17 +40,10 @@ class Curiosity:
     All methods are pure functions of arrays. Attributes are settings and modules, never arrays.
 
     Attributes:
-      needs_embeddings: computes the embeddings of `Experience`, which takes a second pass of the
-        GRU.
+      needs_next_embedding: asks for `Experience.next_embedding`, a second pass of the GRU.
     """
 
-    needs_embeddings = False
-
-    def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and vars(self) == vars(other)
-
-    def __hash__(self) -> int:
-        return hash(type(self))
+    needs_next_embedding = False
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws parameters, trained together with the policy's; {} if there are none.

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 
 import trap_tube_jax as tt
-from agents.acting.episodes import Episodes
-from agents.acting.identity import layout_hashes, position_ids
+from agents.acting.encodings import layout_content
+from agents.acting.episodes import Episodes, place
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.networks.grouping import slots
+from agents.networks.grouping import hash_rows, slots
 from trap_tube_jax.environment import Environment
+from trap_tube_jax.positions import position_id
 
 VISIT_BITS = 20  # of an observation's hash, in the table of visits
 
@@ -52,10 +53,10 @@ class Counts(Curiosity):
 
 def observation_slots(episodes: Episodes) -> jax.Array:
     """Returns the slot i32[T + 1, B] of every observation."""
-    position = position_ids(episodes)
-    layout = jnp.broadcast_to(layout_hashes(episodes.layout), position.shape)
-    rows = jnp.stack([layout, position.astype(jnp.uint32)], axis=-1)
-    return slots(rows, VISIT_BITS)
+    states = jax.vmap(jax.vmap(place), in_axes=(None, 0))(episodes.layout, episodes.cells)
+    position = jax.vmap(jax.vmap(position_id))(states).astype(jnp.uint32)
+    layout = jnp.broadcast_to(hash_rows(layout_content(episodes.layout)), position.shape)
+    return slots(jnp.stack([layout, position], axis=-1), VISIT_BITS)
 
 
 def visit_bonus(visits: jax.Array, slot: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:

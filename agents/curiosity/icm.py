@@ -47,7 +47,7 @@ class ICM(Curiosity):
     stopped, so both losses train the policy's encoder.
     """
 
-    needs_embeddings = True
+    needs_next_embedding = True
 
     def __init__(self, config: Config):
         self._forward, self._inverse = ForwardModel(), InverseModel(config.hidden)

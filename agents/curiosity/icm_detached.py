@@ -26,7 +26,7 @@ class DetachedICM(ICM):
       detached: stops the gradient of the forward model's error at the features.
     """
 
-    needs_embeddings = False
+    needs_next_embedding = False
     detached = True
 
     def __init__(self, config: Config):

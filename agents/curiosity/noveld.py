@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from agents.acting.identity import first_visits
 from agents.curiosity.base import Experience, Params
 from agents.curiosity.rnd import RND
+from agents.curiosity.visits import first_visits
 
 ALPHA = 0.5  # of the paper
 
@@ -25,4 +25,4 @@ class NovelD(RND):
         """Returns the rise of novelty, at first visits."""
         novelty = jnp.linalg.norm(experience.features, axis=-1)
         rise = jnp.maximum(novelty[1:] - ALPHA * novelty[:-1], 0.0)
-        return rise * first_visits(experience.observation_id)[1:], memory
+        return rise * first_visits(experience.episodes.observation_id)[1:], memory

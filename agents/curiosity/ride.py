@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from agents.acting.identity import visits
 from agents.curiosity.base import Experience, Params
 from agents.curiosity.icm_detached import DetachedICM
+from agents.curiosity.visits import visits
 
 
 class RIDE(DetachedICM):
@@ -25,4 +25,4 @@ class RIDE(DetachedICM):
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns the change of the features, divided by the root of the visits."""
         change = jnp.linalg.norm(jnp.diff(experience.features, axis=0), axis=-1)
-        return change / jnp.sqrt(visits(experience.observation_id)[1:]), memory
+        return change / jnp.sqrt(visits(experience.episodes.observation_id)[1:]), memory

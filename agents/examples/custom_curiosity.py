@@ -1,6 +1,6 @@
 """A curiosity of your own: it pays for moves of the tool, less the more there have been.
 
-python -m agents.examples.custom_curiosity --help
+python -m agents.examples.custom_curiosity
 python -m agents.train --import agents.examples.custom_curiosity --curiosity tool-moves
 """
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import tyro
 
 from agents import Config, TrainState, make_train
 from agents.acting.episodes import CELL_TOOL
@@ -35,7 +34,7 @@ class ToolMoves(Curiosity):
 register("tool-moves", lambda config, env: ToolMoves())
 
 
-def train(config: Config, iterations: int) -> tuple[TrainState, dict[str, jax.Array]]:
+def main(config: Config, iterations: int = 20) -> tuple[TrainState, dict[str, jax.Array]]:
     """Trains for at least one iteration; returns the last state and metrics."""
     learner = make_train(config)
     iterate = jax.jit(learner.iterate)
@@ -49,14 +48,5 @@ def train(config: Config, iterations: int) -> tuple[TrainState, dict[str, jax.Ar
     return state, metrics
 
 
-def main(iterations: int = 20) -> None:
-    """Trains on base with a reward for moves of the tool.
-
-    Args:
-      iterations: number of iterations.
-    """
-    train(Config.preset("fast", curiosity="tool-moves"), iterations)
-
-
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(Config.preset("fast", curiosity="tool-moves"))

@@ -1,11 +1,10 @@
 """A transfer of your own, and the score of an agent that was trained without it.
 
-python -m agents.examples.custom_transfer --help
+python -m agents.examples.custom_transfer
 """
 
 import jax
 import jax.numpy as jnp
-import tyro
 
 import agents
 import trap_tube_jax as tt
@@ -29,15 +28,11 @@ tt.register("MirroredTrapTube-v0", (mirrored,), short="mirrored")
 
 
 def main(tasks: int = 100) -> tt.Scores:
-    """Scores the shipped agent `fast-base` on base and on its mirror image.
-
-    Args:
-      tasks: number of tasks of the new set.
-    """
+    """Scores the shipped agent `fast-base` on base and on this number of tasks of the new set."""
     scores = tt.score(agents.load("fast-base"), sets=["base", "mirrored"], tasks=tasks)
     print(scores)
     return scores
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main()

@@ -1,8 +1,8 @@
 """Recurrent PPO with an intrinsic curiosity module in one file, to read from top to bottom.
 
-Network, rewards, losses and settings are those of preset `paper`, computed in the plainest way:
-by Flax's own layers, with every observation encoded wherever it occurs. `agents.ppo` computes the
-same losses, and `python -m benchmarks.learner_peers` compares the two in speed. To train:
+Network, rewards, losses and settings are those of preset `paper`, computed in the plainest way.
+`agents.ppo` computes the same losses; `python -m benchmarks.learner_peers` compares the two in
+speed. To train:
 
     python -m agents.examples.plain_ppo --help
 
@@ -18,10 +18,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
-import tyro
+from flax.training import train_state
 
 import trap_tube_jax as tt
 from agents import Config
+from agents.command_line import parse
 from agents.examples.near_food import NEAR_FOOD
 
 Batch = tuple["Episode", jax.Array, jax.Array]  # [B, ...]; advantage and value target f32[B, T]
@@ -41,13 +42,10 @@ class Episode(NamedTuple):
     value: jax.Array  # f32[T]
 
 
-class TrainState(NamedTuple):
-    """The state of training."""
+class TrainState(train_state.TrainState):
+    """Parameters and the optimizer's state, moving averages and a PRNG key."""
 
-    params: Any
-    opt_state: Any
-    variance: jax.Array  # f32[2], moving averages, of extrinsic and intrinsic reward
-    iteration: jax.Array  # i32[]
+    variance: jax.Array  # f32[2], of extrinsic and intrinsic reward
     key: jax.Array
 
 
@@ -126,22 +124,28 @@ def discounted_sum(x: jax.Array, discount: float) -> jax.Array:
     return x @ jnp.tril(jax.scipy.linalg.toeplitz(discount ** jnp.arange(x.shape[1])))
 
 
-@dataclasses.dataclass(frozen=True)
 class PlainPPO:
     """Training as pure functions; an iteration is `collect`, then an `update` per minibatch."""
 
-    config: Config
-    env: Any
-    network: Any
-    optimizer: optax.GradientTransformation
+    def __init__(self, config: Config, env: Any = None, encoder: nn.Module | None = None):
+        self.config, self.env = config, env or tt.make(config.env_id, max_steps=config.max_steps)
+        encoder = encoder or Encoder(config.filters)
+        self.network: Any = Network(encoder, config.hidden, config.embedding)
+        self.apply = jax.vmap(self.network.apply, (None, 0))  # to episodes [B, ...]
 
     def init(self, key: jax.Array) -> TrainState:
         """Draws the parameters."""
         params_key, key = jax.random.split(key)
         observation = jnp.zeros((2, *self.env.observation_spec.shape), jnp.uint8)
         episode = Episode(observation, jnp.zeros((1, 2), jnp.int32), *jnp.zeros((4, 1)))
-        params = self.network.init(params_key, episode)
-        return TrainState(params, self.optimizer.init(params), jnp.zeros(2), jnp.int32(0), key)
+        adam = optax.adam(self.config.learning_rate, eps=self.config.adam_epsilon)
+        return TrainState.create(
+            apply_fn=self.network.apply,
+            params=self.network.init(params_key, episode),
+            tx=optax.chain(optax.clip_by_global_norm(self.config.max_gradient_norm), adam),
+            variance=jnp.zeros(2),
+            key=key,
+        )
 
     def collect(self, state: TrainState) -> tuple[TrainState, Batch, jax.Array]:
         """Plays the episodes of an iteration, and draws its minibatches i32[updates, size]."""
@@ -151,7 +155,7 @@ class PlainPPO:
         variance, batch = self.prepare(state, episode)
         orders = [jax.random.permutation(k, count) for k in jax.random.split(order_key, epochs)]
         minibatches = jnp.concatenate(orders).reshape(-1, self.config.minibatch_size)
-        return TrainState(*state[:2], variance, state.iteration + 1, key), batch, minibatches
+        return state.replace(variance=variance, key=key), batch, minibatches
 
     def play(self, params: Any, key: jax.Array) -> Episode:
         """Plays an episode."""
@@ -177,9 +181,9 @@ class PlainPPO:
     def prepare(self, state: TrainState, episode: Episode) -> tuple[jax.Array, Batch]:
         """Adds both rewards, estimates advantages; returns the rewards' variances and a batch."""
         config, mask = self.config, episode.mask
-        error = jax.vmap(self.network.apply, (None, 0))(state.params, episode)[2]
+        error = self.apply(state.params, episode)[2]
         rewards = jnp.stack([episode.reward, mask * jnp.sum(error, axis=-1)])
-        keep = jnp.where(state.iteration > 0, config.reward_ema_decay, 0.0)
+        keep = jnp.where(state.step > 0, config.reward_ema_decay, 0.0)
         fresh = jnp.var(rewards, axis=(1, 2), where=mask > 0)
         variance = keep * state.variance + (1 - keep) * fresh
         scale = jnp.array([1, config.intrinsic_coef]) / jnp.where(variance > 0, variance, 1) ** 0.5
@@ -195,14 +199,12 @@ class PlainPPO:
         """Takes a gradient step on the episodes at `places`; returns the terms of the loss, too."""
         minibatch = jax.tree.map(lambda x: x[places], batch)
         gradient, terms = jax.grad(self.loss, has_aux=True)(state.params, minibatch)
-        updates, opt_state = self.optimizer.update(gradient, state.opt_state)
-        params = optax.apply_updates(state.params, updates)
-        return TrainState(params, opt_state, *state[2:]), terms
+        return state.apply_gradients(grads=gradient), terms
 
     def loss(self, params: Any, batch: Batch) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Returns the loss f32[] and its terms, in whose means padding counts as zeros."""
         config, (episode, advantage, target) = self.config, batch
-        logits, value, error, inferred = jax.vmap(self.network.apply, (None, 0))(params, episode)
+        logits, value, error, inferred = self.apply(params, episode)
         entropy = optax.softmax_cross_entropy(logits, jax.nn.softmax(logits)).sum(axis=-1)
         ratio = jnp.exp(log_prob(logits, episode.action) - episode.log_prob)
         clipped = jnp.clip(ratio, 1 - config.clip_eps, 1 + config.clip_eps)
@@ -217,27 +219,26 @@ class PlainPPO:
         return sum(terms.values(), jnp.zeros(())), terms
 
 
-def make_train(config: Config, env: Any = None, encoder: nn.Module | None = None) -> PlainPPO:
-    """Returns training, by default in the config's environment with the paper's encoder."""
-    env = env or tt.make(config.env_id, max_steps=config.max_steps)
-    network = Network(encoder or Encoder(config.filters), config.hidden, config.embedding)
-    adam = optax.adam(config.learning_rate, eps=config.adam_epsilon)
-    clip = optax.clip_by_global_norm(config.max_gradient_norm)
-    return PlainPPO(config, env, network, optax.chain(clip, adam))
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Trains with 64 episodes and 20 gradient steps an iteration.
 
-
-def main(env: str = NEAR_FOOD.short, iterations: int = 10) -> float:
-    """Trains with 64 episodes and 20 gradient steps an iteration; returns the last success.
-
-    Args:
+    Attributes:
       env: task set, by id or short name; by default one that is learned within a minute.
       iterations: number of iterations.
     """
+
+    env: str = NEAR_FOOD.short
+    iterations: int = 10
+
+
+def main(options: Options) -> float:
+    """Trains; returns the fraction of the last iteration's episodes that were solved."""
     small = {"episodes_per_iteration": 64, "minibatch_size": 16, "epochs": 5}
-    learner = make_train(Config.preset("paper", env_id=env, **small))
+    learner = PlainPPO(Config.preset("paper", env_id=options.env, **small))
     collect, update = jax.jit(learner.collect), jax.jit(learner.update)
     state, success = learner.init(jax.random.key(0)), 0.0
-    for iteration in range(1, iterations + 1):
+    for iteration in range(1, options.iterations + 1):
         state, batch, minibatches = collect(state)
         for places in minibatches:
             state, _ = update(state, batch, places)
@@ -247,4 +248,4 @@ def main(env: str = NEAR_FOOD.short, iterations: int = 10) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(parse(Options, None, "python -m agents.examples.plain_ppo"))

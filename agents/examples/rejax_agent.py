@@ -1,13 +1,12 @@
 """Trains rejax's PPO and scores it; needs the extra `interop`.
 
-python -m agents.examples.rejax_agent --help
+python -m agents.examples.rejax_agent
 """
 
 from collections.abc import Callable
 
 import jax
 import rejax  # pyright: ignore[reportMissingImports]
-import tyro
 
 import trap_tube_jax as tt
 from agents.examples.near_food import NEAR_FOOD
@@ -15,11 +14,7 @@ from trap_tube_jax.adapters import to_gymnax
 
 
 class Policy:
-    """Adapts an agent of rejax to `tt.score`.
-
-    Args:
-      act: maps one observation u8[12, 12, N] and a key to 4 * grasp + move.
-    """
+    """Adapts to `tt.score` a function from u8[12, 12, N] and a key to 4 * grasp + move."""
 
     def __init__(self, act: Callable[[jax.Array, jax.Array], jax.Array]):
         self._act = act
@@ -38,11 +33,7 @@ class Policy:
 
 
 def main(total_timesteps: int = 8_192) -> tt.Scores:
-    """Trains where food is near, and scores there and on base, which was not trained.
-
-    Args:
-      total_timesteps: environment steps of training.
-    """
+    """Trains where food is near, and scores there and on base, which was not trained."""
     env, params = to_gymnax.make(NEAR_FOOD.id)
     ppo = rejax.PPO.create(
         env=env,
@@ -62,4 +53,4 @@ def main(total_timesteps: int = 8_192) -> tt.Scores:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main()

@@ -1,11 +1,10 @@
 """Trains Stable-Baselines3's PPO and scores it; needs the extra `interop`.
 
-python -m agents.examples.sb3_agent --help
+python -m agents.examples.sb3_agent
 """
 
 import stable_baselines3  # pyright: ignore[reportMissingImports]
 import torch  # pyright: ignore[reportMissingImports]
-import tyro
 
 import trap_tube_jax as tt
 from agents.examples.near_food import NEAR_FOOD
@@ -13,11 +12,7 @@ from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv
 
 
 def main(total_timesteps: int = 3_000) -> tt.Scores:
-    """Trains where food is near, and scores there and on base, which was not trained.
-
-    Args:
-      total_timesteps: environment steps of training.
-    """
+    """Trains where food is near, and scores there and on base, which was not trained."""
     torch.set_num_threads(1)  # otherwise its threads and JAX's wait for each other
     env = TrapTubeEnv(NEAR_FOOD.id)
     model = stable_baselines3.PPO(
@@ -30,4 +25,4 @@ def main(total_timesteps: int = 3_000) -> tt.Scores:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main()

@@ -1,6 +1,5 @@
 """The policy network as pure functions of its parameters: encoder, recurrent core, heads."""
 
-import functools
 from typing import Any
 
 import flax.linen as nn
@@ -21,10 +20,7 @@ PARTS = ("encoder", "core", "heads")  # of the parameters of the policy network
 
 
 class Agent:
-    """Functions of the policy network; their parameters are a dictionary of `PARTS`.
-
-    The rollout applies `align_to_food` and `encode_chunk_size`; these functions do not.
-    """
+    """Functions of the policy network; their parameters are a dictionary of `PARTS`."""
 
     def __init__(self, config: Config):
         self.config = config
@@ -32,22 +28,11 @@ class Agent:
         self.core = Core(config.hidden, config.embedding, config.recurrent)
         self.heads = Heads(config.num_value_heads)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Agent) and self.config == other.config
-
-    def __hash__(self) -> int:
-        return hash(self.config)
-
-    @functools.cached_property
-    def width(self) -> int:
-        """F, the number of features of an encoded observation."""
-        init = functools.partial(self.encoder.init_with_output, jax.random.key(0))
-        return jax.eval_shape(init, self._board())[0].shape[-1]
-
     def init(self, key: jax.Array) -> Params:
         """Draws the parameters."""
+        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         # Only layers of Flax, in an encoder of your own, use the folded key; see `draw`.
-        features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), self._board())
+        features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
         params = {
@@ -91,38 +76,17 @@ class Agent:
         return _apply(self.core, params["core"], action, method=Core.embed_action)
 
     def unroll(
-        self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
-    ) -> jax.Array:
-        """Returns the GRU's outputs h at every step, f32[T, B, hidden].
-
-        Features are f32[T + 1, B, F], actions i32[T, B, 2], rewards f32[T, B].
-        """
-        inputs = self._unroll_inputs(params, features, action, reward)[:-1]
-        return _apply(self.core, params["core"], inputs, method=Core.unroll)
-
-    def unroll_both(
-        self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Returns h at every step and h' after it, each f32[T, B, hidden].
-
-        h' starts from the initial state at the second observation, with the action and reward
-        just taken as the previous ones (agents/agent.md, "Curiosity").
-        """
-        inputs = self._unroll_inputs(params, features, action, reward)
-        both = jnp.concatenate([inputs[:-1], inputs[1:]], axis=1)
-        now, after = jnp.split(_apply(self.core, params["core"], both, method=Core.unroll), 2, 1)
-        return now, after
-
-    def _unroll_inputs(
-        self, params: Params, features: jax.Array, action: jax.Array, reward: jax.Array
-    ) -> jax.Array:
-        """Returns the GRU's inputs at all observations, f32[T + 1, B, 3 * hidden]."""
-        tm1 = [jnp.concatenate([jnp.zeros_like(x[:1]), x]) for x in (action, reward)]
-        return _apply(self.core, params["core"], features, *tm1, method=Core.inputs)
-
-    def _board(self) -> jax.Array:
-        """Returns an observation, for its shape."""
-        return jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
+        self,
+        params: Params,
+        features: jax.Array,
+        action: jax.Array,
+        reward: jax.Array,
+        *,
+        both: bool = False,
+    ) -> tuple[jax.Array, jax.Array | None]:
+        """Returns the GRU's outputs h at every step, and h' or None; see `Core.unroll`."""
+        given = (features, action, reward)
+        return _apply(self.core, params["core"], *given, both=both, method=Core.unroll)
 
 
 def num_parameters(params: Params) -> int:

@@ -91,14 +91,34 @@ class Core(nn.Module):
         candidate = jnp.tanh(candidate_x + reset * candidate_h)
         return update * state + (1 - update) * candidate
 
-    def unroll(self, inputs: jax.Array) -> jax.Array:
-        """Runs the GRU from the initial state: f32[T, B, 3 * hidden] to f32[T, B, hidden]."""
+    def unroll(
+        self, features: jax.Array, action: jax.Array, reward: jax.Array, *, both: bool
+    ) -> tuple[jax.Array, jax.Array | None]:
+        """Runs the GRU over episodes, from the initial state.
+
+        Args:
+          features: f32[T + 1, B, F], the encoded observations.
+          action: i32[T, B, 2], (grasp, move).
+          reward: f32[T, B].
+          both: computes h', too.
+
+        Returns:
+          h at every step, f32[T, B, hidden], and h' after it or None. h' starts from the initial
+          state at the second observation (agents/agent.md, "Curiosity").
+        """
+        tm1 = [jnp.concatenate([jnp.zeros_like(x[:1]), x]) for x in (action, reward)]
+        inputs = self.inputs(features, *tm1)
+        inputs = jnp.concatenate([inputs[:-1], inputs[1:]], axis=1) if both else inputs[:-1]
 
         def body(state: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
             state = self.advance(state, x)
             return state, state
 
-        return jax.lax.scan(body, self.initial_state(inputs.shape[1]), inputs)[1]
+        _, output = jax.lax.scan(body, self.initial_state(inputs.shape[1]), inputs)
+        if not both:
+            return output, None
+        now, after = jnp.split(output, 2, axis=1)
+        return now, after
 
 
 class Heads(nn.Module):

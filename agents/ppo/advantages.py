@@ -1,7 +1,16 @@
 """Advantages and value targets from extrinsic and intrinsic rewards.
 
-Two rules join both rewards: `combined_advantages` adds the rewards, `separate_advantages` adds the
-advantages.
+`Config.value_heads` chooses one of two rules. `shared` adds the rewards, each divided by its
+standard deviation, and estimates the advantages of the sum:
+
+  r_t = r^ext_t / std(r^ext) + intrinsic_coef * r^int_t / std(r^int).
+
+`separate` estimates the advantages of each reward, normalises them and adds them. In a sum of
+rewards the one of higher variance dominates: once easy tasks pay, the intrinsic reward vanishes in
+their variance (Burda et al., 2019b). The extrinsic reward, at most 1 an episode, is not scaled. The
+intrinsic one is scaled so that the standard deviation of its returns is `INTRINSIC_RETURN_STD`. Its
+stream continues after an episode's end with the next episode, which is worth the mean of v_0, so
+finishing a task early forgoes no novelty.
 
 Source: Schulman et al. (2016); Burda et al. (2019b), "Combining intrinsic and extrinsic returns";
 agents/agent.md, "PPO".
@@ -22,7 +31,7 @@ INTRINSIC_RETURN_STD = 0.3
 # Added to the variance of advantages, so that those of a nearly constant reward stay small.
 VARIANCE_FLOOR = 4e-4
 
-RewardMoments = tuple[returns.Moments, returns.Moments]
+RewardMoments = tuple[returns.Moments, returns.Moments]  # of extrinsic and intrinsic reward
 
 
 def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
@@ -37,30 +46,19 @@ def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
 def update_moments(
     config: Config, moments: RewardMoments, episodes: Episodes, intrinsic_reward: jax.Array
 ) -> RewardMoments:
-    """Updates the moments by which rewards are scaled.
+    """Updates the moments by B episodes with intrinsic rewards f32[T, B].
 
-    Args:
-      config: settings.
-      moments: moments of the extrinsic reward, and of the intrinsic one.
-      episodes: B episodes of T steps.
-      intrinsic_reward: f32[T, B].
-
-    Returns:
-      With shared value heads, moments of both rewards. With separate ones the first stay, and the
-      second are of the discounted intrinsic returns.
+    With separate value heads, the second moments are of the discounted intrinsic returns.
     """
+    if config.value_heads == "separate":
+        intrinsic_reward = returns.discounted_returns(intrinsic_reward, config.discount)
     extrinsic, intrinsic = moments
     mask, decay = episodes.mask, config.reward_ema_decay
-    if config.value_heads == "shared":
-        extrinsic = extrinsic.update(episodes.reward, mask, decay)
-        return extrinsic, intrinsic.update(intrinsic_reward, mask, decay)
-    if config.num_value_heads == 1:
-        return moments
-    intrinsic_return = returns.discounted_returns(intrinsic_reward, config.discount)
-    return extrinsic, intrinsic.update(intrinsic_return, mask, decay)
+    extrinsic = extrinsic.update(episodes.reward, mask, decay)
+    return extrinsic, intrinsic.update(intrinsic_reward, mask, decay)
 
 
-def combined_advantages(
+def estimate(
     config: Config,
     episodes: Episodes,
     intrinsic_reward: jax.Array,
@@ -68,57 +66,31 @@ def combined_advantages(
     value: jax.Array,
     moments: RewardMoments,
 ) -> tuple[jax.Array, jax.Array]:
-    """Estimates the advantages of the weighted sum of both rewards.
-
-      r_t = r^ext_t / std(r^ext) + intrinsic_coef * r^int_t / std(r^int)
+    """Estimates the advantages of both rewards together.
 
     Args:
       config: settings.
       episodes: B episodes of T steps.
       intrinsic_reward: f32[T, B], 0 after an episode's end.
       intrinsic_coef: weight of the intrinsic reward.
-      value: f32[T + 1, B, V], values of all observations; V = 1.
+      value: f32[T + 1, B, V], values of all observations. With separate value heads the first is
+        of the extrinsic reward, the second of the intrinsic one; V = 1 without a curiosity.
       moments: moments as returned by `update_moments`.
 
     Returns:
       Advantages f32[T, B] and value targets f32[T, B, V].
     """
-    extrinsic, intrinsic = moments
-    reward = episodes.reward / extrinsic.std
-    reward = reward + intrinsic_coef * intrinsic_reward / intrinsic.std
-    advantage, target = advantages_and_targets(config, reward, episodes, value[..., 0])
-    return advantage, target[..., None]
-
-
-def separate_advantages(
-    config: Config,
-    episodes: Episodes,
-    intrinsic_reward: jax.Array,
-    intrinsic_coef: jax.typing.ArrayLike,
-    value: jax.Array,
-    moments: RewardMoments,
-) -> tuple[jax.Array, jax.Array]:
-    """Estimates the advantages of both rewards, and adds them after normalising each.
-
-    In a sum of rewards the one of higher variance dominates: once easy tasks pay, the intrinsic
-    reward vanishes in their variance (Burda et al., 2019b).
-
-    The extrinsic reward, at most 1 an episode, is not scaled. The intrinsic one is scaled so that
-    the standard deviation of its returns is `INTRINSIC_RETURN_STD`. Its stream continues after an
-    episode's end with the next episode, which is worth the mean of v_0, so finishing a task early
-    forgoes no novelty.
-
-    Arguments and results are those of `combined_advantages`, with V = 2: the extrinsic and the
-    intrinsic value. Without a curiosity V = 1, the extrinsic value.
-    """
-    mask = episodes.mask
-    task, task_target = advantages_and_targets(config, episodes.reward, episodes, value[..., 0])
+    mask, (extrinsic, intrinsic) = episodes.mask, moments
+    reward = episodes.reward
+    if config.value_heads == "shared":
+        reward = reward / extrinsic.std + intrinsic_coef * intrinsic_reward / intrinsic.std
+    task, task_target = advantages_and_targets(config, reward, episodes, value[..., 0])
     if config.num_value_heads == 1:
         return task, task_target[..., None]
     continues = jnp.concatenate([mask, jnp.zeros_like(mask[:1])]) > 0
     own = jnp.where(continues, value[..., 1], jnp.mean(value[0, :, 1]))
     discount = jnp.full_like(intrinsic_reward, config.discount)
-    reward = INTRINSIC_RETURN_STD * intrinsic_reward / moments[1].std
+    reward = INTRINSIC_RETURN_STD * intrinsic_reward / intrinsic.std
     curiosity = returns.generalized_advantages(reward, discount, own, mask, config.gae_lambda)
     advantage = returns.normalize(task, mask, VARIANCE_FLOOR)
     advantage += intrinsic_coef * returns.normalize(curiosity, mask, VARIANCE_FLOOR)
@@ -140,12 +112,13 @@ def advantages_and_targets(
       episodes: B episodes of T steps.
       value: f32[T + 1, B], values of all observations.
     """
-    gamma, lambda_ = config.discount, config.gae_lambda
-    if config.bootstrap == "value":
-        discount = gamma * episodes.discount
-        advantage = returns.generalized_advantages(reward, discount, value, episodes.mask, lambda_)
-        return advantage, advantage + value[:-1]
-    value = jnp.concatenate([value[:-1], value[-2:-1]])
-    discount = jnp.full_like(reward, gamma)
-    advantage = returns.generalized_advantages(reward, discount, value, episodes.mask, lambda_)
-    return advantage, returns.discounted_returns(reward, gamma)
+    gamma, discount = config.discount, config.discount * episodes.discount
+    if config.bootstrap == "baseline":
+        value = jnp.concatenate([value[:-1], value[-2:-1]])
+        discount = jnp.full_like(reward, gamma)
+    advantage = returns.generalized_advantages(
+        reward, discount, value, episodes.mask, config.gae_lambda
+    )
+    if config.bootstrap == "baseline":
+        return advantage, returns.discounted_returns(reward, gamma)
+    return advantage, advantage + value[:-1]

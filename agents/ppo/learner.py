@@ -1,7 +1,7 @@
 """PPO with curiosity: one iteration of training as one pure function.
 
-Read `Learner.iterate` first. It draws tasks, plays them, computes intrinsic rewards and advantages,
-and takes gradient steps on minibatches.
+`Learner.iterate` draws tasks, plays them, computes intrinsic rewards and advantages, and takes
+gradient steps on minibatches; the methods below it follow in this order.
 
 Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO" and "Curiosity".
 """
@@ -17,8 +17,6 @@ import optax
 
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import Episodes, take
-from agents.acting.frames import Frame
-from agents.acting.identity import observation_ids
 from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
@@ -70,14 +68,12 @@ class Batch(NamedTuple):
 
     Attributes:
       episodes: the episodes.
-      observation_id: i32[T + 1, B], equal only for equal observations.
       log_prob: f32[T, B], log-probabilities of the actions under the acting parameters.
       advantage: f32[T, B], normalised.
       value_target: f32[T, B, V], one for each value head.
     """
 
     episodes: Episodes
-    observation_id: jax.Array
     log_prob: jax.Array
     advantage: jax.Array
     value_target: jax.Array
@@ -108,8 +104,12 @@ class Learner:
     @functools.partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array) -> TrainState:
         """Returns the first state."""
+        config = self.config
         params_key, replay_key, key = jax.random.split(key, 3)
-        params = self.init_params(params_key)
+        agent_key, curiosity_key = jax.random.split(params_key)
+        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
+        curiosity = self.curiosity.init(curiosity_key, board)
+        params = {**self.agent.init(agent_key), "curiosity": curiosity}
         zero = jnp.zeros((), jnp.int32)
         return TrainState(
             params=params,
@@ -118,20 +118,13 @@ class Learner:
             intrinsic=returns.Moments.zero(),
             memory=self.curiosity.memory(),
             task_replay=TaskReplay.untried(
-                replay_key, len(self.config.replay_fractions), self.config.replay_capacity
+                replay_key, len(config.replay_fractions), config.replay_capacity
             ),
             key=key,
             iteration=zero,
             episodes=zero,
             transitions=zero,
         )
-
-    def init_params(self, key: jax.Array) -> Params:
-        """Draws parameters of the policy network and of the curiosity, which may have none."""
-        agent_key, curiosity_key = jax.random.split(key)
-        board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
-        curiosity = self.curiosity.init(curiosity_key, board)
-        return {**self.agent.init(agent_key), "curiosity": curiosity}
 
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Plays one iteration's episodes and learns from them.
@@ -154,7 +147,7 @@ class Learner:
 
         solved = self.axis.gather(trajectory.episodes.solved)
         steps = jnp.sum(self.axis.gather(trajectory.episodes.length), dtype=jnp.int32)
-        metrics = {**self.play_metrics(batch, intrinsic_reward, solved), **update_metrics}
+        metrics = self.play_metrics(trajectory.episodes, intrinsic_reward, solved) | update_metrics
         metrics["is_finite"] = _is_finite((params, metrics))
         next_state = TrainState(
             params=params,
@@ -181,14 +174,11 @@ class Learner:
 
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays one episode from each reset key [B], with sampled actions."""
-        initial, timestep = jax.vmap(self.env.reset)(reset_keys)
-        if self.config.align_to_food:
-            frame = jax.vmap(Frame.facing_food)(timestep.observation)
-            initial = jax.vmap(Frame.state)(frame, initial)
+        initial, _ = jax.vmap(self.env.reset)(reset_keys)
         return rollout(self.agent, params, self.env, initial, action_key)
 
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
-        """Computes the curiosity's reward of every step.
+        """Computes the curiosity's reward of every step, under the parameters that acted.
 
         Returns:
           The reward f32[T, B], 0 after an episode's end, and the curiosity's new memory.
@@ -196,7 +186,7 @@ class Learner:
         Raises:
           ValueError: the curiosity returns another shape or dtype.
         """
-        experience = self.acting_experience(state.params, trajectory)
+        experience = self.experience(state.params, trajectory.episodes, trajectory)
         result = self.curiosity.reward(state.params["curiosity"], state.memory, experience)
         mask = trajectory.episodes.mask
         wanted, found = _shapes((mask, state.memory)), _shapes(result)
@@ -207,32 +197,6 @@ class Learner:
             )
         reward, memory = result
         return jnp.where(mask > 0, reward, 0.0), memory
-
-    def acting_experience(self, params: Params, trajectory: Trajectory) -> Experience:
-        """Returns the curiosity's view of episodes under the parameters that acted."""
-        episodes = trajectory.episodes
-        observation_id = observation_ids(episodes)
-        features = jnp.zeros((*observation_id.shape, 0), jnp.float32)
-        if type(self.curiosity).encode is not Curiosity.encode:
-            own = params["curiosity"]
-
-            def encode(own: Params, rows: jax.Array, _: None) -> tuple[jax.Array, None]:
-                return self.curiosity.encode(own, rows), None
-
-            features = encode_episodes(
-                encode, own, episodes, observation_id, chunk=self.config.encode_chunk_size
-            )
-        experience = Experience(episodes, observation_id, features)
-        if not self.curiosity.needs_embeddings:
-            return experience
-        _, after = self.agent.unroll_both(
-            params, trajectory.features, episodes.action, episodes.reward
-        )
-        return experience._replace(
-            embedding=trajectory.embedding,
-            next_embedding=after,
-            action_embedding=self.agent.embed_action(params, episodes.action),
-        )
 
     def make_batch(
         self, state: TrainState, trajectory: Trajectory, intrinsic_reward: jax.Array
@@ -252,39 +216,12 @@ class Learner:
             config, (state.extrinsic, state.intrinsic), episodes, intrinsic_reward
         )
         moments = self.axis.mean(moments)
-        estimate = (
-            advantages.combined_advantages
-            if config.value_heads == "shared"
-            else advantages.separate_advantages
-        )
         coef = advantages.intrinsic_coef_schedule(config)(state.iteration)
-        advantage, target = estimate(
+        advantage, target = advantages.estimate(
             config, episodes, intrinsic_reward, coef, trajectory.value, moments
         )
-        batch = Batch(
-            episodes=episodes,
-            observation_id=observation_ids(episodes),
-            log_prob=trajectory.log_prob,
-            advantage=returns.normalize(advantage, episodes.mask),
-            value_target=target,
-        )
-        return batch, moments
-
-    def play_metrics(self, batch: Batch, intrinsic_reward: jax.Array, solved: jax.Array) -> Metrics:
-        """Returns metrics of the episodes; `solved` bool[B] is of all devices."""
-        new, replayed = jnp.split(solved.astype(jnp.float32), [self.config.num_new])
-        episodes = batch.episodes
-        metrics = self.axis.mean(
-            {
-                "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
-                "intrinsic_reward": jnp.sum(intrinsic_reward) / jnp.sum(episodes.mask),
-                "distinct_observations": (jnp.max(batch.observation_id) + 1).astype(jnp.float32),
-            }
-        )
-        metrics["success"] = jnp.mean(new)
-        if len(replayed):
-            metrics["replayed_success"] = jnp.mean(replayed)
-        return metrics
+        advantage = returns.normalize(advantage, episodes.mask)
+        return Batch(episodes, trajectory.log_prob, advantage, target), moments
 
     def update(
         self, state: TrainState, batch: Batch, key: jax.Array
@@ -308,12 +245,10 @@ class Learner:
             metrics["gradient_norm"] = optax.tree.norm(gradient)
             return (optax.apply_updates(params, updates), opt_state), metrics
 
-        def shuffle(epoch_key: jax.Array) -> jax.Array:
-            return jax.random.permutation(epoch_key, num_episodes).reshape(-1, minibatch_size)
-
-        minibatches = jax.vmap(shuffle)(jax.random.split(key, self.config.epochs))
+        keys = jax.random.split(key, self.config.epochs)
+        orders = jax.vmap(lambda key: jax.random.permutation(key, num_episodes))(keys)
         (params, opt_state), metrics = jax.lax.scan(
-            step, (state.params, state.opt_state), minibatches.reshape(-1, minibatch_size)
+            step, (state.params, state.opt_state), orders.reshape(-1, minibatch_size)
         )
         return params, opt_state, jax.tree.map(jnp.mean, metrics)
 
@@ -333,8 +268,8 @@ class Learner:
           ValueError: a loss of the curiosity has the name of another term, or not `..._loss`.
         """
         config, mask = self.config, batch.episodes.mask
-        embedding, experience = self.learning_experience(params, batch)
-        actions, value = self.agent.policy_and_value(params, embedding)
+        experience = self.experience(params, batch.episodes)
+        actions, value = self.agent.policy_and_value(params, experience.embedding)
         log_prob = actions.log_prob(batch.episodes.action)
         surrogate = losses.clipped_surrogate(
             log_prob, batch.log_prob, batch.advantage, config.clip_eps
@@ -357,28 +292,59 @@ class Learner:
         mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
         return total, {**terms, "loss": total, "entropy": mean_entropy}
 
-    def learning_experience(self, params: Params, batch: Batch) -> tuple[jax.Array, Experience]:
-        """Returns the GRU's outputs f32[T, B, hidden] and the curiosity's view of a minibatch."""
-        episodes = batch.episodes
+    def experience(
+        self, params: Params, episodes: Episodes, played: Trajectory | None = None
+    ) -> Experience:
+        """Returns the curiosity's view of episodes under `params`.
+
+        Args:
+          params: parameters, by which the arrays of the view are differentiable.
+          episodes: B episodes of T steps.
+          played: the trajectory, if `params` acted; its outputs of the network are not computed
+            again.
+        """
         read = {name: params[name] for name in ("encoder", "curiosity")}
 
         def encode(params: Params, rows: jax.Array, remembered: Any) -> Any:
+            own = self.curiosity.encode(params["curiosity"], rows)
+            if played is not None:
+                return (None, own), None
             features, remembered = self.agent.encode_rows(params, rows, remembered)
-            return (features, self.curiosity.encode(params["curiosity"], rows)), remembered
+            return (features, own), remembered
 
-        features, own = encode_episodes(
-            encode, read, episodes, batch.observation_id, chunk=self.config.encode_chunk_size
+        features, own = encode_episodes(encode, read, episodes, chunk=self.config.encode_chunk_size)
+        features = features if played is None else played.features
+        embedding, next_embedding = self.agent.unroll(
+            params,
+            features,
+            episodes.action,
+            episodes.reward,
+            both=self.curiosity.needs_next_embedding,
         )
-        experience = Experience(episodes, batch.observation_id, own)
-        given = (params, features, episodes.action, episodes.reward)
-        if not self.curiosity.needs_embeddings:
-            return self.agent.unroll(*given), experience
-        embedding, after = self.agent.unroll_both(*given)
-        return embedding, experience._replace(
-            embedding=embedding,
-            next_embedding=after,
+        return Experience(
+            episodes=episodes,
+            features=own,
+            embedding=embedding if played is None else played.embedding,
+            next_embedding=next_embedding,
             action_embedding=self.agent.embed_action(params, episodes.action),
         )
+
+    def play_metrics(
+        self, episodes: Episodes, intrinsic_reward: jax.Array, solved: jax.Array
+    ) -> Metrics:
+        """Returns metrics of the episodes; `solved` bool[B] is of all devices."""
+        metrics = self.axis.mean(
+            {
+                "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
+                "intrinsic_reward": jnp.sum(intrinsic_reward) / jnp.sum(episodes.mask),
+                "distinct_observations": jnp.max(episodes.observation_id + 1).astype(jnp.float32),
+            }
+        )
+        new, replayed = jnp.split(solved.astype(jnp.float32), [self.config.num_new])
+        metrics["success"] = jnp.mean(new)
+        if len(replayed):
+            metrics["replayed_success"] = jnp.mean(replayed)
+        return metrics
 
 
 def make_train(

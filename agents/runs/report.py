@@ -18,7 +18,8 @@ import jax
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluation, Evaluator, play_greedily
+from agents.acting.evaluation import Evaluation, Evaluator
+from agents.acting.rollout import rollout
 from agents.ppo.learner import Learner, TrainState
 from agents.runs.folder import Run, RunFolder, write_text
 from agents.runs.metrics import Row, read_rows
@@ -231,7 +232,7 @@ def _intrinsic_reward(
 
     @jax.jit
     def compute(state: TrainState, tasks: State) -> jax.Array:
-        _, trajectory = play_greedily(learner.agent, state.params, env, tasks)
+        trajectory = rollout(learner.agent, state.params, env, tasks, key=None)
         return learner.intrinsic_reward(state, trajectory)[0]
 
     return compute(state, tasks)

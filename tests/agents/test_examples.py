@@ -1,9 +1,5 @@
 """The programs in `agents/examples`, at small sizes."""
 
-import re
-import runpy
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,28 +9,7 @@ import trap_tube_jax as tt
 from agents.acting.episodes import Episodes
 from agents.curiosity import Experience
 from agents.examples import custom_curiosity, custom_transfer, oracle
-from paths import ROOT
 from small_runs import small_config
-
-EXAMPLES = [
-    path
-    for path in sorted((ROOT / "agents" / "examples").glob("*.py"))
-    if "__main__" in path.read_text()
-]
-
-
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_help_explains_the_options_and_runs_nothing(path, capsys, monkeypatch, own_task_sets):
-    for library in re.findall(r"^import (rejax|stable_baselines3)", path.read_text(), re.M):
-        pytest.importorskip(library)
-    monkeypatch.setattr(sys, "argv", [path.stem, "--help"])
-    with pytest.raises(SystemExit) as error:
-        runpy.run_path(str(path), run_name="__main__")
-    shown = capsys.readouterr().out
-    assert error.value.code == 0
-    assert "usage" in shown
-    assert "iteration " not in shown
-    assert "| set" not in shown
 
 
 def test_a_custom_curiosity_pays_moves_of_the_tool():
@@ -42,8 +17,8 @@ def test_a_custom_curiosity_pays_moves_of_the_tool():
     cells = jnp.zeros((4, 2, 3, 2), jnp.uint8).at[:, :, 1, 1].set(column.astype(jnp.uint8))
     mask = jnp.array([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
     nothing = jnp.zeros((3, 2))
-    episodes = Episodes(tt.base_state(), cells, nothing, nothing, nothing, mask)
-    experience = Experience(episodes, jnp.zeros((4, 2), jnp.int32), jnp.zeros((4, 2, 0)))
+    episodes = Episodes(tt.base_state(), cells, nothing, nothing, nothing, mask, nothing)
+    experience = Experience(episodes, jnp.zeros((4, 2, 0)))
     curiosity = custom_curiosity.ToolMoves()
     pay, moves = curiosity.reward({}, jnp.float32(6.0), experience)
     np.testing.assert_allclose(pay, [[0, 0], [1 / 3, 1 / 3], [1 / 3, 0]], rtol=1e-6)
@@ -53,7 +28,7 @@ def test_a_custom_curiosity_pays_moves_of_the_tool():
 @pytest.mark.slow
 def test_a_custom_curiosity_is_trained_with(capsys):
     config = small_config(curiosity="tool-moves", max_steps=20)
-    state, metrics = custom_curiosity.train(config, iterations=2)
+    state, metrics = custom_curiosity.main(config, iterations=2)
     assert state.memory > 0
     assert metrics["intrinsic_reward"] > 0
     assert capsys.readouterr().out.count("moves of the tool") == 2

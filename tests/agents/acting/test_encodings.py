@@ -30,14 +30,13 @@ SLOW = [
 def test_the_loss_and_its_gradient_are_those_of_the_plain_encoding(curiosity, monkeypatch):
     train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity}))
 
-    def plain_encoding(encode_rows, params, episodes, observation_id, *, chunk):
-        del observation_id, chunk
+    def plain_encoding(encode_rows, params, episodes, *, chunk):
+        del encode_rows, chunk
         rows = episodes.observations()
-        if "encoder" not in params:
-            return jax.vmap(lambda rows: encode_rows(params, rows, None)[0])(rows)
         features = jax.vmap(lambda rows: train.agent.encode(params, rows))(rows)
-        own = params.get("curiosity", {})
-        return features, jax.vmap(lambda rows: train.curiosity.encode(own, rows))(rows)
+        return features, jax.vmap(lambda rows: train.curiosity.encode(params["curiosity"], rows))(
+            rows
+        )
 
     @jax.jit
     def prepare(key):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config
 from agents.acting.evaluation import Evaluator
 from agents.networks.agent import Agent
 from easy import assert_same
@@ -112,5 +111,4 @@ def test_copies_are_equal(copied):
     assert_same(copied(policy).params, policy.params)
     assert copied(policy)._replace(params=None) == policy._replace(params=None)
     assert_same(copied(carry), carry)
-    assert agent.width == 2
-    assert copied(agent) == agent != Agent(Config())
+    assert vars(copied(agent)) == vars(agent)

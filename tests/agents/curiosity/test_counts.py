@@ -8,34 +8,21 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.acting.episodes import Episodes, cells_of
-from agents.acting.identity import observation_ids
+from agents.acting.encodings import layout_content
+from agents.acting.episodes import Episodes
 from agents.curiosity import counts
 from agents.curiosity.counts import Counts, observation_slots, visit_bonus
 
-BATCH, STEPS = 40, 4
+BATCH = 40
+FOOD = jnp.stack(jnp.divmod(jnp.arange(144), 12), axis=-1)
+FOOD_ANYWHERE = jnp.zeros((144, 3, 2), jnp.int32).at[:, 2].set(FOOD)
 
 
-@pytest.fixture(scope="module")
-def episodes() -> Episodes:
-    """Random play of {Sy}."""
-    env = tt.make("sy", max_steps=STEPS)
-    action = jax.random.randint(jax.random.key(2), (STEPS, BATCH, 2), 0, 4)
-
-    @jax.jit
-    def play():
-        initial, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), BATCH))
-
-        def step(state, action):
-            state, _ = jax.vmap(env.step)(state, action)
-            return state, cells_of(state)
-
-        return initial, jax.lax.scan(step, initial, action)[1]
-
-    initial, cells = play()
-    cells = jnp.concatenate([cells_of(initial)[None], cells])
-    ones = jnp.ones((STEPS, BATCH))
-    return Episodes(initial, cells, action, 0 * ones, ones, ones)
+def episodes_at(cells: jax.Array) -> Episodes:
+    """Episodes on layouts of {Sy}, all with agent, tool and food at cells [T + 1, 3, 2]."""
+    layout, _ = jax.vmap(tt.make("sy").reset)(jax.random.split(jax.random.key(1), BATCH))
+    cells = jnp.repeat(cells[:, None], BATCH, axis=1).astype(jnp.uint8)
+    return Episodes(layout, cells, *[jnp.zeros(())] * 5)
 
 
 @pytest.mark.parametrize("env_id", ["base", "sy", "p", "st", "pstsy"])
@@ -55,33 +42,21 @@ def test_visits_pay_by_the_root_of_their_number():
     np.testing.assert_array_equal(visits, [0, 0, 0, 2, 0, 4, 0, 0])
 
 
-def test_few_observations_share_a_slot(episodes):
+def test_equal_observations_share_a_slot_and_few_others_do():
     """Chance would have 1 % of 4000 positions on each layout of {Sy} share one."""
-    cells = jax.random.randint(jax.random.key(2), (4000, 1, 3, 2), 0, 12).astype(jnp.uint8)
-    cells = jnp.broadcast_to(cells, (4000, BATCH, 3, 2))
-    many = episodes._replace(cells=cells)
-    slot, identity = (jax.jit(of)(many) for of in (observation_slots, observation_ids))
-    distinct = int(identity.max()) + 1
-    assert distinct > 19_900
+    episodes = episodes_at(jax.random.randint(jax.random.key(2), (4000, 3, 2), 0, 12))
+    slot = np.asarray(jax.jit(observation_slots)(episodes))
+    _, layout = np.unique(layout_content(episodes.layout), axis=0, return_inverse=True)
+    layout = layout.reshape(-1)
+    assert layout.max() == 4
+    first = [np.argmax(layout == each) for each in range(5)]
+    np.testing.assert_array_equal(slot, slot[:, first][:, layout])
+    distinct = 5 * len(np.unique(episodes.cells[:, 0], axis=0))
     assert 0.98 * distinct < len(np.unique(slot)) <= distinct
 
 
-def test_layouts_of_near_hashes_share_few_slots(episodes, monkeypatch):
-    """The food is at 144 cells in turn."""
-    near: Any = lambda layout: jnp.arange(BATCH, dtype=jnp.uint32)  # noqa: E731
-    monkeypatch.setattr(counts, "layout_hashes", near)
-    food = jnp.stack(jnp.divmod(jnp.arange(144), 12), axis=-1)
-    cells = jnp.zeros((144, BATCH, 3, 2), jnp.uint8)
-    cells = cells.at[:, :, 2].set(food[:, None].astype(jnp.uint8))
-    slot = jax.jit(observation_slots)(episodes._replace(cells=cells))
+def test_layouts_of_near_hashes_share_few_slots(monkeypatch):
+    near: Any = lambda content: jnp.arange(BATCH, dtype=jnp.uint32)  # noqa: E731
+    monkeypatch.setattr(counts, "hash_rows", near)
+    slot = jax.jit(observation_slots)(episodes_at(FOOD_ANYWHERE))
     assert len(np.unique(slot)) > 0.98 * slot.size
-
-
-def test_equal_observations_share_a_slot(episodes):
-    slot = np.asarray(jax.jit(observation_slots)(episodes)).reshape(-1)
-    boards = np.asarray(jax.jit(Episodes.observations)(episodes)).reshape(slot.size, -1)
-    cells = np.asarray(episodes.cells).reshape(slot.size, -1)
-    content = np.concatenate([boards, cells], axis=1)
-    _, first, same = np.unique(content, axis=0, return_index=True, return_inverse=True)
-    assert len(first) < slot.size
-    np.testing.assert_array_equal(slot, slot[first][same.reshape(-1)])

@@ -34,7 +34,8 @@ def random_episodes(env: tt.Environment) -> Episodes:
         carry = (initial, drawn[0])
         _, (cells, action, timestep, mask) = jax.lax.scan(step, carry, (drawn, keeps))
         cells = jnp.concatenate([cells_of(initial)[None], cells])
-        return Episodes(initial, cells, action, timestep.reward, timestep.discount, mask)
+        steps = (action, timestep.reward, timestep.discount, mask)
+        return Episodes(initial, cells, *steps, jnp.zeros(()))
 
     return jax.jit(play)(jax.random.key(0))
 
@@ -96,7 +97,8 @@ def by_hand() -> Episodes:
     mask = jnp.array([[1, 1, 1, 1], [1, 1, 0, 0]], jnp.float32).T
     layout = jax.tree.map(lambda x: jnp.stack([x, x]), tt.base_state())
     action = jnp.zeros((4, 2, 2), jnp.int32)
-    return Episodes(layout, cells, action, jnp.zeros((4, 2)), jnp.ones((4, 2)), mask)
+    zeros = jnp.zeros((4, 2))
+    return Episodes(layout, cells, action, zeros, zeros + 1, mask, jnp.zeros((5, 2), jnp.int32))
 
 
 def test_a_return_is_not_new(by_hand):
@@ -120,7 +122,7 @@ def test_the_first_grasp_of_every_colour_is_new(by_hand):
 
 def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
     curiosity = Effects(Config(reward_ema_decay=0.75))
-    experience = Experience(by_hand, jnp.zeros((5, 2), jnp.int32), jnp.zeros((5, 2, 0)))
+    experience = Experience(by_hand, jnp.zeros((5, 2, 0)))
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)
     np.testing.assert_allclose(memory, [2 / 6, 3 / 6, 0], rtol=1e-6)
     np.testing.assert_allclose(pay.T, [[2, 0, 3, 2], [0, 5, 0, 0]], rtol=1e-6)

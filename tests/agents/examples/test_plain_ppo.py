@@ -58,7 +58,7 @@ def plain_params(params):
 
 
 def test_rewards_advantages_and_losses_are_those_of_the_learner():
-    learner, plain = make_train(CONFIG), plain_ppo.make_train(CONFIG)
+    learner, plain = make_train(CONFIG), plain_ppo.PlainPPO(CONFIG)
     state = learner.init(jax.random.key(0))
     reset_keys = jax.random.split(jax.random.key(1), CONFIG.episodes_per_iteration)
     trajectory = learner.play(state.params, reset_keys, jax.random.key(2))
@@ -80,7 +80,7 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
         trajectory.value[:-1, :, 0],
     )
     steps = jax.tree.map(lambda x: x.swapaxes(0, 1), (episodes.observations(), *steps))
-    plain_state = plain.init(jax.random.key(0))._replace(params=plain_params(state.params))
+    plain_state = plain.init(jax.random.key(0)).replace(params=plain_params(state.params))
     variance, (episode, advantage, target) = plain.prepare(plain_state, plain_ppo.Episode(*steps))
     total, terms = plain.loss(plain_params(now), (episode, advantage, target))
     chex.assert_trees_all_close(
@@ -97,7 +97,7 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
 
 
 def test_an_update_lowers_the_loss():
-    plain = plain_ppo.make_train(CONFIG)
+    plain = plain_ppo.PlainPPO(CONFIG)
     state, batch, minibatches = jax.jit(plain.collect)(plain.init(jax.random.key(0)))
     after, terms = jax.jit(plain.update)(state, batch, minibatches[0])
     assert plain.loss(after.params, batch)[0] < sum(terms.values())
@@ -105,5 +105,5 @@ def test_an_update_lowers_the_loss():
 
 @pytest.mark.slow
 def test_learns_to_reach_near_food(capsys):
-    assert plain_ppo.main(iterations=10) > 0.9
+    assert plain_ppo.main(plain_ppo.Options(iterations=10)) > 0.9
     assert capsys.readouterr().out.count("solved") == 10

@@ -7,22 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.networks import chunks
-from agents.networks.grouping import group
+from agents.networks import chunks, grouping
 
 ROWS, WIDTH = 37, 5
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_groups_are_those_of_numpy(seed):
-    rng = np.random.default_rng(seed)
-    keys = rng.integers(0, 6, (2, 200)).astype(np.int32)
-    groups = group(*map(jnp.asarray, keys))
-    _, expected = np.unique(keys, axis=1, return_inverse=True)
-    np.testing.assert_array_equal(groups.number, expected)
-    assert groups.total == expected.max() + 1
-    representative = np.asarray(groups.representative)[expected]
-    np.testing.assert_array_equal(keys[:, representative], keys)
+@pytest.mark.parametrize("bits", [None, 16, 0])
+def test_groups_hold_equal_rows_and_all_of_them_unless_hashes_collide(bits, monkeypatch):
+    rows = np.random.default_rng(0).integers(0, 6, (200, 2)).astype(np.int32)
+    _, expected = np.unique(rows, axis=0, return_inverse=True)
+    if bits is None:
+        groups = grouping.group(*jnp.asarray(rows.T))
+        np.testing.assert_array_equal(groups.number, expected)
+    else:
+        monkeypatch.setattr(grouping, "GROUPING_BITS", bits)
+        groups = grouping.group_rows(jnp.asarray(rows))
+    representative = np.asarray(groups.representative)[np.asarray(groups.number)]
+    np.testing.assert_array_equal(rows[representative], rows)
+    assert groups.total == np.max(groups.number) + 1
+    assert (groups.total > expected.max() + 1) == (bits == 0)
 
 
 def plain(params: dict[str, jax.Array], rows: jax.Array) -> jax.Array:

@@ -15,6 +15,7 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting.episodes import Episodes
+from agents.acting.frames import Frame
 from agents.acting.rollout import Trajectory
 from agents.arrays import to_arrays
 from agents.curiosity import Curiosity
@@ -65,12 +66,14 @@ class Scripted(Learner):
             reward=reward,
             discount=1 - reward,
             mask=jnp.ones(shape),
+            observation_id=jnp.zeros((STEPS + 1, len(reset_keys)), jnp.int32),
         )
         value = jax.random.normal(
             jax.random.key(3), (STEPS + 1, EPISODES, self.config.num_value_heads)
         )
         nothing = jnp.zeros((*shape, 0))
-        return Trajectory(episodes, nothing, nothing, jnp.zeros(shape), value)
+        frame = Frame.of(jnp.zeros(len(reset_keys), jnp.int32))
+        return Trajectory(frame, episodes, nothing, nothing, jnp.zeros(shape), value)
 
     def intrinsic_reward(self, state, trajectory):
         return jax.random.uniform(jax.random.key(4), (STEPS, EPISODES)), state.memory
@@ -133,7 +136,7 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, c
     moments = advantages.update_moments(
         BEST, (state.extrinsic, state.intrinsic), trajectory.episodes, reward
     )
-    expected, _ = advantages.separate_advantages(
+    expected, _ = advantages.estimate(
         BEST, trajectory.episodes, reward, coef, trajectory.value, moments
     )
     # Normalised once more.
@@ -141,15 +144,16 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, c
     np.testing.assert_allclose(metrics["advantage"], expected, atol=1e-4)
 
 
-def test_episodes_are_played_facing_the_food(monkeypatch):
-    first: Any = lambda agent, params, env, initial, key: initial  # noqa: E731
-    monkeypatch.setattr(learner, "rollout", first)
+def test_episodes_are_played_facing_the_food():
     keys = jax.random.split(jax.random.key(1), 64)
-    start: Any = jax.jit(make_train(BEST).play)({}, keys, jax.random.key(2))
-    down, right = np.asarray(start.food - start.agent).T
+    best = make_train(BEST)
+    params = jax.eval_shape(best.init, jax.random.key(0)).params
+    params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
+    played = jax.jit(best.play)(params, keys, jax.random.key(2))
+    start, _ = jax.jit(jax.vmap(tt.make("pstsy").reset))(keys)
+    down, right = np.asarray(played.episodes.layout.food - played.episodes.layout.agent).T
     assert np.all((down >= right) & (right >= 0))
-    drawn, _ = jax.jit(jax.vmap(tt.make("pstsy").reset))(keys)
-    assert not np.all(drawn.food >= drawn.agent)
+    assert not np.all(start.food >= start.agent)
 
 
 def recorder(updates: int) -> optax.GradientTransformation:
@@ -178,7 +182,7 @@ def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
     params = jnp.zeros(EPISODES)
     state = TrainState(params, counting.optimizer.init(params), *[None] * 8)  # pyright: ignore
     number: Any = jnp.arange(EPISODES)[None]
-    batch = learner.Batch(*[number] * 5)
+    batch = learner.Batch(*[number] * 4)
     after, (count, seen), _ = counting.update(state, batch, jax.random.key(0))
     assert count == updates == 3 * 2
     np.testing.assert_array_equal(after, -3)

@@ -108,9 +108,9 @@ def test_icm_is_the_forward_error_and_the_inverse_likelihood():
     action_embedding = rng.normal(size=(1, CASES, 4)).astype(np.float32)
     action = rng.integers(0, CHOICES, (1, CASES, 2))
     nothing: Any = None
-    episodes = Episodes(nothing, nothing, jnp.asarray(action), nothing, nothing, nothing)
+    episodes = Episodes(nothing, nothing, jnp.asarray(action), *[nothing] * 4)
     experience = Experience(
-        episodes, nothing, nothing, *map(jnp.asarray, (embedding, next_embedding, action_embedding))
+        episodes, nothing, *map(jnp.asarray, (embedding, next_embedding, action_embedding))
     )
     icm = ICM(config)
     params = icm.init(jax.random.key(0), nothing)

@@ -26,17 +26,18 @@ def recording() -> Recording:
 @pytest.fixture(scope="module")
 def ours(recording: Recording) -> dict[str, Any]:
     learner = make_train(CONFIG)
-    params = recording.params("param", jax.jit(learner.init_params)(jax.random.key(0)))
+    state = learner.init(jax.random.key(0))
+    params = recording.params("param", state.params)
 
     @jax.jit
     def run(params):
         trajectory = make_trajectory(learner.agent, params, recording)
-        state = learner.init(jax.random.key(0))._replace(params=params)
-        experience = learner.acting_experience(params, trajectory)
+        experience = learner.experience(params, trajectory.episodes, trajectory)
         assert isinstance(learner.curiosity, ICM)
         prediction = learner.curiosity.predict(params["curiosity"], experience)
-        raw, _ = learner.intrinsic_reward(state, trajectory)
-        batch, moments = learner.make_batch(state, trajectory, raw)
+        before = state._replace(params=params)
+        raw, _ = learner.intrinsic_reward(before, trajectory)
+        batch, moments = learner.make_batch(before, trajectory, raw)
         return trajectory, experience.next_embedding, prediction, raw, batch, moments
 
     names = ("trajectory", "next_embedding", "prediction", "raw", "batch", "moments")

@@ -72,7 +72,7 @@ def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[A
     config = Config(discount=0.5, gae_lambda=0.0, bootstrap=bootstrap)  # pyright: ignore[reportArgumentType]
     nothing: Any = None
     column = [jnp.array(x, jnp.float32)[:, None] for x in (discount, mask)]
-    episodes = Episodes(nothing, nothing, nothing, nothing, *column)
+    episodes = Episodes(nothing, nothing, nothing, nothing, column[0], column[1], nothing)
     value = jnp.array([10.0, 20.0, 30.0, 40.0])[:, None]
     found = advantages.advantages_and_targets(config, column[1], episodes, value)
     return found[0][:, 0], found[1][:, 0]
