@@ -1,4 +1,4 @@
-"""Where the time of a training iteration goes: `python -m benchmarks.train_throughput`.
+"""Time of a training iteration by part: `python -m benchmarks.train_throughput`.
 
 Times a whole iteration, then rollout, encoder and recurrent part by themselves on the same
 episodes. The parts are separate programs, so their times add up to the iteration only roughly.

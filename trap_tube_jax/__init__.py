@@ -28,56 +28,37 @@ them.
 Pages in this folder: environment.md, own_tasks.md, graded.md, controls.md, protocol.md.
 """
 
+# ruff: noqa: F401  the imports are the public names
+
 import importlib
 import sys
 import types
 import typing
 import warnings
 
-from trap_tube_jax._version import __version__ as __version__
-from trap_tube_jax.environment import ArraySpec as ArraySpec
-from trap_tube_jax.environment import Environment as Environment
-from trap_tube_jax.environment import action_from_index as action_from_index
-from trap_tube_jax.environment import action_to_index as action_to_index
-from trap_tube_jax.graded import graded_perceptual as graded_perceptual
-from trap_tube_jax.graded import graded_structural as graded_structural
-from trap_tube_jax.objects import base_palette as base_palette
-from trap_tube_jax.observation import observe as observe
-from trap_tube_jax.observation import render_ascii as render_ascii
-from trap_tube_jax.observation import visible_objects as visible_objects
-from trap_tube_jax.registry import CONTROL_TASK_SETS as CONTROL_TASK_SETS
-from trap_tube_jax.registry import PAPER_TASK_SETS as PAPER_TASK_SETS
-from trap_tube_jax.registry import TaskSet as TaskSet
-from trap_tube_jax.registry import make as make
-from trap_tube_jax.registry import register as register
-from trap_tube_jax.registry import registered_ids as registered_ids
-from trap_tube_jax.registry import task_set as task_set
-from trap_tube_jax.rendering import episode_frames as episode_frames
-from trap_tube_jax.rendering import render as render
-from trap_tube_jax.rendering import save_gif as save_gif
-from trap_tube_jax.scoring.benchmark import score as score
-from trap_tube_jax.scoring.benchmark import score_gymnasium as score_gymnasium
-from trap_tube_jax.scoring.scores import Score as Score
-from trap_tube_jax.scoring.scores import Scores as Scores
-from trap_tube_jax.scoring.tasks import evaluation_tasks as evaluation_tasks
-from trap_tube_jax.solver import Distances as Distances
-from trap_tube_jax.solver import Plan as Plan
-from trap_tube_jax.solver import distances as distances
-from trap_tube_jax.solver import solve as solve
-from trap_tube_jax.solver import solve_batch as solve_batch
-from trap_tube_jax.state import State as State
-from trap_tube_jax.state import TimeStep as TimeStep
-from trap_tube_jax.state import base_state as base_state
-from trap_tube_jax.state import validate as validate
-from trap_tube_jax.transfers import Transfer as Transfer
-from trap_tube_jax.transfers import compose as compose
-from trap_tube_jax.transfers import perceptual as perceptual
-from trap_tube_jax.transfers import structural as structural
-from trap_tube_jax.transfers import symbolic as symbolic
-from trap_tube_jax.vector import VectorEnvironment as VectorEnvironment
-from trap_tube_jax.vector import VectorState as VectorState
-from trap_tube_jax.wrappers import AutoReset as AutoReset
-from trap_tube_jax.wrappers import EpisodeStatistics as EpisodeStatistics
+from trap_tube_jax._version import __version__
+from trap_tube_jax.environment import ArraySpec, Environment, action_from_index, action_to_index
+from trap_tube_jax.graded import graded_perceptual, graded_structural
+from trap_tube_jax.objects import base_palette
+from trap_tube_jax.observation import observe, render_ascii, visible_objects
+from trap_tube_jax.registry import (
+    CONTROL_TASK_SETS,
+    PAPER_TASK_SETS,
+    TaskSet,
+    make,
+    register,
+    registered_ids,
+    task_set,
+)
+from trap_tube_jax.rendering import episode_frames, render, save_gif
+from trap_tube_jax.scoring.benchmark import score, score_gymnasium
+from trap_tube_jax.scoring.scores import Score, Scores
+from trap_tube_jax.scoring.tasks import evaluation_tasks
+from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
+from trap_tube_jax.state import State, TimeStep, base_state, validate
+from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
+from trap_tube_jax.vector import VectorEnvironment, VectorState
+from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 
 
 def _register_with_gymnasium() -> None:

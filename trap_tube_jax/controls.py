@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND, NUM_OBJECTS, OBJECT_CHARS, TRAP
+from trap_tube_jax.objects import BOARD_SIZE, GROUND, OBJECT_CHARS
 from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State, check_state
 from trap_tube_jax.transfers import Transfer
@@ -150,16 +150,6 @@ class LayoutDraw:
     @property
     def __name__(self) -> str:
         return self.layouts.__name__.replace("_", " ")
-
-
-def trap_and_exit_exchanged(state: State) -> State:
-    """Exchanges trap and exit of one state or a batch of states.
-
-    The task and its twin differ in the trap alone. The twin of a task of {P} is a task of {P}.
-    """
-    other = np.arange(NUM_OBJECTS, dtype=np.uint8)
-    other[[TRAP, EXIT]] = EXIT, TRAP
-    return state.replace(board=jnp.asarray(other)[state.board])
 
 
 CONTROLS = (

@@ -9,18 +9,29 @@ Source: graded.md; the paper, section "Structural", for interpolation on the sph
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.geometry import cell_of
-from trap_tube_jax.layouts import NUM_FRAMES, layout_tables, padded, padded_by_frame
+from trap_tube_jax.layouts import (
+    NUM_FRAMES,
+    LayoutTables,
+    layout_tables,
+    padded,
+    padded_by_frame,
+)
 from trap_tube_jax.objects import BOARD_SIZE
-from trap_tube_jax.prng import loop_free
 from trap_tube_jax.state import State, base_state, check_state
-from trap_tube_jax.transfers import Transfer, perceptual, recolor, sphere_points, structural
+from trap_tube_jax.transfers import (
+    Transfer,
+    draw_layout,
+    perceptual,
+    recolor,
+    sphere_points,
+    structural,
+)
 
 CENTER = 1e-4  # a radius below is 0 up to rounding; that of other features is 1 / 255 or more
 TOLERANCE = 1e-9  # of a distance, against the rounding of strength * distance
@@ -81,20 +92,7 @@ class GradedPerceptual:
 
     def __call__(self, key: jax.Array, state: State) -> State:
         """Draws a layout."""
-        check_state(state)
-        near, full = jax.tree.map(jnp.asarray, (near_layouts(self.strength), layout_tables()))
-        layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
-        frame, assignment = near.layout[layout % len(near.layout)]
-        food %= near.num_food[frame]
-        tool %= near.num_tools[frame]
-        agent %= near.num_agents[frame, tool]
-        return state.replace(
-            board=full.board[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
-            food=cell_of(near.food[frame, food]),
-            tool=cell_of(near.tool[frame, tool]),
-            tool_extent=full.extent[frame],
-            agent=cell_of(near.agent[frame, tool, agent]),
-        )
+        return draw_layout(key, state, near_layouts(self.strength))
 
     @property
     def __name__(self) -> str:
@@ -136,58 +134,37 @@ def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Arr
     return ((1 - strength) * radius + strength) * direction
 
 
-class NearLayouts(NamedTuple):
-    """The outcomes of `graded_perceptual`, laid out as in `LayoutTables`.
-
-    Attributes:
-      layout: i32[L, 2], the (frame, assignment) pairs.
-      food: u8[32, F], the cells inside the tube, then padding.
-      num_food: u32[32], how many there are.
-      tool: u8[32, T], the candidates of the tool's top-left cell, then padding.
-      num_tools: u32[32], how many there are.
-      agent: u8[32, T, A], the agent's cells for each candidate, then padding.
-      num_agents: u32[32, T], how many there are; 1 in the padding.
-    """
-
-    layout: np.ndarray
-    food: np.ndarray
-    num_food: np.ndarray
-    tool: np.ndarray
-    num_tools: np.ndarray
-    agent: np.ndarray
-    num_agents: np.ndarray
-
-
 @functools.lru_cache(maxsize=64)
-def near_layouts(strength: float) -> NearLayouts:
+def near_layouts(strength: float) -> LayoutTables:
     """Builds the tables of a strength, and keeps them for the process."""
     full, base = layout_tables(), base_state()
     foods, tools, agents = [], [], []
     for frame in range(NUM_FRAMES):
-        foods.append(_nearest_cells(np.unique(full.food[frame]), base.food, strength))
-        corners = full.tool[frame, : full.num_tools[frame]].astype(np.int32)
-        tools.append(_nearest_cells(corners, base.tool, strength))
+        inside = full.food[frame, : full.num_food[frame]]
+        corners = full.tool[frame, : full.num_tools[frame]]
+        near_corners = _nearest_cells(corners, base.tool, strength)
+        rows = zip(corners, full.agent[frame], full.num_agents[frame], strict=False)
+        foods.append(_nearest_cells(inside, base.food, strength))
+        tools.append(near_corners)
         agents.append(
             [
-                _nearest_cells(cells[:count].astype(np.int32), base.agent, strength)
-                for corner, cells, count in zip(
-                    corners, full.agent[frame], full.num_agents[frame], strict=False
-                )
-                if corner in tools[-1]
+                _nearest_cells(cells[:count], base.agent, strength)
+                for corner, cells, count in rows
+                if corner in near_corners
             ]
         )
     food, num_food = padded(foods)
     tool, num_tools = padded(tools)
     agent, num_agents = padded_by_frame(agents, len(tool[0]))
     near = _is_near(_layout_distances(), strength)
-    return NearLayouts(
-        np.argwhere(near).astype(np.int32),
-        food,
-        num_food,
-        tool,
-        num_tools,
-        agent,
-        num_agents,
+    return full._replace(
+        layout=np.argwhere(near).astype(np.int32),
+        food=food,
+        num_food=num_food,
+        tool=tool,
+        num_tools=num_tools,
+        agent=agent,
+        num_agents=num_agents,
     )
 
 
@@ -207,8 +184,8 @@ def _layout_distances() -> np.ndarray:
 
 def _nearest_cells(cells: np.ndarray, target: Any, strength: float) -> np.ndarray:
     """Returns the flat indices near the cell `target`, by steps up, down and across."""
-    row, column = np.asarray(target)
-    distance = abs(cells // BOARD_SIZE - row) + abs(cells % BOARD_SIZE - column)
+    place = np.stack(np.divmod(cells.astype(np.int32), BOARD_SIZE), axis=-1)
+    distance = abs(place - np.asarray(target)).sum(axis=-1)
     return cells[_is_near(distance, strength)]
 
 

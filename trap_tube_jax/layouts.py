@@ -1,8 +1,7 @@
 """Every layout of the perceptual transfer, enumerated once as tables.
 
-The layouts are few, so they are written out in NumPy, cell by cell. A draw is then a few
-integers and as many look-ups. Counting out cells within each draw is an order of magnitude
-slower under vmap on a CPU.
+The layouts are few, so NumPy enumerates them cell by cell. A draw is then a few integers and as
+many look-ups. Counting cells within each draw is an order of magnitude slower under vmap on a CPU.
 
 Source: environment.md, "Perceptual".
 """
@@ -19,7 +18,6 @@ from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND, TRAP, TUBE1, TUBE2
 CENTER_FIRST, CENTER_LAST = 4, 8  # rows and columns of the central block, both included
 NUM_FRAMES = 32
 NUM_ASSIGNMENTS = 8
-MAX_FOOD_CELLS = 4
 
 # (length of a side of the tube, its first row or column), equally likely: the length is
 # uniform over 3 and 4 first, then the place over those that fit into 4 to 8.
@@ -27,18 +25,17 @@ _SIDES = ((3, 4), (3, 5), (4, 4), (4, 4))
 
 
 class LayoutTables(NamedTuple):
-    """The outcomes of every choice.
-
-    Frames are equally likely, and so are the assignments of a frame. A row of `food`, `tool`
-    or `agent` lists cells that are equally likely; where it ends in padding, the counts say
-    how many of its entries come before it.
+    """The outcomes of every choice, equally likely within a choice.
 
     A frame is a tube's outline with a direction of the tool; an assignment says which of
-    the outline's sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143.
+    the outline's sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143. Rows of
+    cells end in padding; the counts exclude it.
 
     Attributes:
+      layout: i32[L, 2], the pairs (frame, assignment) to draw from.
       board: u8[32, 8, 144], the static objects per frame and assignment.
-      food: i32[32, 4], the cells inside the tube, repeated to fill the row.
+      food: u8[32, F], the cells inside the tube, then padding.
+      num_food: u32[32], how many cells there are.
       extent: i32[32, 2], the tool's (rows, columns).
       tool: u8[32, T], the candidates of the tool's top-left cell, then padding.
       num_tools: u32[32], how many candidates there are.
@@ -46,8 +43,10 @@ class LayoutTables(NamedTuple):
       num_agents: u32[32, T], how many cells there are; 1 in the padding.
     """
 
+    layout: np.ndarray
     board: np.ndarray
     food: np.ndarray
+    num_food: np.ndarray
     extent: np.ndarray
     tool: np.ndarray
     num_tools: np.ndarray
@@ -57,7 +56,7 @@ class LayoutTables(NamedTuple):
 
 @functools.cache
 def layout_tables() -> LayoutTables:
-    """Builds the tables, at the first draw and once per process."""
+    """Builds the tables of all layouts, once per process."""
     frames = [
         (height, width, top, left, vertical)
         for (height, top), (width, left) in itertools.product(_SIDES, _SIDES)
@@ -70,9 +69,15 @@ def layout_tables() -> LayoutTables:
     ]
     tool, num_tools = padded([np.flatnonzero(corners) for corners in tools])
     agent, num_agents = padded_by_frame(agents, len(tool[0]))
+    food, num_food = padded([_food_cells(*frame[:4]) for frame in frames])
+    assignment, frame = np.divmod(
+        np.arange(NUM_FRAMES * NUM_ASSIGNMENTS, dtype=np.int32), NUM_FRAMES
+    )
     return LayoutTables(
-        board=np.stack([_boards(*frame[:4]) for frame in frames]),
-        food=np.stack([_food_cells(*frame[:4]) for frame in frames]),
+        layout=np.stack([frame, assignment], axis=1),
+        board=np.stack([_boards(*each[:4]) for each in frames]),
+        food=food,
+        num_food=num_food,
         extent=np.array([_extent(*frame) for frame in frames], np.int32),
         tool=tool,
         num_tools=num_tools,
@@ -82,12 +87,12 @@ def layout_tables() -> LayoutTables:
 
 
 def _box(top: int, left: int, bottom: int, right: int) -> np.ndarray:
-    """bool[12, 12]: the cells of the rows `top` to `bottom`, columns `left` to `right`."""
+    """Returns the mask bool[12, 12] of rows `top` to `bottom`, columns `left` to `right`."""
     return ((top <= ROWS) & (bottom >= ROWS)) & ((left <= COLUMNS) & (right >= COLUMNS))
 
 
 def _boards(height: int, width: int, top: int, left: int) -> np.ndarray:
-    """u8[8, 144]: tubes on two opposite sides, the openings within the other two."""
+    """Draws u8[8, 144]: tubes on two opposite sides, the openings within the other two."""
     bottom, right = top + height - 1, left + width - 1
     rows = _box(top, left, top, right), _box(bottom, left, bottom, right)
     columns = _box(top, left, bottom, left), _box(top, right, bottom, right)
@@ -104,9 +109,8 @@ def _boards(height: int, width: int, top: int, left: int) -> np.ndarray:
 
 
 def _food_cells(height: int, width: int, top: int, left: int) -> np.ndarray:
-    """i32[4]: the 1, 2 or 4 cells inside the tube, each equally often."""
-    inside = _box(top + 1, left + 1, top + height - 2, left + width - 2)
-    return np.resize(np.flatnonzero(inside), MAX_FOOD_CELLS).astype(np.int32)
+    """Lists the 1, 2 or 4 cells inside the tube."""
+    return np.flatnonzero(_box(top + 1, left + 1, top + height - 2, left + width - 2))
 
 
 def _extent(height: int, width: int, top: int, left: int, vertical: bool) -> tuple[int, int]:
@@ -114,7 +118,7 @@ def _extent(height: int, width: int, top: int, left: int, vertical: bool) -> tup
 
 
 def _tool_corners(height: int, width: int, top: int, left: int, vertical: bool) -> np.ndarray:
-    """bool[12, 12]: the candidates of the tool's top-left cell."""
+    """Returns the mask bool[12, 12] of candidates of the tool's top-left cell."""
     if vertical:
         fits = _box(0, 0, BOARD_SIZE - 1 - height, BOARD_SIZE - 1)
         return fits & ~_box(top - height, left - 2, top + height - 1, left + width + 1)
@@ -123,7 +127,7 @@ def _tool_corners(height: int, width: int, top: int, left: int, vertical: bool) 
 
 
 def _agent_cells(tool_corners: np.ndarray, extent: tuple[int, int], corner: int) -> np.ndarray:
-    """i64[A]: the agent's cells for a tool whose top-left cell is the flat index `corner`."""
+    """Lists the agent's cells for a tool whose top-left cell is the flat index `corner`."""
     row, column = divmod(corner, BOARD_SIZE)
     center = _box(CENTER_FIRST, CENTER_FIRST, CENTER_LAST, CENTER_LAST)
     tool = _box(row, column, row + extent[0] - 1, column + extent[1] - 1)
@@ -131,7 +135,7 @@ def _agent_cells(tool_corners: np.ndarray, extent: tuple[int, int], corner: int)
 
 
 def padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of cells as one table u8, and their lengths u32; 1 where a row is missing."""
+    """Pads rows of cells to a table u8; also returns their lengths u32, 1 for a missing row."""
     num_rows = num_rows or len(rows)
     table = np.zeros((num_rows, max(map(len, rows))), np.uint8)
     lengths = np.ones(num_rows, np.uint32)
@@ -142,7 +146,7 @@ def padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndar
 
 
 def padded_by_frame(frames: list[list[np.ndarray]], num_rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """As `padded`, for the rows of every frame: u8[F, num_rows, A] and u32[F, num_rows]."""
+    """Pads the rows of every frame to u8[F, num_rows, A], with lengths u32[F, num_rows]."""
     tables, lengths = zip(*(padded(rows, num_rows) for rows in frames), strict=True)
     longest = max(table.shape[1] for table in tables)
     wide = [np.pad(table, ((0, 0), (0, longest - table.shape[1]))) for table in tables]

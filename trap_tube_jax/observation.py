@@ -1,4 +1,4 @@
-"""What the agent sees, and pictures for people.
+"""Observations for agents, and text pictures for people.
 
 Source: environment.md, "Board and objects".
 """
@@ -13,7 +13,7 @@ from trap_tube_jax.state import State, check_state
 
 
 def visible_objects(state: State) -> jax.Array:
-    """The topmost object of every cell: u8[12, 12] of object codes 0 to 7.
+    """Returns the topmost object of every cell: u8[12, 12] of object codes 0 to 7.
 
     Raises:
       ValueError: `state` is not one unbatched state; likewise below.
@@ -26,7 +26,7 @@ def visible_objects(state: State) -> jax.Array:
 
 
 def observe(state: State) -> jax.Array:
-    """The observation u8[12, 12, N]: the features of the topmost object of every cell."""
+    """Returns the features u8[12, 12, N] of the topmost object of every cell."""
     objects = visible_objects(state)[..., None]
     # A chain of selects vectorises on a CPU, where a gather runs element by element.
     features = jnp.broadcast_to(state.palette[0], (BOARD_SIZE, BOARD_SIZE, state.palette.shape[1]))
@@ -36,15 +36,14 @@ def observe(state: State) -> jax.Array:
 
 
 def render_ascii(state: State) -> str:
-    """The board as 12 lines of 12 characters, those of `State.from_ascii`. Host side.
+    """Draws the board as 12 lines of 12 characters, those of `State.from_ascii`. Host side.
 
-    Each is the topmost object of its cell. What lies below is lost: not every state can be
-    read back.
+    A character shows the topmost object of its cell alone, so not every state can be read back.
     """
     objects = np.asarray(visible_objects(state))
     return "\n".join("".join(OBJECT_CHARS[code] for code in row) for row in objects)
 
 
 def _at(cell: jax.Array) -> jax.Array:
-    """bool[12, 12]: true at `cell` i32[2]."""
+    """Returns the mask bool[12, 12] of one cell i32[2]."""
     return (cell[0] == ROWS) & (cell[1] == COLUMNS)

@@ -1,7 +1,7 @@
-"""Where agent, tool and food are, as one number, and back.
+"""Numbers for the position of agent, tool and food.
 
-Board, palette and the tool's size do not change within an episode. So this number, with the
-task, says which state an episode is in.
+Board, palette and the tool's size do not change within an episode, so the task and this number
+determine the state, apart from time and flags.
 """
 
 import jax
@@ -15,7 +15,7 @@ NUM_POSITIONS = NUM_CELLS**3
 
 
 def position_id(state: State) -> jax.Array:
-    """The number i32[] in 0 to 144^3 - 1 of a state's position.
+    """Returns the number i32[], 0 to 144^3 - 1, of a state's position.
 
     (agent * 144 + tool) * 144 + food, each a cell in reading order; the tool's is its top-left
     one. A state of NumPy arrays gives a NumPy number.
@@ -26,7 +26,7 @@ def position_id(state: State) -> jax.Array:
 
 
 def cells_at(position: jax.Array) -> jax.Array:
-    """u8[3, 2]: the cells of agent, tool and food at a position i32[]. Undoes `position_id`."""
+    """Returns the cells u8[3, 2] of agent, tool and food at a position i32[]."""
     agent_and_tool, food = jnp.divmod(position, NUM_CELLS)
     cell = jnp.stack([*jnp.divmod(agent_and_tool, NUM_CELLS), food])
     return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)

@@ -34,7 +34,7 @@ class TaskSet:
 
     @property
     def label(self) -> str:
-        """The set in the paper's notation, such as "{P, St}" or, without transfers, "base".
+        """Returns the paper's notation, such as "{P, St}" or, without transfers, "base".
 
         A set with a base state or a step limit of its own has its short name as label.
         """

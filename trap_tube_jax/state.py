@@ -165,7 +165,7 @@ class TimeStep(ByValue, struct.PyTreeNode, eq=False):
 
     @property
     def done(self) -> jax.Array:
-        """Whether the episode is over, bool[]: terminated or truncated."""
+        """Returns bool[]: the episode is over, terminated or truncated."""
         return self.terminated | self.truncated
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.geometry import bar_cells, bar_covers, cell_of, is_on_board
-from trap_tube_jax.layouts import MAX_FOOD_CELLS, NUM_ASSIGNMENTS, NUM_FRAMES, layout_tables
+from trap_tube_jax.layouts import LayoutTables, layout_tables
 from trap_tube_jax.objects import (
     AGENT,
     BOARD_SIZE,
@@ -107,15 +107,21 @@ def perceptual(key: jax.Array, state: State) -> State:
     Raises:
       ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
     """
+    return draw_layout(key, state, layout_tables())
+
+
+def draw_layout(key: jax.Array, state: State, layouts: LayoutTables) -> State:
+    """Replaces the layout of `state` by one drawn from `layouts`; see `perceptual`."""
     check_state(state)
-    tables = jax.tree.map(jnp.asarray, layout_tables())
+    tables = jax.tree.map(jnp.asarray, layouts)
     layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
-    frame, assignment = layout % NUM_FRAMES, layout // NUM_FRAMES % NUM_ASSIGNMENTS
+    frame, assignment = tables.layout[layout % len(tables.layout)]
+    food %= tables.num_food[frame]
     tool %= tables.num_tools[frame]
     agent %= tables.num_agents[frame, tool]
     return state.replace(
         board=tables.board[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
-        food=cell_of(tables.food[frame, food % MAX_FOOD_CELLS]),
+        food=cell_of(tables.food[frame, food]),
         tool=cell_of(tables.tool[frame, tool]),
         tool_extent=tables.extent[frame],
         agent=cell_of(tables.agent[frame, tool, agent]),

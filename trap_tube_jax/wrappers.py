@@ -159,7 +159,7 @@ class EpisodeStatistics:
 
     @property
     def starts_over(self) -> bool:
-        """Whether the wrapped environment resets itself."""
+        """True if the wrapped environment resets itself."""
         return _starts_over(self.env)
 
     def reset(self, key: jax.Array) -> tuple[EpisodeStatisticsState, TimeStep]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents import Config
-from trap_tube_jax.layouts import MAX_FOOD_CELLS, NUM_ASSIGNMENTS, NUM_FRAMES, layout_tables
+from trap_tube_jax.layouts import NUM_ASSIGNMENTS, NUM_FRAMES, layout_tables
 from trap_tube_jax.objects import TUBE1, TUBE2
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS
 
@@ -22,10 +22,10 @@ def layouts() -> tuple[np.ndarray, np.ndarray]:
     chances, counts = [], []
     for frame, share in zip(first, times / NUM_FRAMES, strict=True):
         _, boards = np.unique(looks[frame], axis=0, return_counts=True)
-        _, foods = np.unique(tables.food[frame], return_counts=True)
+        foods = np.full(tables.num_food[frame], 1 / tables.num_food[frame])
         num_tools = tables.num_tools[frame]
         agents = tables.num_agents[frame, :num_tools]
-        inside = np.multiply.outer(boards / NUM_ASSIGNMENTS, foods / MAX_FOOD_CELLS)
+        inside = np.multiply.outer(boards / NUM_ASSIGNMENTS, foods)
         chance = share * np.multiply.outer(inside, 1 / (num_tools * agents))
         chances.append(chance.ravel())
         counts.append(np.broadcast_to(agents, chance.shape).ravel())

@@ -1,4 +1,4 @@
-"""A batch of environments that start over in a step of its own, Gymnasium's default."""
+"""Batches of environments whose reset takes a step, as is Gymnasium's default."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from trap_tube_jax.wrappers import AutoResetTimeStep, auto_reset_timestep
 class NextStepVectorEnvironment(VectorEnvironment):
     """A `VectorEnvironment` that starts the next episode in the step after the last.
 
-    That step ignores its action, pays 0 and returns the new episode's first observation.
+    The reset step ignores its action, pays 0 and returns the new episode's first observation.
     """
 
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:

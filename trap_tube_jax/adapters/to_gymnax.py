@@ -93,12 +93,12 @@ class _TrapTube(environment.Environment):
 
     @property
     def name(self) -> str:
-        """The task set's name."""
+        """Returns the task set's name."""
         return self._name
 
     @property
     def num_actions(self) -> int:
-        """The number of (grasp, move) pairs, 16."""
+        """Returns the number of (grasp, move) pairs, 16."""
         return NUM_ACTIONS
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:

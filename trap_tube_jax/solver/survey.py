@@ -33,7 +33,7 @@ class Survey:
 
     @property
     def solved_length(self) -> np.ndarray:
-        """The lengths i32[S] of the solvable tasks' shortest plans."""
+        """Returns the lengths i32[S] of the solvable tasks' shortest plans."""
         return self.length[self.length >= 0]
 
     def summary(self) -> dict[str, Any]:
