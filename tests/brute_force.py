@@ -1,154 +1,86 @@
-"""The rules of environment.md, "One step", in plain Python, and an exhaustive search over them.
+"""An exhaustive search over the rules as `spec_reference` reads them.
 
-Shares no code with the package, on purpose.
+Shares no code with the package, on purpose. A place is (agent, tool, food), each a flat cell; the
+tool's is its top-left one.
 """
 
-from collections import deque
+from collections.abc import Iterator
 from typing import NamedTuple
 
-Cell = tuple[int, int]
-Place = tuple[Cell, Cell, Cell]  # agent, the tool's top-left cell, food
-GROUND, EXIT = 0, 2
-VECTORS = ((-1, 0), (1, 0), (0, -1), (0, 1))
-ACTIONS = [(grasp, move) for grasp in range(4) for move in range(4)]
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+import spec_reference as spec
+
+GRASP, MOVE = np.divmod(np.arange(16), 4)
+SHIFTS = spec.DIRECTIONS[MOVE] @ (12, 1)
 
 
-class Task(NamedTuple):
-    """What stays: the static objects' codes, row by row, and the tool's (rows, columns)."""
+class Level(NamedTuple):
+    """Places i64[n, 3] at one distance, successors i64[n, 16, 3], and solved bool[n, 16]."""
 
-    board: list[list[int]]
-    extent: Cell
-
-
-def read(state) -> tuple[Task, Place]:
-    """A state's task and place, as Python numbers."""
-    agent, tool, food, extent = (
-        (int(cell[0]), int(cell[1]))
-        for cell in (state.agent, state.tool, state.food, state.tool_extent)
-    )
-    return Task(state.board.tolist(), extent), (agent, tool, food)
+    places: np.ndarray
+    successors: np.ndarray
+    solved: np.ndarray
 
 
-def move(task: Task, place: Place, action: Cell) -> Place:
-    """One step of an unfinished episode."""
-    agent, tool, food = place
-    grasp, push = VECTORS[action[0]], VECTORS[action[1]]
-    before = _cells(task, tool)
-    held = _plus(agent, grasp) in before and agent not in before
-    ahead = _plus(agent, push)
-    way_is_free = _object(task, ahead) == GROUND
-    runs_into_food = food not in before and (food[0] - push[0], food[1] - push[1]) in before
-    beyond = _plus(food, push)
-    food_yields = _object(task, beyond) in (GROUND, EXIT) and beyond not in before
+class Graph(NamedTuple):
+    """All places i64[n, 3] that can be reached, the start first, and fewest steps between them.
 
-    new_food = food
-    if held and way_is_free and runs_into_food and food_yields:
-        new_food = beyond
-    new_tool = tool
-    if held:
-        shifted = _plus(tool, push)
-        fits = all(_object(task, cell) is not None for cell in _cells(task, shifted))
-        if way_is_free and (not runs_into_food or new_food != food) and fits:
-            new_tool = shifted
-        else:
-            return agent, tool, new_food
-    enters = way_is_free or ahead == new_food
-    if _object(task, ahead) is not None and ahead not in _cells(task, new_tool) and enters:
-        return ahead, new_tool, new_food
-    return agent, new_tool, new_food
+    The successors i64[n, 16] are indices of places, -1 for a solved place, which has none. A
+    distance f64[n] is infinite where there is no way.
+    """
+
+    places: np.ndarray
+    successors: np.ndarray
+    from_start: np.ndarray
+    to_goal: np.ndarray
 
 
-def graph(task: Task, start: Place) -> dict[Place, list[Place]]:
-    """The successors of every place that can be reached, by action; none of a solved one."""
-    found: dict[Place, list[Place]] = {start: []}
-    waiting = deque([start])
-    while waiting:
-        place = waiting.popleft()
-        if _is_solved(place):
-            continue
-        found[place] = [move(task, place, action) for action in ACTIONS]
-        for following in found[place]:
-            if following not in found:
-                found[following] = []
-                waiting.append(following)
-    return found
+def levels(state) -> Iterator[Level]:
+    """Yields the unsolved places by fewest steps from the state, each once."""
+    layout = spec.Layouts(np.asarray(state.board), np.asarray(state.tool_extent))
+    cells = (state.agent, state.tool, state.food)
+    places = np.array([[spec.flat(np.asarray(cell)) for cell in cells]])
+    known = set()
+    while len(places):
+        known |= set(map(tuple, places.tolist()))
+        agent, tool, food = (spec.Cell(*np.divmod(each, 12)) for each in places.T[..., None])
+        moved = spec.step(layout, agent, tool, food, (GRASP[None], MOVE[None]))
+        moves = np.stack([moved.agent, moved.tool, moved.food], axis=-1)
+        following = places[:, None] + moves * SHIFTS[:, None]
+        yield Level(places, following, moved.solved)
+        new = np.unique(following[~moved.solved], axis=0)
+        places = new[[tuple(place) not in known for place in new.tolist()]]
 
 
-def distances_from(start: Place, edges: dict[Place, list[Place]]) -> dict[Place, int]:
-    """Fewest steps from the start to every place that can be reached."""
-    steps = {start: 0}
-    waiting = deque(steps)
-    while waiting:
-        place = waiting.popleft()
-        for following in edges[place]:
-            if following not in steps:
-                steps[following] = steps[place] + 1
-                waiting.append(following)
-    return steps
+def graph(state) -> Graph:
+    """Explores everything that can be reached from a state."""
+    found, following, solved = map(np.concatenate, zip(*levels(state), strict=True))
+    goals = np.unique(following[solved], axis=0)
+    places = np.concatenate([found, goals])
+    index = {place: number for number, place in enumerate(map(tuple, places.tolist()))}
+    successors = np.full((len(places), 16), -1)
+    successors[: len(found)] = [[index[tuple(to)] for to in row] for row in following.tolist()]
+    edges = np.repeat(np.arange(len(found)), 16), successors[: len(found)].ravel()
+    matrix = csr_array((np.ones(len(edges[0])), edges), (len(places), len(places)))
+    from_start = dijkstra(matrix, unweighted=True, indices=0)
+    to_goal = np.full(len(places), np.inf)
+    if len(goals):
+        ends = np.arange(len(found), len(places))
+        to_goal = dijkstra(matrix.T, unweighted=True, indices=ends, min_only=True)
+    return Graph(places, successors, from_start, to_goal)
 
 
-def distances_to_goal(edges: dict[Place, list[Place]]) -> dict[Place, int]:
-    """Fewest steps to a solved place, of those that have a way to one."""
-    leads_here: dict[Place, list[Place]] = {place: [] for place in edges}
-    for place, successors in edges.items():
-        for following in successors:
-            leads_here[following].append(place)
-    steps = {place: 0 for place in edges if _is_solved(place)}
-    waiting = deque(steps)
-    while waiting:
-        place = waiting.popleft()
-        for earlier in leads_here[place]:
-            if earlier not in steps:
-                steps[earlier] = steps[place] + 1
-                waiting.append(earlier)
-    return steps
-
-
-def first_plan(task: Task, start: Place) -> list[Cell] | None:
-    """The shortest plan whose actions come first in the order of `ACTIONS`, or None."""
-    edges = graph(task, start)
-    steps = distances_to_goal(edges)
-    if start not in steps:
+def first_plan(state) -> list[list[int]] | None:
+    """The shortest plan whose actions (grasp, move) come first, step by step, or None."""
+    _, successors, _, to_goal = graph(state)
+    if np.isinf(to_goal[0]):
         return None
-    place, plan = start, []
-    while steps[place]:
-        action = next(
-            index
-            for index, following in enumerate(edges[place])
-            if steps.get(following) == steps[place] - 1
-        )
-        plan.append(ACTIONS[action])
-        place = edges[place][action]
+    place, plan = 0, []
+    while to_goal[place]:
+        action = int(np.argmin(to_goal[successors[place]]))
+        plan.append([*divmod(action, 4)])
+        place = successors[place, action]
     return plan
-
-
-def is_solved_within(task: Task, start: Place, steps: int) -> bool:
-    """Whether any sequence of at most `steps` actions solves the task."""
-    known, newest = {start}, {start}
-    for _ in range(steps):
-        following = {move(task, place, action) for place in newest for action in ACTIONS}
-        if any(map(_is_solved, following)):
-            return True
-        newest = following - known
-        known |= newest
-    return False
-
-
-def _is_solved(place: Place) -> bool:
-    return place[0] == place[2]
-
-
-def _plus(cell: Cell, vector: Cell) -> Cell:
-    return cell[0] + vector[0], cell[1] + vector[1]
-
-
-def _cells(task: Task, corner: Cell) -> set[Cell]:
-    rows, columns = task.extent
-    return {
-        (corner[0] + row, corner[1] + column) for row in range(rows) for column in range(columns)
-    }
-
-
-def _object(task: Task, cell: Cell) -> int | None:
-    on_board = 0 <= cell[0] < 12 and 0 <= cell[1] < 12
-    return task.board[cell[0]][cell[1]] if on_board else None

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -46,3 +46,26 @@ def find_boards(boards: np.ndarray) -> np.ndarray:
     index = order[np.searchsorted(known[order], marks).clip(max=len(known) - 1)]
     same = np.all(BOARDS.reshape(-1, 12, 12)[index] == boards, axis=(1, 2))
     return np.where(same, index, -1)
+
+
+class Layout(NamedTuple):
+    """The choices of perceptual draws, each i64[n]; cells as flat indices."""
+
+    outline: np.ndarray
+    variant: np.ndarray
+    vertical: np.ndarray
+    tool: np.ndarray
+    agent: np.ndarray
+    food: np.ndarray
+
+
+def read_layouts(drawn: Any) -> Layout:
+    """Reads drawn states; their tools are as long as the side that they run along."""
+    index = find_boards(drawn.board)
+    assert np.all(index >= 0), "a board that environment.md does not allow"
+    outline, variant = np.divmod(index, 8)
+    vertical = (drawn.tool_extent[:, 0] > 1).astype(int)
+    height, width = np.array(OUTLINES)[outline, :2].T
+    expected = np.where(vertical, [height, np.ones_like(width)], [np.ones_like(height), width])
+    np.testing.assert_array_equal(drawn.tool_extent, expected.T)
+    return Layout(outline, variant, vertical, *map(flat, (drawn.tool, drawn.agent, drawn.food)))

@@ -1,9 +1,10 @@
 """PRNG keys, and the draws of `jax.random` without loops.
 
 On a CPU, JAX computes its Threefry hash in a loop of five rounds. A reset needs a handful of
-numbers, and starting the loops takes longer than the hash: without them XLA fuses a reset of
-{P, St, Sy} into few kernels, 2.4 times as fast. The bits are the same. Loop-free keys have a type
-of their own and never leave this package.
+numbers, and starting the loops takes longer than the hash. Without loops XLA fuses a reset of
+{P, St, Sy} into few kernels: the reset takes 0.8 of the time, a step of `jax.vmap` of an
+`AutoReset` 0.9. The bits are the same. Loop-free keys have a type of their own and never leave
+this package.
 
 Source: Salmon et al. (2011) for the hash; JAX's documentation of `jax_threefry_partitionable`
 for the choice of counters.

@@ -36,7 +36,7 @@ from trap_tube_jax.objects import (
     TUBE2,
 )
 from trap_tube_jax.observation import observe, visible_objects
-from trap_tube_jax.state import State
+from trap_tube_jax.state import State, check_state
 
 SMALLEST_SIGN = 7  # the smallest cell, in pixels, with a sign
 SMALLEST_GRID = 4  # the smallest cell, in pixels, with lines around it
@@ -73,8 +73,9 @@ def render(
       u8[12 s, 12 s, 3].
 
     Raises:
-      ValueError: `cell_size` is not an integer >= 1.
+      ValueError: `cell_size` is not an integer >= 1, or `state` not one unbatched state.
     """
+    check_state(state)
     cell_size = check_integer("cell_size", cell_size)
     return _render(state, grasp, cell_size=cell_size, grid=bool(grid))
 
@@ -102,8 +103,9 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
       cell_size: s >= 1, pixels per cell and side.
 
     Raises:
-      ValueError: `actions` or `cell_size` is invalid; the message says what is allowed.
+      ValueError: an argument is invalid; the message says what is allowed.
     """
+    check_state(state)
     cell_size = check_integer("cell_size", cell_size)
     actions = np.asarray(actions)
     if not actions.size:

@@ -1,7 +1,7 @@
 """Graded transfers against their exact distributions, enumerated from graded.md."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import spec_reference as spec
 import trap_tube_jax as tt
 from goodness_of_fit import assert_fits
 from refusal import assert_refused
-from samples import BOARDS, OUTLINES, draw, find_boards, flat, tally
+from samples import BOARDS, OUTLINES, Layout, draw, read_layouts, tally
 from trap_tube_jax.graded import points_between
 
 DRAWS = 2**15
@@ -64,28 +64,9 @@ def placements(strength: float) -> np.ndarray:
     return table
 
 
-class Drawn(NamedTuple):
-    """What was drawn, each i64[n]; cells as flat indices."""
-
-    outline: np.ndarray
-    variant: np.ndarray
-    vertical: np.ndarray
-    tool: np.ndarray
-    agent: np.ndarray
-    food: np.ndarray
-
-
 @functools.cache
-def layouts(strength: float) -> Drawn:
-    drawn = draw(tt.graded_perceptual(strength), 1, tt.base_state(), DRAWS)
-    index = find_boards(drawn.board)
-    assert np.all(index >= 0), "a board that environment.md does not allow"
-    outline, variant = np.divmod(index, 8)
-    vertical = (drawn.tool_extent[:, 0] > 1).astype(int)
-    sizes = np.array(OUTLINES)[outline, :2]
-    length = np.where(vertical, sizes[:, 0], sizes[:, 1])
-    np.testing.assert_array_equal(drawn.tool_extent.max(axis=1), length)
-    return Drawn(outline, variant, vertical, *map(flat, (drawn.tool, drawn.agent, drawn.food)))
+def layouts(strength: float) -> Layout:
+    return read_layouts(draw(tt.graded_perceptual(strength), 1, tt.base_state(), DRAWS))
 
 
 @pytest.mark.parametrize("strength", STRENGTHS)
@@ -213,18 +194,15 @@ def test_structural_leaves_agent_and_food_and_the_tubes_alike():
         assert np.all(drawn[:, code] == BASE.palette[code])
 
 
-@pytest.mark.parametrize("transfer", [tt.graded_perceptual(0.4), tt.graded_structural(0.4)])
-def test_the_same_jitted_vmapped_and_in_an_environment(transfer):
-    start, keys = tt.base_state(), jax.random.split(jax.random.key(6), 64)
-    states = jax.jit(jax.vmap(transfer, (0, None)))(keys, start)
-    for index in (0, 63):
-        row = jax.tree.map(lambda leaf, i=index: leaf[i], states)
-        jax.tree.map(np.testing.assert_array_equal, row, transfer(keys[index], start))
-    env = tt.Environment((transfer,))
+@pytest.mark.parametrize("transfer", [tt.graded_perceptual(0.3), tt.graded_structural(0.3)])
+def test_the_same_alone_in_a_batch_and_in_an_environment(transfer):
+    env, keys = tt.Environment((transfer,)), jax.random.split(jax.random.key(6), 64)
+    assert transfer.__name__.endswith(" 0.3")
     assert repr(env).startswith(f"Environment(transfers=({transfer.__name__})")
-    assert transfer.__name__.endswith(" 0.4")
-    state, _ = env.reset(jax.random.key(0))
-    tt.validate(state)
+    states, _ = jax.jit(jax.vmap(env.reset))(keys)
+    one = jax.tree.map(lambda leaf: leaf[63], states)
+    assert one == jax.jit(env.reset)(keys[63])[0] == tt.validate(env.reset(keys[63])[0])
+    assert one == transfer(jax.random.fold_in(keys[63], 0), tt.base_state())
 
 
 @pytest.mark.parametrize("factory", [tt.graded_perceptual, tt.graded_structural])
