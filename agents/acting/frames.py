@@ -20,12 +20,7 @@ from trap_tube_jax.state import State, base_state
 class Frame(NamedTuple):
     """One of the eight images of the board.
 
-    The flags mirror the board at the main diagonal, then upside down, then left to right.
-
-    Attributes:
-      transposed: bool[].
-      top_down: bool[].
-      left_right: bool[].
+    The flags bool[] mirror the board at the main diagonal, then upside down, then left to right.
     """
 
     transposed: jax.Array
@@ -41,8 +36,7 @@ class Frame(NamedTuple):
     def facing_food(observation: jax.Array) -> "Frame":
         """Returns the frame with the food below the agent, at most as far to the right as below.
 
-        Finds agent and food in the observation u8[12, 12, N] by their colours. Returns the
-        identity if one of them is not visible.
+        Finds both in u8[12, 12, N] by their colours; the identity if one is not visible.
         """
         palette = base_state(observation.shape[-1]).palette
         agent, food = (_first_cell(observation, palette[thing]) for thing in (AGENT, FOOD))

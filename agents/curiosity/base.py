@@ -48,9 +48,7 @@ class Curiosity:
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws parameters, trained together with the policy's; {} if there are none.
 
-        Args:
-          key: PRNG key, for `networks.layers.init_module`.
-          board: u8[1, 12, 12, N], an observation, for its shape.
+        `board` is an observation u8[1, 12, 12, N], for `networks.layers.init_module`.
         """
         return {}
 

@@ -60,17 +60,9 @@ def observation_slots(episodes: Episodes) -> jax.Array:
 
 
 def visit_bonus(visits: jax.Array, slot: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Adds a batch of observations to the visits, and returns the bonus of each.
+    """Adds observations of slots i32[...] to the visits f32[S], where `mask` f32[...] is 1.
 
-      n(o) <- n(o) + visits of o in this batch,  bonus = n(o)^(-1/2).
-
-    Args:
-      visits: f32[S], visits so far.
-      slot: i32[...], the slot of every observation.
-      mask: f32[...], 1 where an observation counts.
-
-    Returns:
-      The bonus f32[...], 0 where masked out, and the new visits f32[S].
+    Returns the bonus n^(-1/2) of each, f32[...], 0 where masked out, and the new visits.
     """
     visits = visits.at[slot.reshape(-1)].add(mask.reshape(-1))
     return mask / jnp.sqrt(jnp.maximum(visits[slot], 1.0)), visits

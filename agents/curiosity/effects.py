@@ -29,10 +29,7 @@ class Effects(Curiosity):
     the inverse of its rate, a moving average of its effects per step. So all kinds pay the same in
     total, a rare effect pays more, and a kind pays less as the agent learns it.
 
-    The agent's and the food's colours must be known; no transfer changes them.
-
-    Args:
-      config: settings, of which `reward_ema_decay` counts.
+    The decay of this average is `reward_ema_decay`.
     """
 
     def __init__(self, config: Config):
@@ -58,8 +55,7 @@ def new_effects(episodes: Episodes) -> jax.Array:
 
     Food and tool: it moves to a cell where it has not been. The tool is all that moves besides
     agent and food, so its cell is new exactly where the board without these two has not looked the
-    same before in the episode. A tool of the colour of what it moves over is the exception: its
-    moves pay although they are invisible.
+    same before in the episode, unless it has the colour of what it moves over.
 
     Grasp: the grasped cell has a colour that the episode has not grasped before.
     """

@@ -54,7 +54,7 @@ class ICM(Curiosity):
         self._widths = (config.hidden, 2 * config.embedding)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
-        """Draws the parameters of both models; `board` is not used."""
+        """Draws the parameters of both models."""
         embedding, action = (jnp.zeros((1, width), jnp.float32) for width in self._widths)
         params = {
             "forward": self._forward.init(key, embedding, action),

@@ -22,8 +22,7 @@ from trap_tube_jax.objects import NUM_DIRECTIONS
 class DetachedICM(ICM):
     """Forward and inverse models over features of its own; reward and losses are those of `ICM`.
 
-    Attributes:
-      detached: stops the gradient of the forward model's error at the features.
+    If `detached`, no gradient of the forward model's error reaches the features.
     """
 
     needs_next_embedding = False

@@ -16,12 +16,9 @@ from agents.networks.layers import dense, init_module, output_dense
 
 
 class Models(nn.Module):
-    """A fixed random target, and its predictor.
+    """A fixed random target, and its predictor: an encoder, a layer of `hidden` units, an output.
 
-    Attributes:
-      hidden: units of the layer between the predictor's encoder and its output.
-      target: encoder, u8[M, 12, 12, N] to f32[M, F].
-      predictor: the predictor's own encoder.
+    Both encoders map u8[M, 12, 12, N] to f32[M, F].
     """
 
     hidden: int

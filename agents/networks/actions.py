@@ -1,8 +1,7 @@
-"""The distribution of actions, which the policy and the curiosity's inverse model both predict."""
+"""The distribution of actions, predicted by the policy and by inverse models."""
 
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 
@@ -31,19 +30,14 @@ class ActionDistribution(NamedTuple):
 
     def log_prob(self, action: jax.Array) -> jax.Array:
         """Returns log p(grasp) + log p(move), f32[...], of actions i32[..., 2]."""
-        grasp, move = action[..., 0], action[..., 1]
-        return _log_prob(self.grasp_logits, grasp) + _log_prob(self.move_logits, move)
+        choices = jnp.split(action, 2, axis=-1)
+        grasp, move = (
+            jnp.take_along_axis(jax.nn.log_softmax(logits), choice, axis=-1)[..., 0]
+            for logits, choice in zip(self, choices, strict=True)
+        )
+        return grasp + move
 
     def entropy(self) -> jax.Array:
         """Returns the sum of both entropies, f32[...], in nats."""
-        return _entropy(self.grasp_logits) + _entropy(self.move_logits)
-
-
-def _log_prob(logits: jax.Array, choice: jax.Array) -> jax.Array:
-    chex.assert_equal_shape_prefix([logits, choice[..., None]], choice.ndim)
-    return jnp.take_along_axis(jax.nn.log_softmax(logits), choice[..., None], axis=-1)[..., 0]
-
-
-def _entropy(logits: jax.Array) -> jax.Array:
-    log_probs = jax.nn.log_softmax(logits)
-    return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
+        grasp, move = (jax.nn.log_softmax(logits) for logits in self)
+        return -jnp.sum(jnp.exp(grasp) * grasp, axis=-1) - jnp.sum(jnp.exp(move) * move, axis=-1)

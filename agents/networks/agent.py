@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -24,9 +23,10 @@ class Agent:
 
     def __init__(self, config: Config):
         self.config = config
-        self.encoder = make_encoder(config)
-        self.core = Core(config.hidden, config.embedding, config.recurrent)
-        self.heads = Heads(config.num_value_heads)
+        # Typed as anything, because `apply` returns the results of any method.
+        self.encoder: Any = make_encoder(config)
+        self.core: Any = Core(config.hidden, config.embedding, config.recurrent)
+        self.heads: Any = Heads(config.num_value_heads)
 
     def init(self, key: jax.Array) -> Params:
         """Draws the parameters."""
@@ -44,55 +44,37 @@ class Agent:
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Encodes observations u8[M, 12, 12, N] to f32[M, F]; reads `params["encoder"]` alone."""
-        return _apply(self.encoder, params["encoder"], observation)
+        return self.encoder.apply(params["encoder"], observation)
 
     def encode_rows(self, params: Params, observation: jax.Array, remembered: Any = None) -> Any:
         """Does the same by the fast path; see `windows.encode_rows`."""
         return encode_rows(self.encoder, params["encoder"], observation, remembered)
 
-    def step(
-        self,
-        params: Params,
-        state: jax.Array,
-        features: jax.Array,
-        action_tm1: jax.Array,
-        reward_tm1: jax.Array,
-    ) -> jax.Array:
-        """Returns the GRU's state f32[..., hidden] after a step; see `Core.inputs`."""
-        return _apply(self.core, params["core"], state, features, action_tm1, reward_tm1)
-
     def initial_state(self, params: Params, batch: int) -> jax.Array:
         """Returns the GRU's state f32[batch, hidden] before the first step."""
-        return _apply(self.core, params["core"], batch, method=Core.initial_state)
+        return self.core.apply(params["core"], batch, method=Core.initial_state)
+
+    def step(self, params: Params, state: jax.Array, *inputs: jax.Array) -> jax.Array:
+        """Returns the GRU's state f32[..., hidden] after a step; `inputs` are those of `Core`."""
+        return self.core.apply(params["core"], state, *inputs)
+
+    def unroll(
+        self, params: Params, *inputs: jax.Array, both: bool = False
+    ) -> tuple[jax.Array, jax.Array | None]:
+        """Returns the GRU's outputs h at every step, and h' or None; see `Core.unroll`."""
+        return self.core.apply(params["core"], *inputs, both=both, method=Core.unroll)
 
     def policy_and_value(
         self, params: Params, state: jax.Array
     ) -> tuple[ActionDistribution, jax.Array]:
         """Returns actions and values f32[..., V] at states f32[..., hidden] of the GRU."""
-        return _apply(self.heads, params["heads"], state)
+        return self.heads.apply(params["heads"], state)
 
     def embed_action(self, params: Params, action: jax.Array) -> jax.Array:
         """Embeds actions i32[..., 2] to f32[..., 2 * embedding]."""
-        return _apply(self.core, params["core"], action, method=Core.embed_action)
-
-    def unroll(
-        self,
-        params: Params,
-        features: jax.Array,
-        action: jax.Array,
-        reward: jax.Array,
-        *,
-        both: bool = False,
-    ) -> tuple[jax.Array, jax.Array | None]:
-        """Returns the GRU's outputs h at every step, and h' or None; see `Core.unroll`."""
-        given = (features, action, reward)
-        return _apply(self.core, params["core"], *given, both=both, method=Core.unroll)
+        return self.core.apply(params["core"], action, method=Core.embed_action)
 
 
 def num_parameters(params: Params) -> int:
     """Returns the number of scalars in `params`."""
     return sum(leaf.size for leaf in jax.tree.leaves(params))
-
-
-def _apply(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
-    return module.apply(*args, **kwargs)  # typed as anything

@@ -1,8 +1,8 @@
-"""Fast path: `map_rows` computes a function of rows for the first of them alone, and its gradient.
+"""Fast path: a function of the first rows alone, chunk by chunk, and its gradient.
 
 Observations repeat, and encoding them takes nearly all of the time. So distinct observations are
 put first, and only those are encoded, in chunks of fixed size whose number depends on the data.
-JAX does not differentiate loops of varying length; `map_rows` does it here, and remembers for it
+JAX does not differentiate loops of varying length; `map_rows` does, and remembers for the gradient
 results that are costly to compute (20 % of a gradient step).
 """
 
@@ -51,8 +51,8 @@ def _map_rows_forward(
         place = jnp.minimum(index, num_remembered)  # the last place is for all others
         return _put(tables[0], index, features), _put(tables[1], place, memory)
 
-    zeros = _zeros(num_chunks, shapes[0]), _zeros(num_remembered + 1, shapes[1])
-    features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, zeros)
+    tables = _table(num_chunks, shapes[0]), _table(num_remembered + 1, shapes[1])
+    features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, tables)
     num_rows = len(jax.tree.leaves(rows)[0])
     features = jax.tree.map(lambda x: jax.lax.collapse(x, 0, 2)[:num_rows], features)
     return features, (params, rows, count, memory)
@@ -96,8 +96,7 @@ def _(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
 def shared_maximum(x: jax.Array) -> jax.Array:
     """Returns the maximum of a scalar over all vmapped axes, unbatched.
 
-    A loop whose trip count differs between batch elements has to carry both outcomes of
-    every element through selects; one that runs as long as the longest does not.
+    Loops that all run as long as the longest need no selects between batch elements.
     """
     return x
 
@@ -135,5 +134,5 @@ def _put(table: Any, place: jax.Array, rows: Any) -> Any:
     return jax.tree.map(lambda x, new: x.at[place].set(new), table, rows)
 
 
-def _zeros(length: int, shapes: Any) -> Any:
+def _table(length: int, shapes: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.zeros((length, *leaf.shape), leaf.dtype), shapes)

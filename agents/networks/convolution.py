@@ -1,8 +1,7 @@
-"""Convolutions as matrix products of patches, and max pooling.
+"""Fast path: convolutions as matrix products of patches with the kernel, and max pooling.
 
-Fast path of a Flax convolution, with the same result up to rounding: the product of patches with
-the kernel, [M * H * W, k * k * C_in] times [k * k * C_in, C_out], is faster on a CPU than XLA's
-convolutions, whose derivatives are slow.
+On a CPU they are faster than XLA's convolutions, whose derivatives are slow. Results are those of
+Flax's convolutions up to rounding.
 """
 
 from typing import Any
@@ -15,13 +14,9 @@ from agents.networks.layers import as_row, hidden_init
 
 
 class Conv(nn.Module):
-    """A square convolution of stride 1 that keeps the size.
+    """A square convolution of stride 1 to `features` channels, by kernels of height `size`.
 
-    A kernel of even size pads more below and to the right.
-
-    Attributes:
-      features: output channels.
-      size: k, the kernel's height and width.
+    Padding keeps the board's size; even kernels pad more below and to the right.
     """
 
     features: int
@@ -43,26 +38,25 @@ def patches(x: jax.Array, size: int) -> jax.Array:
     return jnp.concatenate(shifts, axis=-1)
 
 
-def pad_edges(x: jax.Array, size: int, *, turned: bool = False) -> jax.Array:
-    """Pads f32[M, H, W, C] with zeros, so that `patches` of this size keep H and W.
+def padded_patches(x: jax.Array, size: int, *, turned: bool = False) -> jax.Array:
+    """Cuts f32[M, H, W, C], padded with zeros, into f32[M, H, W, size² * C].
 
     An even size pads more below and to the right or, if turned, above and to the left.
     """
     before = (size - 1) // 2
     padding = (before, size - 1 - before)
     padding = padding[::-1] if turned else padding
-    return jnp.pad(x, ((0, 0), padding, padding, (0, 0)))
+    return patches(jnp.pad(x, ((0, 0), padding, padding, (0, 0))), size)
 
 
 def add_patches(x: jax.Array, size: int) -> jax.Array:
-    """Transposes `patches` after `pad_edges`.
+    """Transposes `padded_patches`.
 
     Every cell of f32[M, H, W, size² * C] holds its contributions to the cells around it, row by
     row; their sums are f32[M, H, W, C].
     """
-    shape = (*x.shape[:-1], x.shape[-1] // size**2)
-    cells = jax.ShapeDtypeStruct(shape, x.dtype)
-    return jax.linear_transpose(lambda y: patches(pad_edges(y, size), size), cells)(x)[0]
+    cells = jax.ShapeDtypeStruct((*x.shape[:-1], x.shape[-1] // size**2), x.dtype)
+    return jax.linear_transpose(lambda y: padded_patches(y, size), cells)(x)[0]
 
 
 @jax.custom_vjp
@@ -72,15 +66,14 @@ def convolve(x: jax.Array, kernel: jax.Array) -> jax.Array:
     Both derivatives are products with the patches of the cotangent. JAX's own would add up k * k
     overlapping parts for the one and cut the patches of x again for the other.
     """
-    size = len(kernel)
-    return patches(pad_edges(x, size), size) @ kernel.reshape(-1, kernel.shape[-1])
+    return padded_patches(x, len(kernel)) @ kernel.reshape(-1, kernel.shape[-1])
 
 
 def _convolve_backward(residuals: Any, cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = residuals
     size, _, channels, features = kernel.shape
     turned = kernel[::-1, ::-1].swapaxes(2, 3)
-    around = patches(pad_edges(cotangent, size, turned=True), size)
+    around = padded_patches(cotangent, size, turned=True)
     by_kernel = jnp.tensordot(x, around, axes=[(0, 1, 2)] * 2)
     by_kernel = by_kernel.reshape(channels, size, size, features).transpose(1, 2, 0, 3)
     return around @ turned.reshape(-1, channels), by_kernel[::-1, ::-1]

@@ -24,10 +24,7 @@ class Core(nn.Module):
       z, r, n = x W + b_0 and z', r', n' = h R + b_1, each split in three;
       h_t = s(z + z') h_tm1 + (1 - s(z + z')) tanh(n + s(r + r') n').
 
-    Attributes:
-      hidden: units of the GRU and of the layer before it.
-      embedding: units of each action embedding and of the reward's.
-      recurrent: keeps the state between steps; otherwise every step begins with the initial one.
+    Attributes are the settings of these names in `Config`.
     """
 
     hidden: int
@@ -39,8 +36,7 @@ class Core(nn.Module):
         embed = functools.partial(
             nn.Embed, NUM_DIRECTIONS, self.embedding, embedding_init=hidden_init
         )
-        self.grasp_embedding = embed()
-        self.move_embedding = embed()
+        self.grasp_embedding, self.move_embedding = embed(), embed()
         self.reward_embedding = dense(self.embedding)
         self.mix = dense(self.hidden)
         gates = 3 * self.hidden
@@ -52,7 +48,7 @@ class Core(nn.Module):
     def __call__(
         self, state: jax.Array, features: jax.Array, action_tm1: jax.Array, reward_tm1: jax.Array
     ) -> jax.Array:
-        """Returns the state f32[..., hidden] after one step; see `inputs` and `advance`."""
+        """Returns the state f32[..., hidden] after one step."""
         return self.advance(state, self.inputs(features, action_tm1, reward_tm1))
 
     def inputs(

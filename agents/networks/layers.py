@@ -32,10 +32,8 @@ def variance_scaling(scale: float) -> Callable[..., np.ndarray]:
 def draw(key: jax.Array, params: Any) -> Any:
     """Samples kernels from a normal distribution truncated at two standard deviations.
 
-    Args:
-      key: PRNG key.
-      params: tree of NumPy arrays, the standard deviations f32[...] of kernels after truncation,
-        and of JAX arrays, which stay.
+    NumPy arrays in `params` are the standard deviations f32[...] of kernels after truncation; JAX
+    arrays stay.
     """
     leaves, structure = jax.tree.flatten(params)
     ends = np.cumsum([leaf.size for leaf in leaves])

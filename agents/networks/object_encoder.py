@@ -29,8 +29,8 @@ NOWHERE = -1e3  # below every activation
 class ObjectEncoder(nn.Module):
     """Maps every object by itself, then in view of all, and pools over objects.
 
-    Attributes:
-      filters: units of the layers before the objects are pooled into a scene, and after.
+    Layers before the objects are pooled into a scene have `filters[0]` units, later ones
+    `filters[1]`.
     """
 
     filters: tuple[int, int]
@@ -95,10 +95,9 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
 
 
 def _objects(color: jax.Array, left: jax.Array) -> jax.Array:
-    """Finds the first six colours u32[M, 12, 12] in cells that are left, bool[M, 12, 12].
+    """Returns the columns u32[M, 6, 12], in every row, of the first six colours u32[M, 12, 12].
 
-    Returns:
-      The columns u32[M, 6, 12] of each colour in every row.
+    Looks at cells that are left, bool[M, 12, 12].
     """
     count = len(color)
     color, left = color.reshape(count, -1), left.reshape(count, -1)
@@ -119,19 +118,16 @@ def _project(lines: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _relative(places: jax.Array, origin: jax.Array) -> jax.Array:
-    """Returns flags bool[..., 23] of `places` u32[...], the first of `origin` in the middle.
-
-    All are false where there is no origin.
-    """
+    """Returns flags bool[..., 23] of places u32[...] about an origin; false where it is 0."""
     reach = BOARD_SIZE - 1
     seen = (places << np.uint32(reach)) >> _first(origin)
     return _unpack(jnp.where(origin != 0, seen, 0), 2 * reach + 1)
 
 
 def _around(lines: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
-    """Returns flags bool[M, K, 25] of the cells of u32[M, K, 12] around a row and column u32[M, 1].
+    """Returns flags bool[M, K, 25] of cells u32[M, K, 12] around a row and column u32[M, 1].
 
-    They are false off the board, and where there is no row.
+    They are false off the board, and where the row is 0.
     """
     width = 2 * NEAR + 1
     offset = np.arange(BOARD_SIZE, dtype=np.int32)[None] - _first(row).astype(jnp.int32) + NEAR

@@ -33,15 +33,9 @@ def encode_rows(
 ) -> tuple[Any, Any]:
     """Encodes observations u8[M, 12, 12, N], by windows if the encoder is the paper's.
 
-    Args:
-      encoder: an encoder.
-      params: its parameters; the paper's features are differentiable by nothing else.
-      observation: the observations.
-      remembered: see `chunks.map_rows`.
-
     Returns:
-      The features f32[M, F], and the results of the paper's encoder's matrix products that are
-      made observation by observation; None with another encoder.
+      The features f32[M, F], by windows differentiable by `params` alone, and what to remember for
+      `chunks.map_rows`: results of matrix products, or None with another encoder.
     """
     if type(encoder) is not Encoder:  # one derived from it may compute something else
         return encoder.apply(params, observation), None
@@ -70,16 +64,16 @@ def cut_into_windows(board: jax.Array) -> jax.Array:
 def encode_windows(
     weights: Weights, window: jax.Array, block: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes the layers up to the first pooling at single 2x2 blocks of the board.
+    """Computes the layers up to the first pooling, at single 2x2 blocks of the board.
 
     Args:
       weights: of the encoder.
       window: u8[W, 4, 4, N], of which the part beyond the board's edge is ignored.
-      block: integer[W], the number of the block at which the window starts, 0 to 35, row by row.
+      block: integer[W], the block at which the window starts, 0 to 35, row by row.
 
     Returns:
-      f32[W, C], and f32[W, 9 * C], the contributions to the first convolution of the residual
-      block at the 9 cells around it, row by row.
+      f32[W, C], and its contributions f32[W, 9 * C] to the residual block's first convolution at
+      the 9 cells around it.
     """
     inside = np.ones((BOARD_SIZE, BOARD_SIZE, 1), np.float32)
     board = np.concatenate([coordinates_of_cells(), inside], axis=-1)
@@ -96,11 +90,7 @@ def encode_windows(
 def encode_blocks(
     weights: Weights, x: jax.Array, spread: jax.Array, remembered: Any
 ) -> tuple[jax.Array, Any]:
-    """Computes the later layers from the results of `encode_windows`, [M, 6, 6, ...].
-
-    Returns:
-      f32[M, C], and the results of matrix products by name.
-    """
+    """Computes f32[M, C] from `encode_windows` [M, 6, 6, ...]; returns matrix products, too."""
     made = {}
 
     def product(name: str, value: jax.Array) -> jax.Array:
@@ -122,6 +112,6 @@ def _padded(layer: Weights, x: jax.Array) -> jax.Array:
 
 
 def _unpadded(layer: Weights, x: jax.Array) -> jax.Array:
-    size, *_, features = layer["kernel"].shape
-    y = patches(x, size) @ layer["kernel"].reshape(-1, features)
+    kernel = layer["kernel"]
+    y = patches(x, len(kernel)) @ kernel.reshape(-1, kernel.shape[-1])
     return y + as_row(layer["bias"], x.ndim)

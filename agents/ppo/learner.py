@@ -129,12 +129,8 @@ class Learner:
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Plays one iteration's episodes and learns from them.
 
-        Args:
-          state: state of one seed.
-
-        Returns:
-          The next state and the iteration's metrics, f32[] each. `is_finite` is 1 unless a
-          parameter or another metric is infinite or NaN.
+        Returns the next state of one seed, and the iteration's metrics, f32[] each. `is_finite` is
+        1 unless a parameter or another metric is infinite or NaN.
         """
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
         reset_keys = self.draw_tasks(state.task_replay, reset_key)
@@ -201,15 +197,9 @@ class Learner:
     def make_batch(
         self, state: TrainState, trajectory: Trajectory, intrinsic_reward: jax.Array
     ) -> tuple[Batch, advantages.RewardMoments]:
-        """Computes advantages and value targets; see `agents.ppo.advantages`.
+        """Computes advantages and value targets, by intrinsic rewards f32[T, B].
 
-        Args:
-          state: state before the iteration.
-          trajectory: B episodes.
-          intrinsic_reward: f32[T, B].
-
-        Returns:
-          The batch, and the moments of both rewards.
+        Returns the batch, and the moments of both rewards; see `agents.ppo.advantages`.
         """
         config, episodes = self.config, trajectory.episodes
         moments = advantages.update_moments(
@@ -257,10 +247,6 @@ class Learner:
 
           L = policy + value - entropy + curiosity_coef * curiosity's losses
 
-        Args:
-          params: parameters to differentiate by.
-          batch: the minibatch.
-
         Returns:
           L f32[] and metrics: its terms as weighted in L, and the mean entropy of a step.
 
@@ -295,13 +281,10 @@ class Learner:
     def experience(
         self, params: Params, episodes: Episodes, played: Trajectory | None = None
     ) -> Experience:
-        """Returns the curiosity's view of episodes under `params`.
+        """Returns the curiosity's view of episodes under `params`, differentiable by them.
 
-        Args:
-          params: parameters, by which the arrays of the view are differentiable.
-          episodes: B episodes of T steps.
-          played: the trajectory, if `params` acted; its outputs of the network are not computed
-            again.
+        If `params` acted, `played` is the trajectory, whose features and outputs of the GRU are
+        not computed again.
         """
         read = {name: params[name] for name in ("encoder", "curiosity")}
 

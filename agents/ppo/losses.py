@@ -31,9 +31,6 @@ def clipped_surrogate(
       old_log_prob: f32[...], the same under the parameters that acted.
       advantage: f32[...].
       clip_eps: half-width of the interval of ratios.
-
-    Returns:
-      f32[...].
     """
     chex.assert_equal_shape([log_prob, old_log_prob, advantage])
     ratio = jnp.exp(log_prob - old_log_prob)

@@ -22,9 +22,7 @@ def adam(learning_rate: optax.Schedule, epsilon: float) -> optax.GradientTransfo
     `optax.adam` adds epsilon after the correction of v. At t = 1 epsilon then weighs 30 times less
     (sqrt(1 - BETA2) = 0.03), which shows in parameters whose gradient is near 1e-6.
 
-    Args:
-      learning_rate: step size by the number of updates so far.
-      epsilon: added to the root of the second moment.
+    `learning_rate` is a function of the number of updates so far.
     """
 
     def init(params: optax.Params) -> optax.ScaleByAdamState:

@@ -21,11 +21,7 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
     Args:
       reward: f32[T, ...], zero after the end.
       discount: scalar in [0, 1].
-
-    Returns:
-      f32[T, ...].
     """
-    chex.assert_rank(discount, 0)
     return _backward_sum(reward, jnp.full(len(reward), discount, reward.dtype))
 
 
@@ -47,9 +43,6 @@ def generalized_advantages(
       value: f32[T + 1, ...], values of all observations.
       mask: f32[T, ...].
       lambda_: scalar in [0, 1].
-
-    Returns:
-      f32[T, ...].
     """
     chex.assert_equal_shape([reward, discount, value[1:], mask])
     delta = mask * (reward + discount * value[1:] - value[:-1])

@@ -12,7 +12,6 @@ import trap_tube_jax as tt
 from agents.networks import chunks
 from agents.networks.convolution import convolve
 from agents.networks.encoder import Encoder
-from agents.networks.grouping import group_rows
 from agents.networks.layers import init_module
 from agents.networks.windows import cut_into_windows, encode_rows
 
@@ -126,11 +125,3 @@ def test_windows_are_the_parts_of_the_board():
         row, column = divmod(index % 36, 6)
         part = padded[index // 36, 2 * row : 2 * row + 4, 2 * column : 2 * column + 4]
         np.testing.assert_array_equal(window, part)
-
-
-def test_few_windows_of_an_episode_are_distinct():
-    window = cut_into_windows(jax.jit(boards, static_argnums=(0, 1))("base", 3))
-    window = window.reshape(len(window), -1)
-    groups = group_rows(window)
-    assert 1 < groups.total < len(window) / 5
-    np.testing.assert_array_equal(window[groups.representative[groups.number]], window)

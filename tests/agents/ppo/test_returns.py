@@ -31,11 +31,6 @@ def episodes() -> dict[str, np.ndarray]:
     }
 
 
-def test_returns_by_hand():
-    result = returns.discounted_returns(jnp.array([1.0, 0.0, 2.0]), 0.5)
-    np.testing.assert_allclose(result, [1.5, 1.0, 2.0])
-
-
 def test_returns(episodes):
     result = jax.vmap(returns.discounted_returns)(episodes["reward"], episodes["discount"])
     for case in range(CASES):
@@ -43,14 +38,6 @@ def test_returns(episodes):
         powers = np.float64(episodes["discount"][case]) ** np.arange(STEPS)
         expected = [reward[t:] @ powers[: STEPS - t] for t in range(STEPS)]
         np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
-
-
-def test_advantages_by_hand():
-    result = returns.generalized_advantages(
-        jnp.array([0.0, 1.0]), jnp.array([0.5, 0.5]), jnp.array([0.5, 0.25, 2.0]), jnp.ones(2), 0.5
-    )
-    delta = [0.0 + 0.5 * 0.25 - 0.5, 1.0 + 0.5 * 2.0 - 0.25]
-    np.testing.assert_allclose(result, [delta[0] + 0.25 * delta[1], delta[1]])
 
 
 def test_advantages(episodes):
@@ -67,37 +54,30 @@ def test_advantages(episodes):
         np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
 
 
-def targets(bootstrap: str, discount: list[float], mask: list[float]) -> tuple[Any, Any]:
-    """Advantages and targets of one episode: rewards 1, values 10, 20, 30, 40, gamma .5."""
-    config = Config(discount=0.5, gae_lambda=0.0, bootstrap=bootstrap)  # pyright: ignore[reportArgumentType]
+TERMINATED, TRUNCATED = ([1, 0, 0], [1, 1, 0]), ([1, 1, 1], [1, 1, 1])  # discount and mask
+
+
+@pytest.mark.parametrize(
+    ("bootstrap", "end", "advantage", "target"),
+    [
+        # Nothing follows a terminated episode; the last observation's value a truncated one.
+        ("value", TERMINATED, [1 + 0.5 * 20 - 10, 1 - 20, 0], [11, 1]),
+        ("value", TRUNCATED, [1, -4, 1 + 0.5 * 40 - 30], [11, 16, 21]),
+        # After termination the value of the board that stays, after truncation the last step's.
+        ("baseline", TERMINATED, [1, 1 + 0.5 * 30 - 20, 0], [1.5, 1, 0]),
+        ("baseline", TRUNCATED, [1, -4, 1 + 0.5 * 30 - 30], [1.75, 1.5, 1]),
+    ],
+)
+def test_the_rules_of_bootstrap_differ_at_the_end(bootstrap, end, advantage, target):
+    """Rewards are 1, values 10, 20, 30, 40."""
+    config = Config(discount=0.5, gae_lambda=0.0, bootstrap=bootstrap)
     nothing: Any = None
-    column = [jnp.array(x, jnp.float32)[:, None] for x in (discount, mask)]
-    episodes = Episodes(nothing, nothing, nothing, nothing, column[0], column[1], nothing)
+    discount, mask = (jnp.array(x, jnp.float32)[:, None] for x in end)
+    episodes = Episodes(nothing, nothing, nothing, nothing, discount, mask, nothing)
     value = jnp.array([10.0, 20.0, 30.0, 40.0])[:, None]
-    found = advantages.advantages_and_targets(config, column[1], episodes, value)
-    return found[0][:, 0], found[1][:, 0]
-
-
-def test_nothing_follows_a_terminated_episode():
-    advantage, target = targets("value", [1, 0, 0], [1, 1, 0])
-    np.testing.assert_allclose(advantage, [1 + 0.5 * 20 - 10, 1 - 20, 0])
-    np.testing.assert_allclose(target[:2], [11, 1])
-
-
-def test_the_value_of_the_last_observation_follows_a_truncated_episode():
-    advantage, target = targets("value", [1, 1, 1], [1, 1, 1])
-    np.testing.assert_allclose(advantage, [1, -4, 1 + 0.5 * 40 - 30])
-    np.testing.assert_allclose(target, [11, 16, 21])
-
-
-def test_the_baseline_goes_on_with_the_values_that_it_has():
-    """After termination that of the board that stays, after truncation the last step's own."""
-    advantage, target = targets("baseline", [1, 0, 0], [1, 1, 0])
-    np.testing.assert_allclose(advantage, [1, 1 + 0.5 * 30 - 20, 0])
-    np.testing.assert_allclose(target, [1.5, 1, 0])
-    advantage, target = targets("baseline", [1, 1, 1], [1, 1, 1])
-    np.testing.assert_allclose(advantage, [1, -4, 1 + 0.5 * 30 - 30])
-    np.testing.assert_allclose(target, [1.75, 1.5, 1])
+    found = advantages.advantages_and_targets(config, mask, episodes, value)
+    np.testing.assert_allclose(found[0][:, 0], advantage)
+    np.testing.assert_allclose(found[1][: len(target), 0], target)
 
 
 @pytest.mark.parametrize("name", PRESETS)
