@@ -101,8 +101,8 @@ def build(cls: type[Options], namespace: argparse.Namespace, **given: Any) -> Op
 
 
 def _documents(cls: type) -> dict[str, str]:
-    """Returns the first sentence about each attribute in the docstring of `cls`."""
-    text = inspect.getdoc(cls) or ""
+    """Returns the first sentence about each attribute in the docstrings of `cls` and its bases."""
+    text = "\n".join(inspect.getdoc(each) or "" for each in reversed(cls.__mro__[:-1]))
     entries = re.findall(r"^ {2}(\w+): (.+(?:\n {4}.+)*)", text, re.M)
     sentences = {name: re.sub(r"\s+", " ", entry) for name, entry in entries}
     return {

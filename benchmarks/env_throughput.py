@@ -11,12 +11,11 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 import trap_tube_jax as tt
-from agents.command_line import Flag
+from agents.command_line import parse
 from benchmarks import harness
 from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
@@ -31,7 +30,7 @@ PatternName = Literal["bytes", "sum", "mean", "dense", "one-hot", "last"]
 
 @dataclasses.dataclass(frozen=True)
 class StepOptions(harness.Options):
-    """Options of the benchmarks that step environments.
+    """Measures steps per second of the task sets, and of other environments where compared.
 
     Attributes:
       sets: task sets, by id or short name.
@@ -60,7 +59,7 @@ class StepOptions(harness.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Options(StepOptions):
-    """Options of this benchmark.
+    """Measures environment steps per second under random actions.
 
     Attributes:
       patterns: uses of the observations: `bytes` folds every byte into an array of their size,
@@ -71,7 +70,7 @@ class Options(StepOptions):
     """
 
     patterns: tuple[PatternName, ...] = ("bytes",)
-    plain: Flag = False
+    plain: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,12 +212,11 @@ def measure_throughput(
     carry, observations = jax.jit(on_devices(reset, devices))(keys)
     program, compile_s = harness.compiled(on_devices(run, devices), carry, actions)
 
-    def call() -> jax.Array:
-        nonlocal carry
-        carry = program(carry, actions)
-        return carry[1]
-
-    timing = harness.measure_compiled(call, compile_s, options.repeats)
+    calls = []
+    for _ in range(options.repeats + 1):
+        carry, spent = harness.timed(program, carry, actions)
+        calls.append(spent)
+    timing = harness.Timing.of(compile_s, calls[1:])
     return Throughput(
         name=subject.name,
         pattern=pattern,
@@ -304,4 +302,4 @@ def main(options: Options) -> list[Throughput]:
 
 if __name__ == "__main__":
     with plain_errors():
-        main(tyro.cli(Options, description=__doc__))
+        main(parse(Options, None, "python -m benchmarks.env_throughput"))

@@ -46,8 +46,12 @@ class Options:
           ValueError: an option is not allowed, or `output` is given and the code is uncommitted.
         """
         check_integer("repeats", self.repeats)
-        if self.output is not None:
-            check_committed()
+        name = commit()
+        if self.output is not None and (name is None or name.endswith("-dirty")):
+            raise ValueError(
+                f"a record needs committed code, in a git checkout; the commit is {name}: commit "
+                "the changes, or leave out --output"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,33 +84,18 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Callable[..
     return program, time.perf_counter() - start
 
 
-def seconds(run: Callable[[], Any]) -> float:
-    """Times one call, from its start until the arrays that it returns are ready."""
+def timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """Calls a function; returns its result, and the seconds until the arrays in it are ready."""
     start = time.perf_counter()
-    jax.block_until_ready(run())
-    return time.perf_counter() - start
+    result = jax.block_until_ready(function(*arguments))
+    return result, time.perf_counter() - start
 
 
 def measure(function: Callable[..., Any], *arguments: Any, repeats: int = 5) -> Timing:
-    """Compiles and times a function of arrays."""
+    """Compiles and times a function of arrays, after one call to warm up."""
     program, compile_s = compiled(function, *arguments)
-    return measure_compiled(lambda: program(*arguments), compile_s, repeats)
-
-
-def measure_compiled(run: Callable[[], Any], compile_s: float, repeats: int) -> Timing:
-    """Times a call of a compiled function, after one call to warm up."""
-    _, *calls = [seconds(run) for _ in range(repeats + 1)]
+    _, *calls = [timed(program, *arguments)[1] for _ in range(repeats + 1)]
     return Timing.of(compile_s, calls)
-
-
-def check_committed() -> None:
-    """Raises ValueError if the code is not that of a commit, which a record has to name."""
-    name = commit()
-    if name is None or name.endswith("-dirty"):
-        raise ValueError(
-            f"a record needs committed code, in a git checkout; the commit is {name}: commit the "
-            "changes, or leave out --output"
-        )
 
 
 def machine() -> dict[str, Any]:
@@ -122,13 +111,9 @@ def write_record(benchmark: str, options: Options, results: Sequence[Any], **ext
       options: the options that it ran with.
       results: dataclasses.
       extra: further entries.
-
-    Raises:
-      ValueError: the code is uncommitted.
     """
     if options.output is None:
         return
-    check_committed()
     record = {
         "schema": SCHEMA,
         "benchmark": benchmark,

@@ -19,13 +19,13 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 import agents.networks
 import trap_tube_jax as tt
 from agents import Config, make_train
+from agents.command_line import parse
 from agents.examples import plain_ppo
 from benchmarks import harness
 from trap_tube_jax.command_line import plain_errors
@@ -34,6 +34,9 @@ from trap_tube_jax.state import State, TimeStep
 NetworkName = Literal["paper", "dense"]
 ProgramName = Literal["ours", "plain", "plain-by-step"]
 UNITS = 128  # of PureJaxRL's encoder and GRU
+# A compiled iteration, state -> (state, environment steps taken); the seconds of tracing and
+# compiling; and the first state.
+Program = tuple[Callable[[Any], tuple[Any, jax.Array]], float, Any]
 
 
 class DenseEncoder(nn.Module):
@@ -51,7 +54,7 @@ agents.networks.register("dense", lambda config: DenseEncoder())
 
 @dataclasses.dataclass(frozen=True)
 class Options(harness.Options):
-    """Options of this benchmark.
+    """Times iterations of our learner and of plain programs.
 
     Attributes:
       sets: task sets to train on, by id or short name.
@@ -133,28 +136,6 @@ class Speed:
     timing: harness.Timing
 
 
-@dataclasses.dataclass
-class Program:
-    """Iterations of a learner, each from the state that the one before returned.
-
-    Attributes:
-      iterate: state -> (state, environment steps taken), compiled.
-      state: state of training.
-      compile_s: seconds of tracing and compiling.
-      steps: environment steps of the last iteration.
-    """
-
-    iterate: Callable[[Any], tuple[Any, jax.Array]]
-    state: Any
-    compile_s: float
-    steps: Any = 0
-
-    def run(self) -> Any:
-        """Runs one iteration; returns the new state."""
-        self.state, self.steps = self.iterate(self.state)
-        return self.state
-
-
 def our_program(config: Config) -> Program:
     """Compiles an iteration of `agents.ppo`."""
     learner = make_train(config)
@@ -164,8 +145,7 @@ def our_program(config: Config) -> Program:
         return after, after.transitions - state.transitions
 
     state = jax.jit(learner.init)(jax.random.key(0))
-    program, compile_s = harness.compiled(iterate, state)
-    return Program(program, state, compile_s)
+    return *harness.compiled(iterate, state), state
 
 
 def plain_program(learner: plain_ppo.PlainPPO) -> Program:
@@ -178,8 +158,7 @@ def plain_program(learner: plain_ppo.PlainPPO) -> Program:
         return state, jnp.sum(batch[0].mask)
 
     state = jax.jit(learner.init)(jax.random.key(0))
-    program, compile_s = harness.compiled(iterate, state)
-    return Program(program, state, compile_s)
+    return *harness.compiled(iterate, state), state
 
 
 def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
@@ -196,7 +175,7 @@ def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
             state, _ = update(state, batch, places)
         return state, jnp.sum(batch[0].mask)
 
-    return Program(iterate, state, collect_s + update_s)
+    return iterate, collect_s + update_s, state
 
 
 def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed]:
@@ -212,15 +191,17 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
         "plain-by-step": lambda: plain_program_by_step(plain),
     }
     programs = {name: compile_program[name]() for name in options.programs}
+    states: dict[str, Any] = {name: state for name, (*_, state) in programs.items()}
+    steps: dict[str, Any] = {}
     calls: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(options.repeats + 1):
-        for name, program in programs.items():
-            calls[name].append(harness.seconds(program.run))
+        for name, (iterate, *_) in programs.items():
+            (states[name], steps[name]), spent = harness.timed(iterate, states[name])
+            calls[name].append(spent)
     speeds = []
-    for name, program in programs.items():
-        timing = harness.Timing.of(program.compile_s, calls[name][1:])
-        steps_per_s = float(program.steps) / timing.median_s
-        speeds.append(Speed(task_set, network, name, steps_per_s, timing))
+    for name, (_, compile_s, _) in programs.items():
+        timing = harness.Timing.of(compile_s, calls[name][1:])
+        speeds.append(Speed(task_set, network, name, float(steps[name]) / timing.median_s, timing))
     return speeds
 
 
@@ -256,4 +237,4 @@ def main(options: Options) -> list[Speed]:
 
 if __name__ == "__main__":
     with plain_errors():
-        main(tyro.cli(Options, description=__doc__))
+        main(parse(Options, None, "python -m benchmarks.learner_peers"))

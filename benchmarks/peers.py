@@ -11,10 +11,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from agents.command_line import parse
 from benchmarks import env_throughput, harness
 from benchmarks.env_throughput import StepOptions, Subject, Throughput
 from trap_tube_jax.command_line import plain_errors
@@ -182,4 +182,4 @@ def _split(key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
 
 if __name__ == "__main__":
     with plain_errors():
-        main(tyro.cli(StepOptions, description=__doc__))
+        main(parse(StepOptions, None, "python -m benchmarks.peers"))

@@ -126,8 +126,6 @@ def help_of(module: str, *rest: str) -> str:
 @pytest.mark.parametrize("command", commands())
 def test_commands_exist_with_their_options(command):
     module, *words = shlex.split(command)
-    if module in ("benchmarks.env_throughput", "benchmarks.peers"):
-        pytest.skip("being rewritten")
     assert importlib.util.find_spec(module)
     options = [word.partition("=")[0] for word in words if word.startswith("--")]
     subcommand = words[:1] if module == "agents.experiments" else []
