@@ -6,9 +6,7 @@ import inspect
 import re
 import types
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
-
-import tyro
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 Options = TypeVar("Options")
 
@@ -134,10 +132,3 @@ def _text(default: Any) -> str:
     if default is None or default == () or isinstance(default, bool):
         return "on" if default is True else ""
     return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
-
-
-# For commands that tyro still reads.
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-Imports = Annotated[
-    tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import", metavar="MODULE")
-]

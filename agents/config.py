@@ -41,8 +41,8 @@ class Config:
       iterations: rollouts to train for, at most. Schedules span this number.
       max_transitions: environment steps to train for, at most; training stops before an iteration
         that could exceed it. None sets no limit.
-      stop_when_solved: stops a seed once it solves this fraction of the validation tasks of
-        `env_id` greedily; 0 never stops early.
+      stop_when_solved: solved fraction at which a seed stops. Counts the validation tasks of
+        `env_id`, played greedily; 0 never stops early.
       eval_episodes: fixed evaluation tasks per task set.
 
       episodes_per_iteration: episodes played per iteration.
@@ -51,7 +51,7 @@ class Config:
 
       discount: gamma.
       gae_lambda: lambda of the advantage estimates.
-      bootstrap: value after the last step of an episode. `value`: 0 after termination, the
+      bootstrap: value after an episode's last step. `value`: 0 after termination, the
         last observation's value after truncation; the value target is advantage + value.
         `baseline`, as in the paper's published baseline: the value of the final board after
         termination, the last step's own value after truncation; the value target is the
@@ -64,7 +64,7 @@ class Config:
       lr_decay_fraction: final fraction of training that decays the step size. It decays
         geometrically to a fiftieth.
       adam_epsilon: Adam's epsilon.
-      max_gradient_norm: global norm to which gradients are clipped.
+      max_gradient_norm: global norm of clipped gradients.
 
       curiosity: intrinsic reward, by its registered name. README.md lists them.
       intrinsic_coef: weight of the intrinsic reward. The reward is normalised; with separate value
@@ -79,8 +79,7 @@ class Config:
       reward_ema_decay: decay of the moving moments of both rewards. They normalise the rewards;
         the rates of `effects` decay alike.
 
-      replay_fractions: episodes that replay tasks failed once, twice, ... Each number is a fraction
-        of the episodes of an iteration.
+      replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: newest failed tasks kept for each of them.
 
       align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.

@@ -9,9 +9,9 @@ from concurrent.futures import Executor, Future, as_completed
 from pathlib import Path
 
 import jax
-import tyro
 from rich.console import Console
 
+from agents.command_line import add_options, build, make_parser
 from agents.experiments import report
 from agents.experiments.grids import Grid, Options
 from agents.experiments.workers import ProcessPerCall, log_of, make_executor, train_logged
@@ -44,19 +44,17 @@ def main(
     arguments, grid = sys.argv[1:] if arguments is None else list(arguments), grid or Grid()
     console = Console()
     with plain_errors():
-        options = tyro.cli(
-            Options,
-            args=arguments,
-            prog=program,
-            default=grid.options,
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
+        parser = make_parser(Options, program)
+        add_options(parser, Options, grid.options)
+        add_options(parser, RunOptions, grid.run)
+        found = parser.parse_args(arguments)
+        options, how = build(Options, found), build(RunOptions, found)
         jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
         runs = grid.runs(name, options)
         root = next(iter(runs)).parent
         try:
             with make_executor(options.processes, options.cluster) as pool, RunFolder(root).lock():
-                failed = launch(runs, options.run, pool, console)
+                failed = launch(runs, how, pool, console)
                 if any((path / "config.json").exists() for path in runs):
                     report.collect(root, f"{program} {shlex.join(arguments)}".strip())
                     _say(console, report.write(root))

@@ -45,9 +45,6 @@ class Options:
       resume: folder of a run to continue; its settings become the defaults, and only
         --iterations, --max-transitions and --stop-when-solved may change.
       imports: module to import first. It may register curiosities, encoders and task sets.
-      checkpoint_every: iterations from one checkpoint to the next.
-      keep: number of newest checkpoints to keep.
-      devices: devices that share the run; one if absent, all if distributed.
     """
 
     preset: str = option("fast", "run")
@@ -58,9 +55,6 @@ class Options:
     out: Path = option(Path("runs"), "run")
     resume: Path | None = option(None, "run")
     imports: tuple[str, ...] = option((), "run", append=True, flags=("--import",))
-    checkpoint_every: int = option(10, "run")
-    keep: int = option(3, "run")
-    devices: int | None = option(None, "devices and hosts")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -70,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         train(*parse(arguments))
 
 
-def parse(arguments: Sequence[str]) -> tuple[Options, Run, processes.Job]:
+def parse(arguments: Sequence[str]) -> tuple[Options, Run, RunOptions, processes.Job]:
     """Reads a command line and, with --resume, the stored run.
 
     Raises:
@@ -91,21 +85,20 @@ def parse(arguments: Sequence[str]) -> tuple[Options, Run, processes.Job]:
     options = build(Options, found)
     config = build(Config, found, env_id=tt.task_set(config.env_id).id)
     run = Run(config, options.preset, options.seed, options.seeds, imports=options.imports)
-    return options, run, build(processes.Job, found)
+    return options, run, build(RunOptions, found), build(processes.Job, found)
 
 
 def _parser(options: Options, config: Config) -> argparse.ArgumentParser:
     """Returns the parser with these defaults."""
     parser = make_parser(Options, PROGRAM)
-    add_options(parser, Options, options, skip=("devices",))
+    add_options(parser, Options, options)
     add_options(parser, Config, config, skip=("env_id",))
-    others = [field.name for field in dataclasses.fields(Options) if field.name != "devices"]
-    add_options(parser, Options, options, skip=others)
+    add_options(parser, RunOptions)
     add_options(parser, processes.Job)
     return parser
 
 
-def train(options: Options, run: Run, job: processes.Job) -> None:
+def train(options: Options, run: Run, how: RunOptions, job: processes.Job) -> None:
     """Trains a run, or continues it, and prints its results.
 
     Raises:
@@ -113,7 +106,7 @@ def train(options: Options, run: Run, job: processes.Job) -> None:
       ValueError: the run cannot be trained or continued.
       OSError: a file cannot be written.
     """
-    become_devices(options.devices)
+    become_devices(how.devices)
     job.join()
     console = Console(quiet=not processes.is_first())
     folder = RunFolder(run_path(options, run))
@@ -121,9 +114,8 @@ def train(options: Options, run: Run, job: processes.Job) -> None:
         processes.on_first(folder.check_free)
     compilation.enable_cache()
     again = f"Continue with: {display.resume_command(folder)}"
-    run_options = RunOptions(options.checkpoint_every, options.keep, options.devices)
     try:
-        scores = train_run(folder.path, run, run_options, console=console)
+        scores = train_run(folder.path, run, how, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
         console.print(f"Stopped. {again}", soft_wrap=True, highlight=False, markup=False)
         number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT

@@ -9,13 +9,11 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 import trap_tube_jax as tt
-from agents.command_line import Imports
-from agents.config import PRESETS, Config
+from agents.command_line import option
+from agents.config import Config
 from agents.ppo.learner import make_train
 from agents.runs.folder import Run, RunFolder, check_name
 from agents.runs.session import RunOptions
@@ -44,12 +42,11 @@ class Options:
       out: the folder of all grids.
       processes: runs at a time; one per core if absent, or one at all with a GPU or TPU.
       cluster: address of a Dask scheduler whose workers train the runs, as in tcp://HOST:8786.
-      run: how each run is trained and evaluated.
     """
 
     settings: tuple[str, ...] = ()
-    imports: Imports = ()
-    preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "fast"
+    imports: tuple[str, ...] = option((), append=True, flags=("--import",))
+    preset: str = "fast"
     env: str | None = None
     only: tuple[str, ...] = ()
     seeds: int = 1
@@ -58,9 +55,6 @@ class Options:
     out: Path = Path("runs")
     processes: int | None = None
     cluster: str | None = None
-    run: Annotated[RunOptions, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=RunOptions
-    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,12 +62,14 @@ class Grid:
     """A named grid.
 
     Attributes:
-      options: what its command line starts from.
+      options: defaults of its command line.
+      run: defaults of how each run is trained and evaluated.
       settings: settings of all points, which the command line may replace.
       points: settings by the name of the point.
     """
 
     options: Options = dataclasses.field(default_factory=Options)
+    run: RunOptions = dataclasses.field(default_factory=RunOptions)
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     points: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=lambda: {"": {}})
 
@@ -153,23 +149,31 @@ def _value(text: str) -> Any:
         return text
 
 
-def _options(preset: str, env: str, seeds: int, evaluate_every: int) -> Options:
-    run = RunOptions(evaluate_every=evaluate_every, reported=1000)
-    return Options(preset=preset, env=env, seeds=seeds, run=run)
-
-
 PAPER_POINTS = {"ppo": {"curiosity": "none"}, "ppo+icm": {"curiosity": "icm"}}
 CURIOSITIES = ("icm", "icm-detached", "rnd", "noveld", "ride", "e3b", "effects")
 
 GRIDS = {
-    "exp1": Grid(_options("paper", "base", 5, evaluate_every=1), {"iterations": 250}, PAPER_POINTS),
-    "exp2": Grid(
-        _options("paper", "pstsy", 5, evaluate_every=1), {"iterations": 500}, PAPER_POINTS
+    "exp1": Grid(
+        Options(preset="paper", env="base", seeds=5),
+        RunOptions(evaluate_every=1, reported=1000),
+        {"iterations": 250},
+        PAPER_POINTS,
     ),
-    "fast": Grid(_options("fast", "base", 10, evaluate_every=100)),
-    "best": Grid(_options("best", "pstsy", 5, evaluate_every=20)),
+    "exp2": Grid(
+        Options(preset="paper", env="pstsy", seeds=5),
+        RunOptions(evaluate_every=1, reported=1000),
+        {"iterations": 500},
+        PAPER_POINTS,
+    ),
+    "fast": Grid(
+        Options(preset="fast", env="base", seeds=10), RunOptions(evaluate_every=100, reported=1000)
+    ),
+    "best": Grid(
+        Options(preset="best", env="pstsy", seeds=5), RunOptions(evaluate_every=20, reported=1000)
+    ),
     "curiosities": Grid(
-        _options("best", "pstsy", 2, evaluate_every=20),
+        Options(preset="best", env="pstsy", seeds=2),
+        RunOptions(evaluate_every=20, reported=1000),
         {"iterations": 312},
         {
             "ppo": {"curiosity": "none"},

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import evaluate, own_and_paper_sets
 from agents.acting.policy_files import load_policy
 from agents.arrays import from_arrays
+from agents.command_line import option
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.devices import Placement
@@ -32,6 +33,7 @@ from agents.runs.display import ProgressLine
 from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows, make_evaluator
 from agents.runs.folder import Run, RunFolder, read_json, write_json
 from agents.runs.loading import policies
+from agents.runs.loggers import open_loggers
 from agents.runs.metrics import CsvLog, Row, is_last
 from agents.runs.provenance import provenance
 from agents.runs.stopping import DivergedError, Stopped, StopSignals
@@ -46,23 +48,28 @@ class RunOptions:
     """How a run is carried out; nothing here changes what it learns on one device.
 
     Attributes:
-      checkpoint_every: iterations from one checkpoint to the next.
+      checkpoint_every: iterations between checkpoints.
       keep: number of newest checkpoints to keep.
-      devices: number of devices that share the episodes; see `Placement.of`.
-      evaluate_every: iterations from one greedy evaluation on all `sets` to the next, by which the
-        best parameters are kept; 0: never.
-      sets: short names of the sets to evaluate on; the paper's eight and the training set if None.
-      reported: test tasks per set in the final evaluation; the run's `eval_episodes` if None.
-      report: writes the learning curves, the report and a GIF at the end.
+      evaluate_every: iterations between evaluations on `sets`; 0 for none. The best evaluation
+        selects the parameters that the run reports.
+      sets: short names of the sets to evaluate on; the paper's eight and the training set if
+        absent.
+      reported: test tasks per set in the final evaluation; `eval_episodes` if absent.
+      report: writes curves, page and GIF at the end.
+      tensorboard: logs metrics for TensorBoard.
+      wandb: logs metrics to Weights & Biases; offline with WANDB_MODE=offline.
+      devices: devices that share the run; one if absent, all if distributed. See `Placement.of`.
     """
 
-    checkpoint_every: int = 10
-    keep: int = 3
-    devices: int | None = None
-    evaluate_every: int = 0
-    sets: tuple[str, ...] | None = None
-    reported: int | None = None
-    report: bool = True
+    checkpoint_every: int = option(10, "run")
+    keep: int = option(3, "run")
+    evaluate_every: int = option(0, "run")
+    sets: tuple[str, ...] | None = option(None, "run")
+    reported: int | None = option(None, "run")
+    report: bool = option(True, "run")
+    tensorboard: bool = option(False, "run")
+    wandb: bool = option(False, "run")
+    devices: int | None = option(None, "devices and hosts")
 
     def __post_init__(self) -> None:
         """Checks the numbers.
@@ -200,9 +207,11 @@ class Session:
         stop = StopSignals(
             lambda: self._say("Finishing this iteration; Ctrl-C again stops now."), self.stop_file
         )
-        with stop, ProgressLine(self.console, self.run.config.iterations) as progress:
+        progress = ProgressLine(self.console, self.run.config.iterations)
+        with stop, self._loggers() as log, progress:
             while self.active.any():
                 rows = self._iterate(advance)
+                log(rows)
                 progress.update(rows)
                 # A signal may reach any process: all have to agree on it.
                 request = processes.agree(stop.request())
@@ -350,6 +359,10 @@ class Session:
         here = {**provenance(), "devices": str(self.placement)}
         if here not in known:
             write_json(path, [*known, here])
+
+    def _loggers(self) -> contextlib.AbstractContextManager[Callable[[Sequence[Row]], None]]:
+        chosen = (self.options.tensorboard, self.options.wandb) if self.metrics else (False, False)
+        return open_loggers(self.folder.path, self.run, tensorboard=chosen[0], wandb=chosen[1])
 
     def _say(self, line: str) -> None:
         self.console.print(line, soft_wrap=True, highlight=False, markup=False)

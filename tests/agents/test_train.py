@@ -160,14 +160,14 @@ def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_options_take_precedence_over_every_preset(preset):
     arguments = f"--preset {preset} --env psy --seed 3 --seeds 2 --hidden 32 --curiosity none"
-    found, wanted, _ = parse(arguments.split())
+    found, wanted, *_ = parse(arguments.split())
     own = {"env_id": "PerceptualSymbolicTrapTube-v0", "hidden": 32, "curiosity": "none"}
     assert wanted == Run(Config.preset(preset, **own), preset, 3, 2)
     assert run_path(found, wanted).name == f"{preset}-psy-3to4"
 
 
 def test_the_default_is_the_preset_fast():
-    found, wanted, _ = parse([])
+    found, wanted, *_ = parse([])
     assert wanted == Run(Config.preset("fast"), "fast")
     assert str(run_path(found, wanted)) == "runs/fast-base-0"
 
@@ -176,10 +176,10 @@ def test_resumed_runs_keep_their_settings(tmp_path):
     stored = Run(Config.preset("paper", hidden=32), "paper", 5, 2)
     RunFolder(tmp_path / "x").create(stored)
     arguments = ["--resume", str(tmp_path / "x")]
-    found, wanted, _ = parse(arguments)
+    found, wanted, *_ = parse(arguments)
     assert wanted == stored
     assert run_path(found, wanted) == tmp_path / "x"
-    _, wanted, _ = parse([*arguments, "--iterations", "999"])
+    _, wanted, *_ = parse([*arguments, "--iterations", "999"])
     assert wanted.config == dataclasses.replace(stored.config, iterations=999)
 
 

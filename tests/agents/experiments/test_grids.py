@@ -71,7 +71,7 @@ def test_the_papers_experiments(name, env, iterations):
     for config in found.values():
         assert (config.env_id, config.iterations, config.eval_episodes) == (env, iterations, 128)
     assert (grid.options.preset, grid.options.seeds) == ("paper", 5)
-    assert grid.options.run == RunOptions(evaluate_every=1, reported=1000)
+    assert grid.run == RunOptions(evaluate_every=1, reported=1000)
 
 
 def test_a_named_grid_keeps_its_settings_unless_given():

@@ -1,0 +1,59 @@
+"""Metrics to TensorBoard and to Weights & Biases, by their own libraries."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.runs.folder import Run
+from agents.runs.metrics import Row
+from trap_tube_jax.imports import needs_extra
+
+Log = Callable[[dict[str, float], int], Any]  # takes values by name, and the iteration
+
+
+@contextlib.contextmanager
+def open_loggers(
+    folder: Path, run: Run, *, tensorboard: bool, wandb: bool
+) -> Iterator[Callable[[Sequence[Row]], None]]:
+    """Opens the loggers asked for; yields a function that logs the rows of an iteration.
+
+    Names are those of `metrics.csv`; a run of several seeds puts `seed<n>/` in front.
+
+    Both write into the run's folder; Weights & Biases is offline with WANDB_MODE=offline.
+
+    Raises:
+      ImportError: a library is missing; the message names its extra.
+    """
+    with contextlib.ExitStack() as stack:
+        logs: list[Log] = []
+        if tensorboard:
+            with needs_extra("logging"):
+                from tensorboard.summary import Writer  # noqa: PLC0415  an extra
+            writer = Writer(str(folder / "tensorboard"))
+            stack.callback(writer.close)
+            logs.append(
+                lambda values, step: [writer.add_scalar(k, v, step) for k, v in values.items()]
+            )
+        if wandb:
+            with needs_extra("logging"):
+                import wandb as wandb_library  # noqa: PLC0415  an extra
+            logged = stack.enter_context(
+                wandb_library.init(
+                    project="trap-tube-jax", group=folder.name, config=run.to_dict(), dir=folder
+                )
+            )
+            logs.append(logged.log)
+
+        def log(rows: Sequence[Row]) -> None:
+            prefixes = [f"seed{row['seed']}/" if run.seeds > 1 else "" for row in rows]
+            values = {
+                prefix + name: value
+                for prefix, row in zip(prefixes, rows, strict=True)
+                for name, value in row.items()
+                if name not in ("seed", "iteration")
+            }
+            for each in logs:
+                each(values, rows[0]["iteration"])
+
+        yield log
