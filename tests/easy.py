@@ -24,7 +24,15 @@ def rows(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
+def bits(leaf: Any) -> np.ndarray:
+    """Returns an array, or the words of PRNG keys."""
+    is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+
+
 def assert_same(tree: Any, other: Any) -> None:
+    """Two trees have the same structure, dtypes and numbers."""
+    tree, other = jax.tree.map(bits, tree), jax.tree.map(bits, other)
     chex.assert_trees_all_equal_structs(tree, other)
     chex.assert_trees_all_equal_dtypes(tree, other)
     jax.tree.map(np.testing.assert_array_equal, tree, other)

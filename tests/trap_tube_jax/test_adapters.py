@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
+from easy import assert_same, rows
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 SIZE = 20
@@ -21,14 +22,6 @@ def wander(key, state):
 
 
 ACTIONS = np.random.default_rng(0).integers(0, 4, (6, SIZE, 2), np.int32)
-
-
-def assert_same(one, other):
-    """Equal leaves; keys are compared by their bits."""
-    for left, right in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        is_key = jnp.issubdtype(left.dtype, jax.dtypes.prng_key)
-        bits = jax.random.key_data if is_key else np.asarray
-        np.testing.assert_array_equal(bits(left), bits(right))
 
 
 def test_next_step_spends_a_step_on_the_reset():
@@ -51,7 +44,7 @@ def test_next_step_spends_a_step_on_the_reset():
     fresh, first = reset(state.episodes.key)
     state, timestep = step(state, ACTIONS[2])
     np.testing.assert_array_equal(timestep.observation[old], first.observation[old])
-    assert_same(jax.tree.map(lambda x: x[old], state), jax.tree.map(lambda x: x[old], fresh))
+    assert_same(rows(state, old), rows(fresh, old))
     assert state.episodes.inner.time[::2].tolist() == [3] * (SIZE // 2)
     assert not timestep.done.any()
     assert timestep.discount.all()
@@ -63,14 +56,14 @@ def test_a_solved_episode_ends_once():
     batch = NextStepVectorEnvironment(tt.Environment(base=base))
     step = jax.jit(batch.step)
     state, _ = jax.jit(batch.reset)(jax.random.split(jax.random.key(0), 2))
-    state, timestep = step(state, np.array([[0, 3], [0, 1]]))  # the first onto the food
-    assert timestep.terminated.tolist() == [True, False]
-    assert timestep.discount.tolist() == [0, 1]
-    assert timestep.reward.tolist() == [1, 0]
-    state, timestep = step(state, np.array([[0, 3], [0, 0]]))
-    assert not timestep.done.any()
-    assert timestep.discount.tolist() == [1, 1]
-    assert not timestep.reward.any()
+    # The first moves onto the food, and ignores its next action.
+    for actions, expected in (
+        ([[0, 3], [0, 1]], ([1, 0], [True, False], [0, 1])),
+        ([[0, 3], [0, 0]], ([0, 0], [False, False], [1, 1])),
+    ):
+        state, timestep = step(state, np.array(actions))
+        found = (timestep.reward, timestep.terminated, timestep.discount)
+        assert tuple(each.tolist() for each in found) == expected
     assert state.episodes.inner.agent.tolist() == [[0, 0], [0, 0]]
     assert state.episodes.inner.time.tolist() == [0, 2]
 

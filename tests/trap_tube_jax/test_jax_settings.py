@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same, enable_x64
+from easy import assert_same, bits, enable_x64
 
 OPTIMISED = False  # few steps
 TRANSFERS = (
@@ -36,11 +36,6 @@ def play() -> Any:
             state, timestep = step(state, np.ones(shape, int))
     record.append(tt.render(tt.base_state(), 8, grasp=0))
     record.append((tt.action_from_index(np.arange(16)), tt.action_to_index(np.array([1, 2]))))
-
-    def bits(leaf: jax.Array) -> np.ndarray:
-        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
-
     return jax.tree.map(bits, record)
 
 
