@@ -1,22 +1,18 @@
-"""Imports run downward only, and the top imports little."""
+"""Imports run downward only, the top imports little, and the wheel needs what it installs."""
 
 import ast
 import graphlib
 import json
 import os
 import pathlib
+import re
 import subprocess
 import sys
+import tomllib
 
-import pytest
-
+import trap_tube_jax as tt
 from paths import ROOT
 
-MAY_IMPORT = {
-    "trap_tube_jax": {"trap_tube_jax"},
-    "agents": {"agents", "trap_tube_jax"},
-    "benchmarks": {"benchmarks", "agents", "trap_tube_jax"},
-}
 # Lower rooms never import higher ones. Modules of a package itself are rooms of their own.
 ENVIRONMENT = (
     ("_version", "by_value", "checks", "imports", "command_line", "tables"),
@@ -42,10 +38,11 @@ AGENTS = (
     ("experiments", "profiles", "sweep"),
     ("evaluate", "examples", "profile"),
 )
-LEARNING = ("registry", "config", "parallel", "networks", "acting", "curiosity", "ppo")
-SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
-# The project's other dependencies, and what only its extras install.
-HEAVY = {"PIL", "chex", "gymnasium", "gymnax", "matplotlib", "optax", "orbax", "tyro"}
+LEARNING = {"registry", "config", "parallel", "networks", "acting", "curiosity", "ppo"}
+PACKAGES = ("trap_tube_jax", "agents", "benchmarks")  # a package never imports a later one
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
+# Libraries that neither importing the environment nor drawing text needs.
+HEAVY = {"PIL", "chex", "gymnasium", "gymnax", "matplotlib", "optax", "orbax", "pandas"}
 
 
 def module_name(path: pathlib.Path) -> str:
@@ -53,25 +50,7 @@ def module_name(path: pathlib.Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-MODULES = {module_name(path) for path in SOURCES}
-
-
-def imported_modules(path: pathlib.Path, tree: ast.AST) -> set[str]:
-    """Absolute names of the imported modules, with relative imports resolved."""
-    package = module_name(path).split(".")
-    if path.name != "__init__.py":
-        package = package[:-1]
-    names = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            above = package[: len(package) - node.level + 1] if node.level else []
-            module = ".".join([*above, *([node.module] if node.module else [])])
-            for alias in node.names:
-                submodule = f"{module}.{alias.name}"
-                names.add(submodule if submodule in MODULES else module)
-    return names
+SOURCES = {module_name(path): path for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
 
 
 class WithoutFunctions(ast.NodeTransformer):
@@ -81,81 +60,108 @@ class WithoutFunctions(ast.NodeTransformer):
         del node
 
 
-def test_the_sources_are_found():
-    assert {"trap_tube_jax.dynamics", "agents", "benchmarks"} <= MODULES
+def imported(tree: ast.AST) -> set[str]:
+    """Absolute names of the imported modules; the project has no relative imports."""
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, ast.unparse(node)
+            whole = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= {name if name in SOURCES else str(node.module) for name in whole}
+    return names
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=module_name)
-def test_imports_run_downward(path):
-    package = module_name(path).split(".")[0]
-    own = {name.split(".")[0] for name in imported_modules(path, ast.parse(path.read_text()))}
-    assert own & set(MAY_IMPORT) <= MAY_IMPORT[package]
+TREES = {name: ast.parse(path.read_text()) for name, path in SOURCES.items()}
+IMPORTS = {name: imported(tree) for name, tree in TREES.items()}
 
 
 def room(module: str) -> str:
     return module.split(".")[1] if "." in module else ""
 
 
-@pytest.mark.parametrize(
-    ("package", "rooms"),
-    [("trap_tube_jax", ENVIRONMENT), ("agents", AGENTS)],
-    ids=["env", "agents"],
-)
-def test_rooms_import_downward(package, rooms):
-    level = {name: height for height, names in enumerate(rooms) for name in names}
-    for path in SOURCES:
-        own = module_name(path)
-        if own.startswith(f"{package}."):
-            for name in imported_modules(path, ast.parse(path.read_text())) & MODULES:
-                if name.startswith(f"{package}."):
-                    assert level[room(name)] <= level[room(own)], (own, name)
+def test_imports_run_downward():
+    assert {"trap_tube_jax.dynamics", "agents", "benchmarks"} <= SOURCES.keys()
+    levels = {
+        package: {name: height for height, names in enumerate(rooms) for name in names}
+        for package, rooms in (("trap_tube_jax", ENVIRONMENT), ("agents", AGENTS))
+    }
+    for own, names in IMPORTS.items():
+        package = own.split(".")[0]
+        for name in names & SOURCES.keys():
+            above = name.split(".")[0]
+            assert PACKAGES.index(above) <= PACKAGES.index(package), (own, name)
+            if above == package and package in levels and room(own) and room(name):
+                level = levels[package]
+                assert level[room(name)] <= level[room(own)], (own, name)
+    graph = {
+        name: (imported(WithoutFunctions().visit(tree)) & SOURCES.keys()) - {name}
+        for name, tree in TREES.items()
+    }
+    graphlib.TopologicalSorter(graph).prepare()  # raises if a module needs itself
+
+
+def modules_after(program: str, folder: pathlib.Path) -> list[set[str]]:
+    """Runs a program that prints lists of modules as its last line, in a fresh interpreter."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-W", "error", "-c", program]
+    environment = os.environ | {"PYTHONPATH": path}
+    output = subprocess.check_output(command, env=environment, cwd=folder, text=True)
+    return list(map(set, json.loads(output.splitlines()[-1])))
 
 
 def test_training_imports_no_command_line(tmp_path):
-    """Nor tyro or matplotlib: learning needs arrays alone."""
-    program = "import json, sys, agents; print(json.dumps(sorted(sys.modules)))"
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path}
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        env=environment, cwd=tmp_path, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    modules = set(json.loads(result.stdout))
-    rooms = {room(name) for name in modules if name.startswith("agents.")}
-    assert rooms == set(LEARNING)
-    assert not modules & {"tyro", "matplotlib"}
+    """Nor matplotlib: learning needs arrays alone."""
+    program = "import json, sys, agents; print(json.dumps([sorted(sys.modules)]))"
+    (modules,) = modules_after(program, tmp_path)
+    assert {room(name) for name in modules if name.startswith("agents.")} == LEARNING
+    assert "matplotlib" not in modules
 
 
-def test_no_module_needs_itself():
-    graph = {}
-    for path in SOURCES:
-        tree = WithoutFunctions().visit(ast.parse(path.read_text()))
-        graph[module_name(path)] = imported_modules(path, tree) & MODULES - {module_name(path)}
-    graphlib.TopologicalSorter(graph).prepare()
-
-
-def test_importing_the_environment_is_light(tmp_path):
-    """Checked in a fresh interpreter: what JAX, Flax and NumPy import themselves is free."""
+def test_the_environment_is_light(tmp_path):
+    """What JAX, Flax and NumPy import themselves is free."""
     program = """
 import json, sys
 import jax, numpy
 from flax import struct
 sys.modules["gymnasium"] = None  # which importing the environment registers with
 before = set(sys.modules)
-import trap_tube_jax
-print(json.dumps([sorted(before), sorted(set(sys.modules) - before)]))
+import trap_tube_jax as tt
+print(tt.render_ascii(tt.make("base").reset(jax.random.key(0))[0]))
+ours = {name for name in set(sys.modules) - before if not name.startswith(("jax", "numpy"))}
+print(json.dumps([sorted(before), sorted(ours)]))
 """
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        env=os.environ | {"PYTHONPATH": path},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
+    before, added = (
+        {name.split(".")[0] for name in names} for names in modules_after(program, tmp_path)
     )
-    before, added = ({name.split(".")[0] for name in names} for names in json.loads(result.stdout))
-    assert "trap_tube_jax" in added
     assert added - before - set(sys.stdlib_module_names) == {"trap_tube_jax"}
     assert not added & HEAVY
     assert not before & {"agents", "benchmarks"}
+
+
+def modules_of(requirements: list[str]) -> set[str]:
+    found = (re.split(r"[\[>=]", requirement)[0] for requirement in requirements)
+    return {{"pillow": "PIL"}.get(name, name) for name in found}
+
+
+def test_the_wheel_holds_the_environment_and_what_it_imports():
+    project, build = SETTINGS["project"], SETTINGS["tool"]["hatch"]
+    assert build["build"]["targets"]["wheel"] == {"packages": ["trap_tube_jax"]}
+    extras = project["optional-dependencies"]
+    required = modules_of(project["dependencies"])
+    allowed = required | modules_of(extras["pictures"] + extras["interop"])
+    for own, names in IMPORTS.items():
+        if own.split(".")[0] == "trap_tube_jax":
+            used = {name.split(".")[0] for name in names} - {"trap_tube_jax"}
+            assert used <= allowed | sys.stdlib_module_names, own
+    assert required == {"jax", "flax", "chex", "numpy", "scipy"}
+
+
+def test_every_place_names_the_version():
+    assert SETTINGS["tool"]["hatch"]["version"] == {"path": "trap_tube_jax/_version.py"}
+    cited = re.findall(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    changed = re.findall(
+        r"^## (\S+), \d{4}-\d{2}-\d{2}$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE
+    )
+    assert cited == changed[:1] == [tt.__version__]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import EASY, assert_same
+from easy import EASY
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.controls import CONTROLS, drawn_from
 
@@ -65,19 +65,14 @@ def test_a_copy_equals_its_original_and_nothing_else(duplicate):
     assert [hash(value) for value in PUBLIC] == [hash(value) for value in copies]
 
 
-@pytest.mark.parametrize("name", ["graded", "control", "statistics", "small chunks"])
+@pytest.mark.parametrize("name", ["graded", "control", "statistics"])
 def test_an_unpickled_environment_plays_the_same(name):
-    env = ENVIRONMENTS[name]
-    batched = isinstance(env, tt.VectorEnvironment)
-
     def play(env: Any) -> Any:
-        key = jax.random.split(KEY, 3) if batched else KEY
-        state, first = jax.jit(env.reset)(key)
-        action = np.zeros((3, 2) if batched else 2, np.int32)
-        return [first, *jax.jit(env.step)(state, action)]
+        state, first = jax.jit(env.reset)(KEY)
+        return [first, *jax.jit(env.step)(state, np.zeros(2, np.int32))]
 
-    for one, other in zip(*map(play, (env, pickle.loads(pickle.dumps(env)))), strict=True):
-        assert one == other
+    env = ENVIRONMENTS[name]
+    assert play(pickle.loads(pickle.dumps(env))) == play(env)
 
 
 def test_a_subclass_with_other_attributes_is_another():
@@ -95,4 +90,3 @@ def test_a_state_equals_neither_another_nor_an_array():
     assert state == jax.device_get(state), "NumPy arrays of the same dtype and content"
     assert state != state.replace(time=np.int64(0)) != 0
     assert len({state, tt.base_state(), state.replace(time=np.int32(1))}) == 2
-    assert_same(jax.tree.map(lambda x: x, state), state)

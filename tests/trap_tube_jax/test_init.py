@@ -2,17 +2,12 @@
 
 import pydoc
 import re
-import subprocess
 import sys
 import textwrap
 
 import pytest
 
 import trap_tube_jax as tt
-from paths import ROOT
-
-# Libraries that neither the environment nor its dependencies need.
-EXTRAS = ("filelock", "gymnasium", "matplotlib", "pandas", "PIL", "safetensors", "tyro")
 
 
 def test_dir_holds_the_public_names_alone():
@@ -33,19 +28,6 @@ def test_help_fits_two_screens_and_opens_with_a_program(capsys):
     assert program.startswith("    import jax")
     exec(textwrap.dedent("\n\n".join((tt.__doc__ or "").split("\n\n")[1:3])), {})
     assert capsys.readouterr().out.endswith("1.0 True\n")
-
-
-def test_the_environment_needs_no_extra():
-    blocked = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS}))\n"
-    program = "import trap_tube_jax as tt; print(tt.render_ascii(tt.make('base').base))"
-    ran = subprocess.run(
-        [sys.executable, "-W", "error", "-c", blocked + program],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ran.stdout.strip() == tt.render_ascii(tt.base_state()), ran.stderr
 
 
 def test_only_a_missing_gymnasium_goes_unsaid(monkeypatch):

@@ -11,7 +11,6 @@ import sys
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import trap_tube_jax as tt
@@ -19,8 +18,6 @@ from refusal import refused
 from trap_tube_jax import play
 
 UP, LEFT, RIGHT = "\x1b[A", "\x1b[D", "\x1bOC"
-# To the tool's lower end, along with the tool to the right, around the food and into it.
-TO_THE_TOOL = [UP, *[RIGHT] * 6]
 
 
 def press_all(game, keys):
@@ -38,12 +35,9 @@ def game():
 
 
 def test_a_new_game_is_the_environments_task(game):
-    assert (game.name, game.seed, int(game.state.time)) == ("TrapTube-v0", 0, 0)
-    np.testing.assert_array_equal(game.state.board, tt.base_state().board)
+    assert (game.name, game.seed, game.state) == ("TrapTube-v0", 0, tt.base_state())
     expected, _ = jax.jit(tt.make("st").reset)(jax.random.key(4))
-    np.testing.assert_array_equal(play.new_game("st", 4).state.palette, expected.palette)
-    with pytest.raises(ValueError, match="unknown task set 'nonesuch'"):
-        play.new_game("nonesuch", 0)
+    assert play.new_game("st", 4).state == expected
     with pytest.raises(ValueError, match="seed must be an integer >= 0 and <= 4294967295, got -1"):
         play.new_game("base", -1)
 
@@ -57,26 +51,14 @@ def test_keys_turn_the_hand_and_move(game, key, move, hand, grasp):
     assert (turned.grasp, int(turned.state.time)) == (grasp, 0)
     expected, _ = play._step(tt.Environment(), game.state, jnp.array([grasp, move], jnp.int32))
     after = play.press(turned, key)
-    assert after.grasp == grasp
-    for part in ("agent", "tool", "time"):
-        np.testing.assert_array_equal(getattr(after.state, part), getattr(expected, part))
+    assert (after.grasp, after.state) == (grasp, expected)
 
 
-def test_the_hand_drags_the_tool(game):
-    after = press_all(game, TO_THE_TOOL)
-    assert after.state.tool.tolist() == [4, 7]
-    assert after.state.agent.tolist() == [8, 7]
-
-
-def test_restart_and_next_task(game):
+def test_restart_next_task_and_other_keys(game):
     restarted = press_all(game, [UP, "d", "r"])
-    assert (restarted.seed, int(restarted.state.time)) == (0, 0)
-    np.testing.assert_array_equal(restarted.state.agent, game.state.agent)
+    assert (restarted.seed, restarted.state) == (0, game.state)
     assert play.press(game, "n").seed == 1
     assert play.press(dataclasses.replace(game, seed=2**32 - 1), "n").seed == 0
-
-
-def test_unknown_keys_change_nothing(game):
     assert play.press(game, "\x1b[18~") is game
 
 
@@ -123,15 +105,12 @@ def test_the_screen_shows_the_board_and_fits(game):
     assert sum("@@ food" in line for line in lines) == 1
 
 
-def test_the_screen_shows_the_hand(game):
+def test_the_screen_shows_the_hand_and_a_horizontal_tool(game):
     holding = press_all(game, [UP])
     assert "hand up: holds the tool" in drawn(holding)[2]
     turned = play.press(holding, "d")
     assert "hand right: empty" in drawn(turned)[2]
     assert drawn(turned)[10][:26] == "|  ->                    |"
-
-
-def test_the_screen_shows_a_horizontal_tool(game):
     tool, extent = jnp.array([0, 0], jnp.int32), game.state.tool_extent[::-1]
     assert drawn(having(game, tool=tool, tool_extent=extent))[2][:11] == "|========  "
 

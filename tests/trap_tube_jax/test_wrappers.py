@@ -113,17 +113,14 @@ def test_episode_statistics_of_a_vector_count_each_environment():
     np.testing.assert_array_equal(state.last_return, [1, 0])
 
 
-def test_statistics_go_around_what_starts_over():
-    with pytest.raises(ValueError, match=r"allowed: EpisodeStatistics\(AutoReset\(env\)\)"):
-        tt.AutoReset(tt.EpisodeStatistics(tt.Environment()))
-
-
 @pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
-def test_auto_reset_refuses_what_resets_itself(wrapper):
+def test_auto_reset_refuses_what_resets_itself_or_counts(wrapper):
     env = wrapper(tt.Environment())
     words = [wrapper.__name__, "resets itself", "trap_tube_jax.Environment"]
     assert_refused(words, tt.AutoReset, env)
     assert_refused(["resets itself"], tt.AutoReset, tt.EpisodeStatistics(env))
+    counting = tt.EpisodeStatistics(tt.Environment())
+    assert_refused(["allowed: EpisodeStatistics(AutoReset(env))"], tt.AutoReset, counting)
 
 
 @pytest.mark.parametrize("wrap", [tt.AutoReset, tt.EpisodeStatistics])
