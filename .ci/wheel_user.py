@@ -37,7 +37,7 @@ def play():
 
 def run_alone():
     """Finds nothing that the wheel does not need, and refuses pictures in a line."""
-    for module in ("agents", "benchmarks", "tyro", "pandas", "PIL", "matplotlib"):
+    for module in ("agents", "benchmarks", "pandas", "PIL", "matplotlib"):
         assert importlib.util.find_spec(module) is None, module
     play()
     for command in (["gallery"], ["solver", "--show", "base"], ["solver", "--tasks", "1"]):

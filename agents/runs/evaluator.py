@@ -1,5 +1,6 @@
 """Greedy evaluation on several task sets as training goes, and the best parameters."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,39 +22,41 @@ class PeriodicEvaluator:
     all sets; base, a single task, counts only where it is trained on.
     """
 
-    def __init__(self, folder: RunFolder, run: Run, sets: Sequence[str]):
-        """Draws the tasks.
+    def __init__(self, folder: RunFolder, run: Run, sets: Sequence[str], rows: Sequence[Row]):
+        """Draws the tasks, and continues after rows of `evaluations.csv`.
 
         Args:
           folder: the run's files.
           run: what is trained.
           sets: short names of the task sets.
+          rows: those of earlier evaluations.
         """
         self._folder = folder
         trained_on_base = task_set(run.config.env_id).short == "base"
         self._ranked = [name for name in sets if name != "base" or trained_on_base] or list(sets)
         self._evaluator = make_evaluator(run, sets, run.config.eval_episodes, "validation")
         self._best: dict[int, float] = {}
-
-    def resume(self, rows: Sequence[Row]) -> None:
-        """Continues after the validation rows of `evaluations.csv`."""
-        scores: dict[tuple[int, int], list[float]] = {}
-        for row in rows:
-            if row["purpose"] == "validation" and row["task_set"] in self._ranked:
-                key = (row["seed"], row["iteration"])
-                scores.setdefault(key, []).append(row["solved"] / row["tasks"])
-        for (seed, _), shares in scores.items():
-            self._best[seed] = max(self._best.get(seed, -1.0), float(np.mean(shares)))
+        evaluated = itertools.groupby(
+            (row for row in rows if row["purpose"] == "validation"),
+            lambda row: (row["seed"], row["iteration"]),
+        )
+        for (seed, _), group in evaluated:
+            self._is_best(seed, list(group))
 
     def evaluate(self, seed: int, policy: Policy) -> list[Row]:
         """Plays with the policy of one seed; returns its rows of `evaluations.csv`."""
         scores = self._evaluator.scores(self._evaluator(policy.params))
         rows = evaluation_rows(scores, policy, seed, "validation")
-        shares = [row["solved"] / row["tasks"] for row in rows if row["task_set"] in self._ranked]
-        if float(np.mean(shares)) > self._best.get(seed, -1.0):
-            self._best[seed] = float(np.mean(shares))
+        if self._is_best(seed, rows):
             save_policy(self._folder.best(seed), policy)
         return rows
+
+    def _is_best(self, seed: int, rows: Sequence[Row]) -> bool:
+        """Returns whether an evaluation is a seed's best so far, and remembers it."""
+        shares = [row["solved"] / row["tasks"] for row in rows if row["task_set"] in self._ranked]
+        mean, before = float(np.mean(shares)), self._best.get(seed, -1.0)
+        self._best[seed] = max(mean, before)
+        return mean > before
 
 
 def make_evaluator(run: Run, sets: Sequence[str], tasks: int, purpose: Purpose) -> Evaluator:

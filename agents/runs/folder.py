@@ -121,7 +121,6 @@ class RunFolder:
 
     def __init__(self, path: Path):
         self.path = path
-        self._is_new = False
         self.config = path / CONFIG_FILE
         self.provenance = path / "provenance.json"
         self.metrics = path / "metrics.csv"
@@ -139,16 +138,14 @@ class RunFolder:
     def lock(self) -> Iterator[None]:
         """Makes this process the folder's only writer; makes the folder if missing.
 
-        At the end a folder that `create` has made is removed if nothing was saved in it.
-
         Raises:
           ValueError: another process writes to it.
           OSError: the folder cannot be made.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        lock, holder = filelock.FileLock(self.path / ".lock"), self.path / ".writer"
+        lock, holder = filelock.FileLock(self.path / ".lock", timeout=0), self.path / ".writer"
         try:
-            lock.acquire(timeout=0)
+            lock.acquire()
         except filelock.Timeout:
             name = holder.read_text() if holder.is_file() else "another process"
             raise ValueError(f"{self.path} is being written by {name}; wait for its end") from None
@@ -158,9 +155,29 @@ class RunFolder:
         finally:
             holder.unlink(missing_ok=True)
             lock.release()
-            saved = self.metrics.exists() or self.checkpoints.exists()
-            if self._is_new and not saved:  # the name is free again
-                shutil.rmtree(self.path, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def opened_for(self, run: Run) -> Iterator[None]:
+        """Locks the folder for training a new run or continuing the stored one.
+
+        A new folder in which nothing was saved is removed at the end.
+
+        Raises:
+          ValueError: the folder is taken, or `run` does not continue the stored run.
+          OSError: the folder cannot be made.
+        """
+        with self.lock():
+            if self.config.is_file():
+                run.check_continues(self.open(self.path)[1])
+                yield
+                return
+            self.check_free()
+            self.note(run)
+            try:
+                yield
+            finally:
+                if not (self.metrics.exists() or self.checkpoints.exists()):
+                    shutil.rmtree(self.path, ignore_errors=True)
 
     def check_free(self) -> None:
         """Checks that a new run can be created here.
@@ -178,16 +195,6 @@ class RunFolder:
         hidden = self.path.is_dir() and all(p.name.startswith(".") for p in self.path.iterdir())
         if self.path.exists() and not hidden:
             raise ValueError(f"{self.path} is taken, and holds no run; give another --name")
-
-    def create(self, run: Run) -> None:
-        """Writes the settings of a new run.
-
-        Raises:
-          ValueError: the folder holds something already.
-        """
-        self.check_free()
-        self._is_new = True
-        self.note(run)
 
     def note(self, run: Run) -> None:
         """Writes the settings of a run and the version of this package."""

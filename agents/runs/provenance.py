@@ -9,6 +9,8 @@ from typing import Any
 
 import jax
 
+from agents.runs.folder import read_json, write_json
+
 ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Code that decides results; records and texts may change between two of them.
@@ -27,6 +29,14 @@ def provenance() -> dict[str, Any]:
         **{name: importlib.metadata.version(name) for name in VERSIONED},
         "commit": commit(),
     }
+
+
+def note_provenance(path: pathlib.Path, devices: str) -> None:
+    """Adds this machine, its versions and the commit to a JSON file of those before."""
+    known = read_json(path) if path.exists() else []
+    here = {**provenance(), "devices": devices}
+    if here not in known:
+        write_json(path, [*known, here])
 
 
 def commit() -> str | None:

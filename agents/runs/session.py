@@ -7,8 +7,9 @@ saving, then evaluation. No thread runs JAX in the background.
 import contextlib
 import dataclasses
 import os
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rich.console import Console
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import evaluate, own_and_paper_sets
+from agents.acting.policy import Policy
 from agents.acting.policy_files import load_policy
 from agents.arrays import from_arrays
 from agents.command_line import option
@@ -31,11 +33,11 @@ from agents.runs import report
 from agents.runs.checkpoint import CheckpointError, Checkpoints
 from agents.runs.display import ProgressLine
 from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows, make_evaluator
-from agents.runs.folder import Run, RunFolder, read_json, write_json
+from agents.runs.folder import Run, RunFolder
 from agents.runs.loading import policies
 from agents.runs.loggers import open_loggers
 from agents.runs.metrics import CsvLog, Row, is_last
-from agents.runs.provenance import provenance
+from agents.runs.provenance import note_provenance
 from agents.runs.stopping import DivergedError, Stopped, StopSignals
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
@@ -118,21 +120,14 @@ def train_run(
     folder = RunFolder(path)
     check_memory(run)
     with contextlib.ExitStack() as stack:
-
-        def prepare() -> None:
-            stack.enter_context(folder.lock())
-            if folder.config.is_file():
-                run.check_continues(RunFolder.open(path)[1])
-            else:
-                folder.create(run)
-
-        processes.on_first(prepare)
-        session = Session(folder, run, options, console, stop_file)
-        if processes.is_first():
-            folder.note(run)  # it may have other limits than before
-        with session.checkpoints or contextlib.nullcontext():
+        processes.on_first(lambda: stack.enter_context(folder.opened_for(run)))
+        written = folder
+        if not processes.is_first():  # only the first process's files are kept
+            written = RunFolder(Path(stack.enter_context(tempfile.TemporaryDirectory())))
+        session = Session(run, options, console, folder.checkpoints, written, stop_file)
+        with session.checkpoints:
             session.train()
-            return session.finish()
+            return session.finish() if processes.is_first() else {}
 
 
 class Session:
@@ -140,45 +135,40 @@ class Session:
 
     def __init__(
         self,
-        folder: RunFolder,
         run: Run,
         options: RunOptions,
         console: Console,
+        stored: Path,
+        folder: RunFolder,
         stop_file: Path | None = None,
     ):
-        """Builds the learner and restores the newest checkpoint.
+        """Builds the learner and restores the newest checkpoint in `stored`.
 
         Raises:
           ValueError: the settings cannot be trained with, or the checkpoint cannot be continued.
         """
-        self.folder, self.run, self.options, self.console = folder, run, options, console
-        self.stop_file = stop_file
+        self.run, self.options, self.console = run, options, console
+        self.folder, self.stop_file = folder, stop_file
         self.placement = Placement.of(options.devices, run.config, run.seeds)
         self.learner = make_train(run.config, axis=self.placement.axis)
         self.sets = options.sets or own_and_paper_sets(run.config)
         keys = jax.vmap(jax.random.key)(np.array(run.seed_range, np.uint32))
         init = jax.jit(jax.vmap(self.learner.init))
-        self._shapes = jax.eval_shape(init, keys)
-        # The first process writes; all read.
-        is_first = processes.is_first()
-        self.checkpoints = Checkpoints(folder.checkpoints, keep=options.keep) if is_first else None
-        state, record = self._restore()
+        state, record = restore(stored, run, jax.eval_shape(init, keys))
         self.iteration: int = record["iteration"]
         self.seconds: float = record["seconds"]
         self.compile_seconds: float = record["compile_seconds"]
-        self.state = self.placement.put(init(keys) if state is None else state)
-        self.saved = self.iteration
-        self.metrics = CsvLog(folder.metrics, last_iteration=self.iteration) if is_first else None
-        self.evaluations = (
-            CsvLog(folder.evaluations, last_iteration=self.iteration) if is_first else None
-        )
         self._last = {int(row["seed"]): row for row in record["last"]}
-        if self.metrics is not None and len(self.metrics.rows) < self.iteration:
+        self.state = self.placement.put(init(keys) if state is None else state)
+        self.checkpoints = Checkpoints(folder.checkpoints, keep=options.keep)
+        self.metrics = CsvLog(folder.metrics, last_iteration=self.iteration)
+        self.evaluations = CsvLog(folder.evaluations, last_iteration=self.iteration)
+        if len(self.metrics.rows) < self.iteration:
             self._say(f"{folder.metrics} has lost rows; learning curves lack these iterations.")
-        self._tracker = None
-        if options.evaluate_every and self.evaluations is not None:
-            self._tracker = PeriodicEvaluator(folder, run, self.sets)
-            self._tracker.resume(self.evaluations.rows)
+        self._evaluator = None
+        if options.evaluate_every:
+            self._evaluator = PeriodicEvaluator(folder, run, self.sets, self.evaluations.rows)
+        folder.note(run)  # it may have other limits than before
 
     @property
     def active(self) -> np.ndarray:
@@ -196,19 +186,23 @@ class Session:
         """
         if not self.active.any():
             return
-        self._note_provenance()
-        count = num_parameters(self._shapes.params) // self.run.seeds
+        note_provenance(self.folder.provenance, str(self.placement))
+        count = num_parameters(self.state.params) // self.run.seeds
         self._say(
             f"{self.folder.path}: {tt.task_set(self.run.config.env_id).id}, curiosity "
             f"{self.run.config.curiosity}, seed {', '.join(map(str, self.run.seed_range))}, "
             f"{count:,} parameters, on {self.placement}. Compiling ..."
         )
-        advance = self._compile()
+        started = time.perf_counter()
+        advance = self.placement.shard(make_advance(self.learner))
+        advance = jax.jit(advance, donate_argnums=0).lower(self.state, self.active).compile()
+        self.compile_seconds += time.perf_counter() - started
         stop = StopSignals(
             lambda: self._say("Finishing this iteration; Ctrl-C again stops now."), self.stop_file
         )
         progress = ProgressLine(self.console, self.run.config.iterations)
-        with stop, self._loggers() as log, progress:
+        chosen = {"tensorboard": self.options.tensorboard, "wandb": self.options.wandb}
+        with stop, open_loggers(self.folder.path, self.run, **chosen) as log, progress:
             while self.active.any():
                 rows = self._iterate(advance)
                 log(rows)
@@ -223,20 +217,13 @@ class Session:
 
     def finish(self) -> dict[int, list[Score]]:
         """Evaluates the final policies, or the best ones; writes and returns the results."""
-        state = self.placement.local(self.state)
-        if self.evaluations is None:
-            return {}
-        final = policies(self.run, state.params, np.asarray(state.iteration))
-        shown = {}
-        for seed, policy in zip(self.run.seed_range, final, strict=True):
-            best = self.folder.best(seed)
-            shown[seed] = load_policy(best) if self._tracker and best.is_file() else policy
-        tested = {
-            (row["seed"], row["iteration"])
-            for row in self.evaluations.rows
-            if row["purpose"] == "test"
-        }
-        missing = [s for s, policy in shown.items() if (s, policy.iteration) not in tested]
+        shown = self._policies()
+        for seed in shown:
+            if self._evaluator and self.folder.best(seed).is_file():
+                shown[seed] = load_policy(self.folder.best(seed))
+        tested = [row for row in self.evaluations.rows if row["purpose"] == "test"]
+        known = {(row["seed"], row["iteration"]) for row in tested}
+        missing = [seed for seed in shown if (seed, shown[seed].iteration) not in known]
         if not missing and (self.folder.page.exists() or not self.options.report):
             return {}
         self._say("Evaluating ...")
@@ -247,125 +234,101 @@ class Session:
         for seed in missing:
             self.evaluations.append(evaluation_rows(scores[seed], shown[seed], seed, "test"))
         if self.options.report:
-            first = jax.tree.map(lambda x: x[0], state)
+            first = jax.tree.map(lambda x: x[0], self.placement.local(self.state))
             report.write(self.folder, self.run, self.learner, first, evaluator, played)
         return scores
-
-    def _restore(self) -> tuple[TrainState | None, dict[str, Any]]:
-        """Returns the state of the newest checkpoint, if there is one, and its record.
-
-        Raises:
-          ValueError: the checkpoint is unusable, or of other settings.
-        """
-        nothing = {"iteration": 0, "seconds": 0.0, "compile_seconds": 0.0, "last": []}
-        if not self.folder.checkpoints.is_dir():
-            return None, nothing
-        with Checkpoints(self.folder.checkpoints) as checkpoints:
-            if not checkpoints.iterations:
-                return None, nothing
-            arrays, record = checkpoints.load()
-        try:
-            self.run.check_continues(Run.from_dict(record["run"]))
-            state = from_arrays(arrays, self._shapes)
-        except (KeyError, ValueError) as error:
-            raise CheckpointError(
-                f"checkpoint {record['iteration']} in {self.folder.checkpoints} cannot be "
-                f"continued: {error}"
-            ) from error
-        for row in record["last"]:
-            if row["iteration"] < record["iteration"] and not is_last(row, self.run.config):
-                raise ValueError(
-                    f"seed {row['seed']} stopped after iteration {row['iteration']} of "
-                    f"{record['iteration']}, and would train on with these limits; give the "
-                    "former ones, or begin a new run"
-                )
-        if record["iteration"] > self.run.config.iterations:
-            raise ValueError(
-                f"iterations must be at least {record['iteration']}, which are done, got "
-                f"{self.run.config.iterations}"
-            )
-        return state, record
-
-    def _compile(self) -> Advance:
-        """Compiles one iteration and the evaluation after it, for all seeds, ahead of time."""
-        started = time.perf_counter()
-        advance = self.placement.shard(make_advance(self.learner))
-        compiled = jax.jit(advance, donate_argnums=0).lower(self.state, self.active).compile()
-        self.compile_seconds += time.perf_counter() - started
-        return compiled
 
     def _iterate(self, advance: Advance) -> list[Row]:
         """Advances the active seeds by one iteration; returns and logs their rows of metrics."""
         active, started = self.active, time.perf_counter()
         self.state, metrics = advance(self.state, active)
-        metrics = self.placement.local(metrics)
-        host = {name: np.asarray(values) for name, values in sorted(metrics.items())}
+        host = jax.tree.map(np.asarray, self.placement.local(metrics))
         taken = time.perf_counter() - started
         self.iteration, self.seconds = self.iteration + 1, self.seconds + taken
         steps, finite = host.pop("steps"), host.pop("is_finite")
+        if not finite[active].all():
+            raise DivergedError(
+                f"training diverged in iteration {self.iteration}: a loss or a parameter is not "
+                f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
+            )
         rows: list[Row] = [
             {
                 "seed": seed,
                 "iteration": self.iteration,
-                **{name: values[index].item() for name, values in host.items()},
+                **{name: host[name][index].item() for name in sorted(host)},
                 "transitions_per_second": round(float(steps[index]) / taken, 1),
                 "seconds": round(self.seconds, 3),
             }
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        if not finite[active].all():
-            raise DivergedError(
-                f"training diverged in iteration {self.iteration}: a loss or a parameter is not "
-                f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
-            )
-        if self.metrics is not None:
-            self.metrics.append(rows)
+        self.metrics.append(rows)
         self._last |= {int(row["seed"]): row for row in rows}
-        self._track(active)
+        self._evaluate(active)
         return rows
 
-    def _track(self, active: np.ndarray) -> None:
-        """Evaluates the active seeds on all sets where that is due."""
-        due = self.options.evaluate_every and self.iteration % self.options.evaluate_every == 0
-        if not due and (self.active == active).all():
+    def _evaluate(self, active: np.ndarray) -> None:
+        """Evaluates on all sets the seeds that trained, where that is due or they are done."""
+        if self._evaluator is None:
             return
+        due = self.iteration % self.options.evaluate_every == 0
+        chosen = active if due else active & ~self.active
+        found = self._policies() if chosen.any() else {}
+        for seed, is_chosen in zip(self.run.seed_range, chosen, strict=True):
+            if is_chosen:
+                self.evaluations.append(self._evaluator.evaluate(seed, found[seed]))
+
+    def _policies(self) -> dict[int, Policy]:
+        """Returns the present policy of each seed."""
         state = self.placement.local(self.state)
-        if self._tracker is None or self.evaluations is None:
-            return
         found = policies(self.run, state.params, np.asarray(state.iteration))
-        for index, seed in enumerate(self.run.seed_range):
-            if active[index] and (due or not self.active[index]):
-                self.evaluations.append(self._tracker.evaluate(seed, found[index]))
+        return dict(zip(self.run.seed_range, found, strict=True))
 
     def _save(self) -> None:
-        state = self.placement.local(self.state)
-        if self.checkpoints is not None:
-            record = {
-                "run": self.run.to_dict(),
-                "seconds": self.seconds,
-                "compile_seconds": self.compile_seconds,
-                "last": list(self._last.values()),
-            }
-            self.checkpoints.save(self.iteration, state, record)
-        self.saved = self.iteration
-
-    def _note_provenance(self) -> None:
-        """Adds this machine and commit to those that have trained the run."""
-        if self.metrics is None:
-            return
-        path = self.folder.provenance
-        known = read_json(path) if path.exists() else []
-        here = {**provenance(), "devices": str(self.placement)}
-        if here not in known:
-            write_json(path, [*known, here])
-
-    def _loggers(self) -> contextlib.AbstractContextManager[Callable[[Sequence[Row]], None]]:
-        chosen = (self.options.tensorboard, self.options.wandb) if self.metrics else (False, False)
-        return open_loggers(self.folder.path, self.run, tensorboard=chosen[0], wandb=chosen[1])
+        record = {
+            "run": self.run.to_dict(),
+            "seconds": self.seconds,
+            "compile_seconds": self.compile_seconds,
+            "last": list(self._last.values()),
+        }
+        self.checkpoints.save(self.iteration, self.placement.local(self.state), record)
 
     def _say(self, line: str) -> None:
         self.console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def restore(folder: Path, run: Run, shapes: TrainState) -> tuple[TrainState | None, dict[str, Any]]:
+    """Returns the state and the record of the newest checkpoint; None and zeros if there is none.
+
+    Raises:
+      ValueError: the checkpoint is unusable, or of other settings.
+    """
+    nothing = {"iteration": 0, "seconds": 0.0, "compile_seconds": 0.0, "last": []}
+    if not folder.is_dir():
+        return None, nothing
+    with Checkpoints(folder) as checkpoints:
+        if not checkpoints.iterations:
+            return None, nothing
+        arrays, record = checkpoints.load()
+    done = record["iteration"]
+    try:
+        run.check_continues(Run.from_dict(record["run"]))
+        state = from_arrays(arrays, shapes)
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(
+            f"checkpoint {done} in {folder} cannot be continued: {error}"
+        ) from error
+    for row in record["last"]:
+        if row["iteration"] < done and not is_last(row, run.config):
+            raise ValueError(
+                f"seed {row['seed']} stopped after iteration {row['iteration']} of {done}, and "
+                "would train on with these limits; give the former ones, or begin a new run"
+            )
+    if done > run.config.iterations:
+        raise ValueError(
+            f"iterations must be at least {done}, which are done, got {run.config.iterations}"
+        )
+    return state, record
 
 
 def make_advance(learner: Learner) -> Advance:

@@ -84,7 +84,7 @@ def test_training_ends_without_a_traceback_where(vanishes, tmp_path):
         if vanishes == "pipe":
             process.stdout.close()
         else:
-            shutil.rmtree(tmp_path / "x")
+            (tmp_path / "x").rename(tmp_path / "gone")
         errors = process.stderr.read()
     assert process.returncode == 1
     assert "Traceback" not in errors
@@ -149,7 +149,7 @@ def test_a_run_is_not_overwritten(capsys, whole):
 
 def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
     folder = RunFolder(tmp_path / "foreign")
-    folder.create(Run(Config()))
+    folder.note(Run(Config()))
     shutil.copytree(whole[0] / "checkpoints", folder.checkpoints)
     settings = folder.config.read_bytes()
     assert "cannot be continued" in refused(capsys, main, "--resume", folder.path)
@@ -174,7 +174,7 @@ def test_the_default_is_the_preset_fast():
 
 def test_resumed_runs_keep_their_settings(tmp_path):
     stored = Run(Config.preset("paper", hidden=32), "paper", 5, 2)
-    RunFolder(tmp_path / "x").create(stored)
+    RunFolder(tmp_path / "x").note(stored)
     arguments = ["--resume", str(tmp_path / "x")]
     found, wanted, *_ = parse(arguments)
     assert wanted == stored

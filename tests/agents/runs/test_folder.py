@@ -52,11 +52,10 @@ def test_only_the_end_of_a_run_may_change(before, after, words):
 
 def test_a_folder_holds_one_run(tmp_path):
     folder, run = RunFolder(tmp_path / "x"), Run(Config(hidden=8))
-    with folder.lock():
-        folder.create(run)
+    with folder.opened_for(run):
         folder.metrics.touch()
     assert RunFolder.open(tmp_path / "x")[1] == run
-    assert_refused(["holds a run", "--resume"], RunFolder(tmp_path / "x").create, run)
+    assert_refused(["holds a run", "--resume"], RunFolder(tmp_path / "x").check_free)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").touch()
     assert_refused(["is taken, and holds no run"], RunFolder(tmp_path / "other").check_free)
@@ -75,8 +74,7 @@ def test_a_new_folder_without_results_is_removed_and_no_other(tmp_path):
 
 
 def _fail_after_creation(folder):
-    with folder.lock():
-        folder.create(Run(Config()))
+    with folder.opened_for(Run(Config())):
         raise ValueError("broken")
 
 

@@ -20,7 +20,7 @@ def run_path(tmp_path_factory) -> Path:
     """A run of two seeds with one checkpoint."""
     path = tmp_path_factory.mktemp("runs") / "mine"
     folder = RunFolder(path)
-    folder.create(Run(CONFIG, seed=SEEDS[0], seeds=2))
+    folder.note(Run(CONFIG, seed=SEEDS[0], seeds=2))
     params = [random_params(seed=seed) for seed in SEEDS]
     both = jax.tree.map(lambda *x: jnp.stack(x), *params)
     with Checkpoints(folder.checkpoints, keep=1) as checkpoints:
