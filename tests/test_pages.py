@@ -1,7 +1,6 @@
 """Pages for users: Python blocks run and print what they state; links and commands exist."""
 
 import contextlib
-import csv
 import doctest
 import functools
 import importlib.util
@@ -11,11 +10,13 @@ import runpy
 import shlex
 import sys
 from pathlib import Path
-from statistics import fmean
+from typing import Any
 
+import pandas as pd
 import pytest
 
 from agents import registry
+from agents.experiments import tables
 from paths import ROOT
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
@@ -24,6 +25,8 @@ for folder in ("trap_tube_jax", "agents", "benchmarks", "tests"):
     PAGES += ROOT.joinpath(folder).rglob("*.md")
 NAMES = sorted(str(page.relative_to(ROOT)) for page in PAGES)
 PROTOCOL = "trap_tube_jax/protocol.md"
+RESULTS = ROOT / "benchmarks" / "results"
+BEST, CURIOSITIES = (f"benchmarks/results/{name}.md" for name in ("best_preset", "curiosities"))
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\n\n```text\n(.*?)^```$)?", re.DOTALL | re.MULTILINE)
@@ -80,19 +83,15 @@ def anchors(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_links_lead_to_files_and_headings(name):
+def test_links_lead_to_files_and_headings_and_pictures_are_described(name):
     page = ROOT / name
+    assert "![](" not in page.read_text()
     for target in re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", page.read_text())):
         if not target.startswith(("http://", "https://")):
             file, _, anchor = target.partition("#")
             path = page.parent / file if file else page
             assert path.exists(), target
             assert not anchor or anchor in anchors(path), target
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_pictures_are_described(name):
-    assert "![](" not in text_of(name)
 
 
 def commands():
@@ -104,9 +103,7 @@ def commands():
         lines = "\n".join(shell).splitlines()
         lines += [" ".join(code.split()) for code in INLINE.findall(FENCE.sub("", text))]
         for line in lines:
-            for command in re.findall(
-                r"python -m ((?:trap_tube_jax|agents|benchmarks)\S*.*)", line
-            ):
+            for command in COMMAND.findall(line):
                 found[command.partition(" #")[0].strip()] = name
     return found
 
@@ -136,36 +133,49 @@ def test_commands_exist_with_their_options(command):
             assert re.search(rf"{re.escape(option)}\b", known), option
 
 
-def percent_solved(record: str) -> dict[str, dict[str, list[float]]]:
-    """Returns the percentages of a record by algorithm and task set, a number per seed."""
-    found: dict[str, dict[str, list[float]]] = {}
-    with (ROOT / "benchmarks" / "results" / record / "results.csv").open() as file:
-        for row in csv.DictReader(file):
-            if row["purpose"] == "test":
-                own = found.setdefault(row["algorithm"], {}).setdefault(row["task_set"], [])
-                own.append(100 * int(row["solved"]) / int(row["tasks"]))
-    return found
+def rows_of(record: str, name: str) -> Any:
+    return pd.read_csv(RESULTS / record / f"{name}.csv")
 
 
-def cells(values: list[float]) -> str:
+def percent_solved(record: str) -> Any:
+    """Returns the percentages of a record: a row per algorithm and seed, a column per set."""
+    return tables.by_set(tables.reported(rows_of(record, "results")))
+
+
+def cells(values: Any) -> str:
     return " | ".join(f"{value:.1f}" for value in values)
 
 
 def test_stated_results_are_those_of_the_records():
-    best, fast = percent_solved("exp2_best")["best"], percent_solved("fast_base")["fast"]
-    means = {name: [fmean(own[each]) for each in ALL_SETS] for name, own in
-             (("best", best), ("fast", fast))}  # fmt: skip
-    for name, own in means.items():
-        assert re.search(rf"`{name}`, mean .* {re.escape(cells(own))} ", text_of(PROTOCOL)), name
-    (row,) = re.findall(r"^\| preset `best` \| (.*) \|$", text_of("README.md"), re.M)
-    assert re.sub(r" \[[^]]*\]", "", row) == cells(means["best"][1:])
-    page = text_of("benchmarks/results/best_preset.md")
-    for seed in range(5):
-        assert f"| {seed} | {cells([best[each][seed] for each in ALL_SETS[1:]])} |" in page
-    page = text_of("benchmarks/results/curiosities.md")
-    for name, own in percent_solved("exp2_curiosities").items():
-        seeds = [", ".join(f"{value:.1f}" for value in own[each]) for each in ALL_SETS[1:]]
-        assert f"| `{name}` | {' | '.join(seeds)} |" in page
+    """Each number of a table of solved tasks that has a record."""
+    best, fast = (percent_solved(name) for name in ("exp2_best", "fast_base"))
+    rows = {"README.md": [], PROTOCOL: [], BEST: [], CURIOSITIES: []}
+    few = {"st", "sy", "stsy"}  # sets of few layouts, whose means have no interval
+    means = [
+        cells([own.mean()]) if name in few else tables.mean_text(own.to_numpy(), ".1f", high=100)
+        for name, own in best[list(ALL_SETS[1:])].items()
+    ]
+    rows["README.md"].append(f"| preset `best` | {' | '.join(means)} |")
+    for name, (paper, _) in tables.PAPER_SUCCESS.items():
+        rows[PROTOCOL].append(f"{cells(paper)} | ≤ 25,600,000 |")
+        rows["README.md"] += [f"| {name} | {cells(paper)} |"] if "ICM" in name else []
+    for folder, own, shipped in (("exp2_best", best, 1), ("fast_base", fast, 7)):
+        steps = rows_of(folder, "curves").groupby("seed")["transitions"].max()
+        found = own.droplevel(0).drop(columns=tables.MEAN)
+        for percent, taken in (
+            (found.mean(), steps.mean()),
+            (found.loc[shipped], steps[shipped]),
+        ):
+            rows[PROTOCOL].append(f"| {cells(percent)} | {taken:,.0f} |")
+    table = best.droplevel(0).drop(columns=["base", tables.MEAN])
+    rows[BEST] += [f"| {seed} | {cells(own)} |" for seed, own in table.iterrows()]
+    rows[BEST].append(f"| mean | {cells(table.mean())} |")
+    for name, own in percent_solved("exp2_curiosities").groupby("algorithm"):
+        by_set = [", ".join(map("{:.1f}".format, own[each])) for each in own if each != "base"]
+        rows[CURIOSITIES].append(f"| `{name}` | {' | '.join(by_set)} |")
+    for page, expected in rows.items():
+        for row in expected:
+            assert row in text_of(page), (page, row)
 
 
 def test_pages_stay_short():

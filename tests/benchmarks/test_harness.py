@@ -88,19 +88,33 @@ def test_a_wrong_option_ends_in_one_line_before_measuring(
     assert error.startswith(f"error: {message}")
 
 
-def test_tables_of_speeds_are_of_their_records():
+def results_of(name):
+    record = json.loads((RESULTS / f"{name}.json").read_text())
+    return record["machine"]["commit"][:7], record["results"]
+
+
+def test_stated_speeds_are_of_their_records():
     """A table marked `<!-- speeds: NAME NAME -->` has a row for each batch size of a record."""
     page = (RESULTS / "throughput.md").read_text()
     tables = re.findall(r"<!-- speeds: (.*?) -->\n\n(.*?)\n\n", page, re.DOTALL)
-    assert tables
+    assert len(tables) == 2
     for names, table in tables:
         head, _, *rows = [line.strip("| ").split(" | ") for line in table.splitlines()]
         shown = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
-        for name in names.split():
-            record = json.loads((RESULTS / f"{name}.json").read_text())
-            for each in record["results"]:
+        for commit, results in map(results_of, names.split()):
+            for each in results:
                 if each["num_envs"] >= 4096:
                     devices = f"{each['devices']} device" + "s" * (each["devices"] > 1)
-                    commit = f"commit `{record['machine']['commit'][:7]}`"
-                    row = f"{devices}, {each['num_envs']:,} environments, {commit}"
+                    row = f"{devices}, {each['num_envs']:,} environments, commit `{commit}`"
                     assert shown[row][each["name"]] == f"{each['steps_per_s'] / 1e6:.1f}"
+    stated = [line.strip("| ").split(" | ") for line in page.splitlines()]
+    parts = [results_of(f"train_throughput_{name}")[1] for name in ("base", "pstsy")]
+    for base, pstsy in zip(*parts, strict=True):
+        seconds = [f"{each['timing']['median_s']:.1f}" for each in (base, pstsy)]
+        assert any(row[0].startswith(base["name"]) and row[1:] == seconds for row in stated)
+    readme = (ROOT / "README.md").read_text()
+    (sentence,) = re.findall(r"^\*\*Speed\*\*.*?\n\n", readme, re.MULTILINE | re.DOTALL)
+    commit, results = results_of("peers_2_devices")
+    assert f"Commit `{commit}`" in sentence
+    speeds = re.findall(r"\b(\d+\.\d)\b", sentence)
+    assert set(speeds) == {f"{each['steps_per_s'] / 1e6:.1f}" for each in results}
