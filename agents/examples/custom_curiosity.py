@@ -4,6 +4,7 @@ python -m agents.examples.custom_curiosity
 python -m agents.train --import agents.examples.custom_curiosity --curiosity tool-moves
 """
 
+import argparse
 from typing import Any
 
 import jax
@@ -49,4 +50,5 @@ def main(config: Config, iterations: int = 20) -> tuple[TrainState, dict[str, ja
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main(Config.preset("fast", curiosity="tool-moves"))

@@ -3,6 +3,8 @@
 python -m agents.examples.custom_transfer
 """
 
+import argparse
+
 import jax
 import jax.numpy as jnp
 
@@ -35,4 +37,5 @@ def main(tasks: int = 100) -> tt.Scores:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main()

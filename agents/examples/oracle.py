@@ -3,6 +3,7 @@
 python -m agents.examples.oracle
 """
 
+import argparse
 from collections.abc import Sequence
 
 import jax
@@ -28,4 +29,5 @@ def main(sets: Sequence[str] = ("base", "sy", "p"), tasks: int = 20) -> dict[str
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main()

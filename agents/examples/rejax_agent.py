@@ -3,6 +3,7 @@
 python -m agents.examples.rejax_agent
 """
 
+import argparse
 from collections.abc import Callable
 
 import jax
@@ -53,4 +54,5 @@ def main(total_timesteps: int = 8_192) -> tt.Scores:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main()

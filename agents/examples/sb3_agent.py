@@ -3,6 +3,8 @@
 python -m agents.examples.sb3_agent
 """
 
+import argparse
+
 import stable_baselines3  # pyright: ignore[reportMissingImports]
 import torch  # pyright: ignore[reportMissingImports]
 
@@ -25,4 +27,5 @@ def main(total_timesteps: int = 3_000) -> tt.Scores:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main()

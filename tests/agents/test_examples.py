@@ -1,5 +1,8 @@
 """The programs in `agents/examples`, at small sizes."""
 
+import runpy
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +26,16 @@ def test_a_custom_curiosity_pays_moves_of_the_tool():
     pay, moves = curiosity.reward({}, jnp.float32(6.0), experience)
     np.testing.assert_allclose(pay, [[0, 0], [1 / 3, 1 / 3], [1 / 3, 0]], rtol=1e-6)
     assert moves == 9
+
+
+@pytest.mark.parametrize("name", ["custom_curiosity", "custom_transfer", "oracle", "plain_ppo"])
+def test_help_explains_a_program_instead_of_running_it(name, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.delitem(sys.modules, f"agents.examples.{name}", raising=False)
+    with pytest.raises(SystemExit) as stopped:
+        runpy.run_module(f"agents.examples.{name}", run_name="__main__")
+    assert stopped.value.code == 0
+    assert "usage:" in capsys.readouterr().out
 
 
 @pytest.mark.slow
