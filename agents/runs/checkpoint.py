@@ -27,14 +27,10 @@ class Checkpoints:
     """The checkpoints of one run, each named by its iteration. A context manager."""
 
     def __init__(self, folder: Path, *, keep: int | None = None):
-        """Opens `folder`.
-
-        Args:
-          folder: its place.
-          keep: number of newest checkpoints to keep; None opens for reading only.
+        """Opens a folder: to keep the `keep` newest checkpoints, or for reading only if None.
 
         Raises:
-          CheckpointError: the folder is missing and `keep` is None.
+          CheckpointError: a folder to read is missing.
         """
         self.folder = folder
         if keep is None and not folder.is_dir():
@@ -65,12 +61,9 @@ class Checkpoints:
         return sorted(self._manager.all_steps(read=True))
 
     def save(self, iteration: int, state: Any, record: dict[str, Any]) -> None:
-        """Saves a pytree of arrays; returns once it is on disk.
+        """Saves a pytree of arrays and keys with a record of plain values.
 
-        Args:
-          iteration: its name; a checkpoint of this name is kept as it is.
-          state: the pytree; PRNG keys are allowed.
-          record: plain values to store with it.
+        Returns once both are on disk. A checkpoint of this iteration is kept as it is.
 
         Raises:
           OSError: the checkpoint cannot be written.
@@ -102,12 +95,10 @@ class Checkpoints:
         known = self.iterations
         if not known:
             raise CheckpointError(f"{self.folder} holds no checkpoint")
-        if iteration not in (None, *known):
-            names = ", ".join(map(str, known))
-            raise CheckpointError(
-                f"{self.folder} holds no checkpoint {iteration}; allowed: {names}"
-            )
         chosen = known[-1] if iteration is None else iteration
+        if chosen not in known:
+            allowed = ", ".join(map(str, known))
+            raise CheckpointError(f"{self.folder} holds no checkpoint {chosen}; allowed: {allowed}")
         items = ocp.args.Composite(state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore())
         try:
             restored = self._manager.restore(chosen, args=items)

@@ -39,8 +39,9 @@ def load_policies(
     if path.is_file() or str(source) in pretrained.names():
         if iteration is not None:
             raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
-        load = policy_files.load_policy if path.is_file() else pretrained.load_shipped
-        return [load(path if path.is_file() else str(source))]  # pyright: ignore[reportArgumentType]
+        if path.is_file():
+            return [policy_files.load_policy(path)]
+        return [pretrained.load_shipped(str(source))]
     known = sorted(entry.parent.name for entry in path.parent.glob(f"*/{CONFIG_FILE}"))
     raise ValueError(
         f"{source} is neither a run, a file nor a shipped agent; runs in {path.parent}: "

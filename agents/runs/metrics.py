@@ -1,8 +1,4 @@
-"""Files of numbers that a run appends to.
-
-`metrics.csv` has a row per seed and iteration, `evaluations.csv` a row per seed, evaluated
-iteration and task set.
-"""
+"""CSV files that a run appends to."""
 
 import csv
 import io
@@ -24,17 +20,12 @@ class CsvLog:
     """
 
     def __init__(self, path: Path, *, last_iteration: int = 0):
-        """Opens the file and drops the rows after `last_iteration`.
-
-        Args:
-          path: the file; made at the first row if missing.
-          last_iteration: iteration from which training continues; 0 starts anew.
-        """
+        """Opens the file, made at the first row if missing; drops rows after `last_iteration`."""
         self._path = path
         rows = read_rows(path)
         self.rows: list[Row] = [row for row in rows if row["iteration"] <= last_iteration]
         if rows:
-            write_text(path, self._lines(self.rows, header=True))
+            write_text(path, self._text(self.rows, header=True))
 
     def append(self, rows: Sequence[Row]) -> None:
         """Appends rows of the columns of the first row.
@@ -45,9 +36,9 @@ class CsvLog:
         """
         self.rows.extend(rows)
         with self._path.open("a", newline="", encoding="utf-8") as file:
-            file.write(self._lines(rows, header=not file.tell()))
+            file.write(self._text(rows, header=not file.tell()))
 
-    def _lines(self, rows: Sequence[Row], *, header: bool) -> str:
+    def _text(self, rows: Sequence[Row], *, header: bool) -> str:
         text = io.StringIO()
         if self.rows:
             writer = csv.DictWriter(text, list(self.rows[0]), lineterminator="\n")
@@ -67,16 +58,12 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    text = path.read_text(encoding="utf-8")
-    whole = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
-    reader = csv.DictReader(whole)
-    if whole and "iteration" not in (reader.fieldnames or ()):
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    reader = csv.DictReader(line for line in lines if line.endswith("\n"))
+    if lines and "iteration" not in (reader.fieldnames or ()):
         raise ValueError(f"{path} has no header with a column 'iteration'; delete or restore it")
-    return [
-        {name: _parse(text) for name, text in row.items()}
-        for row in reader
-        if None not in row and None not in row.values()
-    ]
+    whole = [row for row in reader if None not in row and None not in row.values()]
+    return [{name: _parse(text) for name, text in row.items()} for row in whole]
 
 
 def is_last(row: Row, config: Config) -> bool:

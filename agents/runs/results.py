@@ -2,13 +2,16 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from agents.runs.folder import CONFIG_FILE, RunFolder, read_json
 
+Paths = str | Path | Iterable[str | Path]
 
-def results(paths: str | Path | Iterable[str | Path]) -> pd.DataFrame:
+
+def results(paths: Paths) -> pd.DataFrame:
     """Returns the evaluations of all runs in folders, one row each.
 
     Args:
@@ -23,25 +26,28 @@ def results(paths: str | Path | Iterable[str | Path]) -> pd.DataFrame:
     Raises:
       ValueError: a folder holds no run, or a file cannot be read.
     """
-    tables = [_of_run(run) for run in find_runs(paths)]
+    tables = []
+    for folder in find_runs(paths):
+        values = read_json(folder.config)  # plain values: no name in it is looked up or imported
+        machines = read_json(folder.provenance) if folder.provenance.exists() else []
+        table = _table(folder, folder.evaluations, values)
+        table.insert(2, "preset", values["preset"])
+        table.insert(3, "commit", machines[-1]["commit"] if machines else None)
+        settings = values["config"].items()
+        tables.append(table.assign(**{k: str(v) if type(v) is list else v for k, v in settings}))
     return pd.concat(tables, ignore_index=True)
 
 
-def metrics(paths: str | Path | Iterable[str | Path]) -> pd.DataFrame:
+def metrics(paths: Paths) -> pd.DataFrame:
     """Returns the training metrics of all runs in folders, one row per seed and iteration.
 
     Columns: run, algorithm, and those of `metrics.csv`. Arguments and errors as in `results`.
     """
-    tables = []
-    for folder in find_runs(paths):
-        table, values = _read(folder.metrics), read_json(folder.config)
-        table.insert(0, "run", str(folder.path))
-        table.insert(1, "algorithm", values["algorithm"])
-        tables.append(table)
+    tables = [_table(run, run.metrics, read_json(run.config)) for run in find_runs(paths)]
     return pd.concat(tables, ignore_index=True)
 
 
-def find_runs(paths: str | Path | Iterable[str | Path]) -> list[RunFolder]:
+def find_runs(paths: Paths) -> list[RunFolder]:
     """Returns the runs in folders, sorted by path.
 
     Raises:
@@ -56,23 +62,9 @@ def find_runs(paths: str | Path | Iterable[str | Path]) -> list[RunFolder]:
     return found
 
 
-def _of_run(folder: RunFolder) -> pd.DataFrame:
-    values = read_json(folder.config)  # plain values: no name in it is looked up or imported
-    machines = read_json(folder.provenance) if folder.provenance.exists() else []
-    table = _read(folder.evaluations)
-    settings = {name: str(v) if isinstance(v, list) else v for name, v in values["config"].items()}
-    first = {
-        "run": str(folder.path),
-        "algorithm": values["algorithm"],
-        "preset": values["preset"],
-        "commit": machines[-1]["commit"] if machines else None,
-    }
-    for place, (name, value) in enumerate(first.items()):
-        table.insert(place, name, value)
-    return table.assign(**settings)
-
-
-def _read(path: Path) -> pd.DataFrame:
-    if not path.exists() or not path.stat().st_size:
-        return pd.DataFrame({"seed": [], "iteration": []})
-    return pd.read_csv(path)
+def _table(folder: RunFolder, path: Path, values: dict[str, Any]) -> pd.DataFrame:
+    is_empty = not path.exists() or not path.stat().st_size
+    table = pd.DataFrame({"seed": [], "iteration": []}) if is_empty else pd.read_csv(path)
+    table.insert(0, "run", str(folder.path))
+    table.insert(1, "algorithm", values["algorithm"])
+    return table
