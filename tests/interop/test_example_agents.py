@@ -1,18 +1,18 @@
-"""The examples with agents of other libraries."""
+"""Agents of other libraries learn an easy task through the adapters."""
+
+import importlib
 
 import pytest
-
-pytest.importorskip("rejax")
-pytest.importorskip("stable_baselines3")
-
-from agents.examples import rejax_agent, sb3_agent
 
 pytestmark = [pytest.mark.interop, pytest.mark.filterwarnings("default")]
 
 
-@pytest.mark.parametrize("example", [rejax_agent, sb3_agent])
-def test_agents_of_other_libraries_are_trained_and_scored(example):
-    scores = example.main()
+@pytest.mark.parametrize(
+    ("library", "example"), [("rejax", "rejax_agent"), ("stable_baselines3", "sb3_agent")]
+)
+def test_agents_of_other_libraries_are_trained_and_scored(library, example):
+    pytest.importorskip(library)
+    scores = importlib.import_module(f"agents.examples.{example}").main()
     assert [score.set for score in scores.sets] == ["near-food", "base"]
     assert scores["near-food"].solved == 1
     assert scores["base"].solved == 0

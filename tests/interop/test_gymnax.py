@@ -26,7 +26,7 @@ def easy(easy_env):
     return to_gymnax.make(easy_env)
 
 
-def test_spaces_are_gymnaxs_own(easy):
+def test_spaces_and_parameters_are_gymnaxs_own(easy):
     env, params = easy
     assert isinstance(env, gymnax.environments.environment.Environment)
     assert isinstance(env.action_space(params), spaces.Discrete)
@@ -37,10 +37,6 @@ def test_spaces_are_gymnaxs_own(easy):
     observation, state = env.reset(jax.random.key(0), params)
     assert (observation.shape, observation.dtype) == (box.shape, box.dtype)
     assert env.get_obs(state).tolist() == observation.tolist()
-
-
-def test_parameters_are_hashable_with_the_limit_as_a_leaf(easy):
-    _, params = easy
     assert jax.tree.leaves(params) == [6]
     assert hash(params) == hash(params.replace(max_steps_in_episode=6))
     assert isinstance(params, gymnax.EnvParams)
@@ -105,27 +101,19 @@ def test_a_finished_episode_stays_without_the_reset(easy):
     np.testing.assert_array_equal(after.agent, state.agent)
 
 
-def test_pairs_as_actions(easy, easy_env):
+def test_pairs_as_actions_batches_and_copies(easy, easy_env):
     env, params = to_gymnax.make(easy_env, flat_actions=False)
     assert isinstance(env.action_space(params), spaces.Tuple)
-    key = jax.random.key(0)
-    _, state = env.reset(key, params)
-    flat, _ = easy
-    for grasp, move in ((1, 3), (2, 0)):
-        pair = (jnp.int32(grasp), jnp.int32(move))
-        expected = flat.step(key, state, 4 * grasp + move, params)[0]
-        np.testing.assert_array_equal(env.step(key, state, pair, params)[0], expected)
-
-
-def test_batches_and_copies(easy):
-    env, params = easy
-    env = copy.deepcopy(env)
+    flat = copy.deepcopy(easy[0])
     keys = jax.random.split(jax.random.key(0), 3)
-    _, states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
-    step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
-    observations, *_, done, _ = step(keys, states, jnp.array([0, 3, 9]), params)
-    assert observations.shape == (3, 12, 12, 3)
-    assert done.shape == (3,)
+    _, states = jax.vmap(flat.reset, in_axes=(0, None))(keys, params)
+    indices = jnp.array([0, 7, 9])
+    results = [
+        jax.vmap(each.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
+        for each, actions in ((flat, indices), (env, jnp.divmod(indices, 4)))
+    ]
+    jax.tree.map(np.testing.assert_array_equal, *results)
+    assert results[0][0].shape == (3, 12, 12, 3)
 
 
 @pytest.mark.parametrize(

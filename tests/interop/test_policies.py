@@ -36,64 +36,52 @@ def expected():
         yield found
 
 
-def percent(returns):
-    return [100.0 * value for value in returns]
+def environment(name):
+    env = tt.make(name)
+    step = jax.jit(env.step)
+    state, timestep = env.reset(jax.random.key(0))
+    action = yield timestep.observation, 0, False
+    while True:
+        state, timestep = step(state, action)
+        action = yield timestep.observation, timestep.reward, timestep.done
 
 
-def test_the_environment(expected):
-    def reward(name):
-        env, carry = tt.make(name), POLICY.initial(1)
-        state, timestep = env.reset(jax.random.key(0))
-        total, step = 0.0, jax.jit(env.step)
-        while not timestep.done:
-            action, carry = ACT(timestep.observation[None], carry)
-            state, timestep = step(state, action[0])
-            total += float(timestep.reward)
-        return total
-
-    assert percent(map(reward, NAMES)) == expected
+def gymnasium_environment(name):
+    env = TrapTubeEnv(name)
+    action = yield env.reset(seed=0)[0], 0, False
+    while True:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        action = yield observation, reward, terminated or truncated
 
 
-def test_gymnasiums_single_environment(expected):
-    def reward(name):
-        env, carry, over, total = TrapTubeEnv(name), POLICY.initial(1), False, 0.0
-        observation, _ = env.reset(seed=0)
-        while not over:
-            action, carry = ACT(observation[None], carry)
-            observation, gained, terminated, truncated, _ = env.step(np.asarray(action[0]))
-            over, total = terminated or truncated, total + gained
-        return total
-
-    assert percent(map(reward, NAMES)) == expected
+def gymnasium_batch(name):
+    envs = TrapTubeVectorEnv(name, 2)
+    action = yield envs.reset(seed=0)[0][1], 0, False
+    while True:
+        observations, rewards, terminated, truncated, _ = envs.step([action] * 2)
+        assert rewards[0] == rewards[1]
+        action = yield observations[1], rewards[1], (terminated | truncated)[1]
 
 
-def test_gymnasiums_vector_environment(expected):
-    def reward(name):
-        envs, carry = TrapTubeVectorEnv(name, 2), POLICY.initial(2)
-        over, total = np.zeros(2, bool), np.zeros(2)
-        observation, _ = envs.reset(seed=0)
-        while not over.all():
-            action, carry = ACT(observation, carry)
-            observation, gained, terminated, truncated, _ = envs.step(np.asarray(action))
-            total += gained * ~over
-            over |= terminated | truncated
-        assert total[0] == total[1]
-        return total[0]
-
-    assert percent(map(reward, NAMES)) == expected
+def gymnax_environment(name):
+    env, params = to_gymnax.make(name, flat_actions=False)
+    observation, state = env.reset(jax.random.key(0), params)
+    action = yield observation, 0, False
+    while True:
+        observation, state, reward, done, _ = env.step(jax.random.key(1), state, action, params)
+        action = yield observation, reward, done
 
 
-def test_gymnaxs_step(expected):
-    def reward(name):
-        (env, params), carry = to_gymnax.make(name, flat_actions=False), POLICY.initial(1)
-        observation, state = env.reset(jax.random.key(0), params)
-        done, total = False, 0.0
+@pytest.mark.parametrize(
+    "played", [environment, gymnasium_environment, gymnasium_batch, gymnax_environment]
+)
+def test_every_interface_has_the_evaluators_successes(played, expected):
+    def success(name):
+        game, carry = played(name), POLICY.initial(1)
+        observation, reward, done = next(game)
         while not done:
             action, carry = ACT(observation[None], carry)
-            observation, state, gained, done, _ = env.step(
-                jax.random.key(1), state, action[0], params
-            )
-            total += float(gained)
-        return total
+            observation, reward, done = game.send(np.asarray(action[0]))
+        return 100 * float(reward)
 
-    assert percent(map(reward, NAMES)) == expected
+    assert list(map(success, NAMES)) == expected
