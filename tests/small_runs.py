@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 from agents.config import Config
-from agents.runs.checkpoint import Checkpoints, digest
+from agents.runs import checkpoint
 from paths import ROOT
 
 SETTINGS = {
@@ -74,6 +74,5 @@ def untimed(folder):
 
 def final_state(folder):
     """Returns the iteration and the digest of the newest checkpoint."""
-    with Checkpoints(folder / "checkpoints") as checkpoints:
-        arrays, record = checkpoints.load()
-    return record["iteration"], digest(arrays)
+    arrays, record = checkpoint.load(folder / "checkpoints")
+    return record["iteration"], checkpoint.digest(arrays)

@@ -7,6 +7,8 @@ without an error where a byte of its files has changed.
 
 import hashlib
 import logging
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,26 +26,18 @@ class CheckpointError(ValueError):
 
 
 class Checkpoints:
-    """The checkpoints of one run, each named by its iteration. A context manager."""
+    """Writes the checkpoints of one run, each named by its iteration. A context manager."""
 
-    def __init__(self, folder: Path, *, keep: int | None = None):
-        """Opens a folder: to keep the `keep` newest checkpoints, or for reading only if None.
-
-        Raises:
-          CheckpointError: a folder to read is missing.
-        """
-        self.folder = folder
-        if keep is None and not folder.is_dir():
-            raise CheckpointError(f"{folder} holds no checkpoint")
-        if keep is not None:
-            folder.mkdir(parents=True, exist_ok=True)  # Orbax refuses to for one of many processes
+    def __init__(self, folder: Path, *, keep: int):
+        """Makes the folder if missing; the `keep` newest checkpoints stay in it."""
+        folder.mkdir(parents=True, exist_ok=True)  # Orbax refuses to for one of many processes
+        self._folder = folder
         self._manager = ocp.CheckpointManager(
             folder.absolute(),
             options=ocp.CheckpointManagerOptions(
                 max_to_keep=keep,
-                read_only=keep is None,
                 create=False,
-                cleanup_tmp_directories=keep is not None,
+                cleanup_tmp_directories=True,
                 enable_async_checkpointing=False,
                 multiprocessing_options=_this_process_alone(),
             ),
@@ -55,11 +49,6 @@ class Checkpoints:
     def __exit__(self, *_: object) -> None:
         self._manager.close()
 
-    @property
-    def iterations(self) -> list[int]:
-        """The iterations that have a checkpoint, in order."""
-        return sorted(self._manager.all_steps(read=True))
-
     def save(self, iteration: int, state: Any, record: dict[str, Any]) -> None:
         """Saves a pytree of arrays and keys with a record of plain values.
 
@@ -68,7 +57,7 @@ class Checkpoints:
         Raises:
           OSError: the checkpoint cannot be written.
         """
-        if iteration in self.iterations:
+        if iteration in iterations(self._folder):
             return
         arrays = to_arrays(state)
         record = {**record, "iteration": iteration, "digest": digest(arrays)}
@@ -80,41 +69,56 @@ class Checkpoints:
         except Exception as error:  # Orbax passes on what its many back ends raise
             raise OSError(f"cannot write checkpoint {iteration}: {_first_line(error)}") from error
 
-    def load(self, iteration: int | None = None) -> tuple[Arrays, dict[str, Any]]:
-        """Reads the arrays of a checkpoint and its record.
 
-        A writer may delete old checkpoints meanwhile: where the newest is asked for and vanishes,
-        the next newest is read.
+def iterations(folder: Path) -> list[int]:
+    """Returns the iterations that have a checkpoint, in order; none if the folder is missing."""
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    return sorted(int(name) for name in names if name.isdigit())  # drafts have other names
 
-        Args:
-          iteration: the checkpoint; the newest if None.
 
-        Raises:
-          CheckpointError: there is none, or it is damaged.
-        """
-        known = self.iterations
-        if not known:
-            raise CheckpointError(f"{self.folder} holds no checkpoint")
-        chosen = known[-1] if iteration is None else iteration
-        if chosen not in known:
-            allowed = ", ".join(map(str, known))
-            raise CheckpointError(f"{self.folder} holds no checkpoint {chosen}; allowed: {allowed}")
-        items = ocp.args.Composite(state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore())
-        try:
-            restored = self._manager.restore(chosen, args=items)
-            arrays, record = restored["state"], restored["record"]
-            if digest(arrays) == record["digest"]:
-                return arrays, record
-            problem = "its numbers have changed"
-        except Exception as error:  # depends on the file that is damaged
-            problem = _first_line(error)
-        if iteration is None and chosen not in (now := self.iterations) and now:
-            return self.load()
-        others = [other for other in known if other != chosen]
-        advice = f"use checkpoint {others[-1]}" if others else "begin again"
-        raise CheckpointError(
-            f"checkpoint {self.folder / str(chosen)} is damaged ({problem}); delete it to {advice}"
-        )
+def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, Any]]:
+    """Reads the arrays of a checkpoint, the newest if `iteration` is None, and its record.
+
+    A writer may delete a checkpoint meanwhile; the next newest is then read.
+
+    Raises:
+      CheckpointError: there is none, or it is damaged.
+    """
+    known = iterations(folder)
+    if not known:
+        raise CheckpointError(f"{folder} holds no checkpoint")
+    chosen = known[-1] if iteration is None else iteration
+    if chosen not in known:
+        allowed = ", ".join(map(str, known))
+        raise CheckpointError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
+    try:
+        with tempfile.TemporaryDirectory() as copy:  # which no writer deletes
+            shutil.copytree(folder / str(chosen), copy, dirs_exist_ok=True)
+            arrays, record = _restore(Path(copy))
+        if digest(arrays) == record["digest"]:
+            return arrays, record
+        problem = "its numbers have changed"
+    except Exception as error:  # depends on the file that is damaged
+        problem = _first_line(error)
+    if iteration is None and iterations(folder)[-1:] != [chosen]:
+        return load(folder)
+    others = [other for other in known if other != chosen]
+    advice = f"use checkpoint {others[-1]}" if others else "begin again"
+    raise CheckpointError(
+        f"checkpoint {folder / str(chosen)} is damaged ({problem}); delete it to {advice}"
+    )
+
+
+def _restore(path: Path) -> tuple[Arrays, dict[str, Any]]:
+    items = ocp.args.Composite(state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore())
+    options = _this_process_alone()
+    handler = ocp.CompositeCheckpointHandler(
+        state=ocp.StandardCheckpointHandler(multiprocessing_options=options),
+        record=ocp.JsonCheckpointHandler(multiprocessing_options=options),
+    )
+    with ocp.Checkpointer(handler, multiprocessing_options=options) as checkpointer:
+        restored = checkpointer.restore(path, args=items)
+    return restored["state"], restored["record"]
 
 
 def digest(arrays: Arrays) -> str:

@@ -11,7 +11,7 @@ from agents.acting import policy_files
 from agents.acting.policy import Policy
 from agents.arrays import from_arrays
 from agents.networks.agent import PARTS, Agent
-from agents.runs.checkpoint import Checkpoints
+from agents.runs import checkpoint
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder
 from trap_tube_jax.imports import import_modules
 
@@ -52,8 +52,7 @@ def load_policies(
 def load_run(path: Path, iteration: int | None, imports: tuple[str, ...]) -> list[Policy]:
     """Loads the policies of a run from one of its checkpoints; see `load_policies`."""
     folder, run = RunFolder.open(path, imports)
-    with Checkpoints(folder.checkpoints) as checkpoints:
-        arrays, _ = checkpoints.load(iteration)
+    arrays, _ = checkpoint.load(folder.checkpoints, iteration)
     keys = jax.random.split(jax.random.key(0), run.seeds)
     expected = {"params": jax.eval_shape(jax.vmap(Agent(run.config).init), keys)}
     wanted = tuple(f"params/{part}/" for part in PARTS)

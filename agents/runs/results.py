@@ -1,5 +1,6 @@
 """Results of runs as one tidy table."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -55,10 +56,11 @@ def find_runs(paths: Paths) -> list[RunFolder]:
     """
     found: list[RunFolder] = []
     for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
-        configs = sorted(path.rglob(CONFIG_FILE))
-        if not configs:
+        walk = os.walk(path)  # unlike `rglob`, passes over folders that a writer deletes
+        runs = sorted(Path(folder) for folder, _, files in walk if CONFIG_FILE in files)
+        if not runs:
             raise ValueError(f"{path} holds no run")
-        found.extend(RunFolder(config.parent) for config in configs)
+        found.extend(map(RunFolder, runs))
     return found
 
 

@@ -29,8 +29,7 @@ from agents.parallel import processes
 from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
 from agents.ppo.memory import memory_estimate
-from agents.runs import report
-from agents.runs.checkpoint import CheckpointError, Checkpoints
+from agents.runs import checkpoint, report
 from agents.runs.display import ProgressLine
 from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows, make_evaluator
 from agents.runs.folder import Run, RunFolder
@@ -160,7 +159,7 @@ class Session:
         self.compile_seconds: float = record["compile_seconds"]
         self._last = {int(row["seed"]): row for row in record["last"]}
         self.state = self.placement.put(init(keys) if state is None else state)
-        self.checkpoints = Checkpoints(folder.checkpoints, keep=options.keep)
+        self.checkpoints = checkpoint.Checkpoints(folder.checkpoints, keep=options.keep)
         self.metrics = CsvLog(folder.metrics, last_iteration=self.iteration)
         self.evaluations = CsvLog(folder.evaluations, last_iteration=self.iteration)
         if len(self.metrics.rows) < self.iteration:
@@ -303,19 +302,15 @@ def restore(folder: Path, run: Run, shapes: TrainState) -> tuple[TrainState | No
     Raises:
       ValueError: the checkpoint is unusable, or of other settings.
     """
-    nothing = {"iteration": 0, "seconds": 0.0, "compile_seconds": 0.0, "last": []}
-    if not folder.is_dir():
-        return None, nothing
-    with Checkpoints(folder) as checkpoints:
-        if not checkpoints.iterations:
-            return None, nothing
-        arrays, record = checkpoints.load()
+    if not checkpoint.iterations(folder):
+        return None, {"iteration": 0, "seconds": 0.0, "compile_seconds": 0.0, "last": []}
+    arrays, record = checkpoint.load(folder)
     done = record["iteration"]
     try:
         run.check_continues(Run.from_dict(record["run"]))
         state = from_arrays(arrays, shapes)
     except (KeyError, ValueError) as error:
-        raise CheckpointError(
+        raise checkpoint.CheckpointError(
             f"checkpoint {done} in {folder} cannot be continued: {error}"
         ) from error
     for row in record["last"]:

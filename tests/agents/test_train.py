@@ -9,6 +9,7 @@ from concurrent import futures
 
 import pytest
 
+import agents
 from agents import evaluate
 from agents.config import PRESETS, Config
 from agents.runs import compilation
@@ -72,6 +73,21 @@ def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
     assert (process.returncode, errors) == (130, "")
     assert f"Stopped. Continue with: python -m agents.train --resume {path}" in output
     assert final_state(path)[0] == len(untimed(path)) >= 3
+
+
+@pytest.mark.slow
+def test_a_run_in_training_is_read_at_any_moment(tmp_path):
+    arguments = ["--iterations", 100_000, "--checkpoint-every", 1, "--keep", 1, "--out", tmp_path]
+    process = start("agents.train", *options(), *arguments, "--name", "x")
+    read_iterations(process, 2)
+    seen = set()
+    for _ in range(500):
+        seen.add(agents.load(tmp_path / "x").iteration)
+        agents.results(tmp_path)
+    assert process.poll() is None
+    assert len(seen) > 1
+    process.kill()
+    process.communicate()
 
 
 @pytest.mark.parametrize("vanishes", ["pipe", "folder"])

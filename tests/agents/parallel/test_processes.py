@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from agents.parallel import processes
-from agents.runs.checkpoint import Checkpoints
+from agents.runs import checkpoint
 from agents.runs.metrics import read_rows
 from agents.train import main
 from refusal import refused
@@ -38,8 +38,7 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
     assert "Stopped. Continue with: " in output
 
     folder = tmp_path / "joint"
-    with Checkpoints(folder / "checkpoints") as checkpoints:
-        (iteration,) = checkpoints.iterations
+    (iteration,) = checkpoint.iterations(folder / "checkpoints")
     episodes = [row["episodes"] for row in read_rows(folder / "metrics.csv")]
     assert episodes == [8 * done for done in range(1, iteration + 1)]
 
