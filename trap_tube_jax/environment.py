@@ -93,7 +93,10 @@ class Environment(ByValue):
         self.transfers = tuple(transfers)
         self.base = base_state() if base is None else _check_base(base)
         self._draw = compose(*self.transfers)
-        self._try_transfers()
+        own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
+        state, key = self.base, jax.random.key(0)
+        for transfer in self.transfers[: own[-1] + 1 if own else 0]:
+            state = _try_transfer(transfer, jax.random.clone(key), state)
 
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """Draws a task.
@@ -158,12 +161,6 @@ class Environment(ByValue):
     def __repr__(self) -> str:
         names = ", ".join(map(transfer_name, self.transfers))
         return f"{type(self).__name__}(transfers=({names}), max_steps={self.max_steps})"
-
-    def _try_transfers(self) -> None:
-        own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
-        state, key = self.base, jax.random.key(0)
-        for transfer in self.transfers[: own[-1] + 1 if own else 0]:
-            state = _try_transfer(transfer, jax.random.clone(key), state)
 
 
 def action_from_index(index: jax.typing.ArrayLike) -> jax.Array:

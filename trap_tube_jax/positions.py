@@ -5,7 +5,6 @@ determine the state, apart from time and flags.
 """
 
 import jax
-import jax.numpy as jnp
 
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import State
@@ -23,10 +22,3 @@ def position_id(state: State) -> jax.Array:
     cells = (state.agent, state.tool, state.food)
     agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
     return (agent * NUM_CELLS + tool) * NUM_CELLS + food
-
-
-def cells_at(position: jax.Array) -> jax.Array:
-    """Returns the cells u8[3, 2] of agent, tool and food at a position i32[]."""
-    agent_and_tool, food = jnp.divmod(position, NUM_CELLS)
-    cell = jnp.stack([*jnp.divmod(agent_and_tool, NUM_CELLS), food])
-    return jnp.stack([cell // BOARD_SIZE, cell % BOARD_SIZE], axis=1).astype(jnp.uint8)

@@ -19,6 +19,7 @@ import numpy as np
 
 from trap_tube_jax.checks import check_integer
 from trap_tube_jax.dynamics import holds_tool, step
+from trap_tube_jax.environment import check_actions
 from trap_tube_jax.geometry import unit_vector
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import (
@@ -107,21 +108,11 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
     """
     check_state(state)
     cell_size = check_integer("cell_size", cell_size)
-    actions = np.asarray(actions)
+    actions = np.atleast_1d(actions)
     if not actions.size:
         actions = np.zeros((0, 2), np.int32)
-    if actions.shape[1:] != (2,) or actions.dtype.kind not in "iu":
-        raise ValueError(
-            "actions must be integer[T, 2], (grasp, move) pairs, got "
-            f"{actions.dtype}{list(actions.shape)}"
-        )
-    in_range = ((actions >= 0) & (actions < NUM_DIRECTIONS)).all(axis=1)
-    wrong = actions[~in_range & (actions != NO_DIRECTION).any(axis=1)]
-    if len(wrong):
-        raise ValueError(
-            f"actions must be pairs of directions, each 0 to {NUM_DIRECTIONS - 1}, or "
-            f"({NO_DIRECTION}, {NO_DIRECTION}), got {tuple(wrong[0].tolist())}"
-        )
+    is_padding = (actions == NO_DIRECTION).all(axis=-1, keepdims=True)
+    check_actions(np.where(is_padding, 0, actions), (len(actions), 2))
     return np.asarray(_episode_frames(state, actions.astype(np.int32), cell_size=cell_size))
 
 

@@ -16,8 +16,9 @@ from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.environment import action_from_index
+from trap_tube_jax.geometry import cell_of
 from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
-from trap_tube_jax.positions import NUM_POSITIONS, cells_at, position_id
+from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, position_id
 from trap_tube_jax.state import State, validate
 
 Record = TypeVar("Record")
@@ -200,8 +201,9 @@ def _expand(layout: State, nodes: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _state_at(layout: State, node: jax.Array) -> State:
     """Returns the state of a node i32[], on the board and with the tool of `layout`."""
-    agent, tool, food = cells_at(node).astype(jnp.int32)
-    return layout.replace(agent=agent, tool=tool, food=food)
+    agent_and_tool, food = jnp.divmod(node, NUM_CELLS)
+    agent, tool = jnp.divmod(agent_and_tool, NUM_CELLS)
+    return layout.replace(agent=cell_of(agent), tool=cell_of(tool), food=cell_of(food))
 
 
 def _to_plan(indices: np.ndarray | None) -> Plan:
