@@ -47,9 +47,11 @@ def test_draws_are_those_of_jax():
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
-def test_fold_in_gives_the_key_of_jax(impl):
+def test_keys_of_every_kind_keep_their_draws(impl):
     key = jax.random.key(5, impl=impl)
     assert_same(fold_in(key, 3), jax.random.fold_in(key, 3))
+    with jax.threefry_partitionable(impl == "rbg"):
+        assert loop_free(key).dtype == key.dtype
 
 
 @pytest.mark.parametrize("transfer", [tt.perceptual, tt.structural, tt.symbolic])
@@ -57,13 +59,6 @@ def test_the_transfers_draw_without_loops(transfer):
     """The environment's reset is as fast as its draws."""
     env = tt.Environment((transfer,))
     assert "while" not in jax.jit(env.reset).lower(jax.random.key(0)).as_text()
-
-
-def test_other_kinds_of_keys_keep_their_draws():
-    rbg = jax.random.key(0, impl="rbg")
-    assert loop_free(rbg).dtype == rbg.dtype
-    with jax.threefry_partitionable(False):
-        assert loop_free(jax.random.key(0)).dtype == jax.random.key(0).dtype
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])

@@ -87,12 +87,6 @@ def test_a_tool_may_reach_the_last_cell(extent):
     np.testing.assert_array_equal(state.tool, corner)
 
 
-def test_states_can_be_built_while_tracing():
-    """A layout written inside a jitted function is a constant of it."""
-    time = jax.jit(lambda: tt.base_state().replace(time=jnp.int32(7)).time)()
-    assert time == 7
-
-
 # Arrays in place of the good ones, and the message's words.
 BAD_ARRAYS = [
     ({"board": BOARD[1:]}, ["board", "[12, 12]", "[11, 12]"]),
