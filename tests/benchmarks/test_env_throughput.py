@@ -5,40 +5,58 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from benchmarks import env_throughput, harness, peers
 from benchmarks.env_throughput import PATTERNS, StepOptions, Subject
+from trap_tube_jax import VectorState
+
+
+def counter(name, *, plain=False):
+    """A cheap subject that shows how often it was stepped, three times in float32."""
+    del plain
+
+    def observe(count):
+        return count, jnp.broadcast_to(count.astype(jnp.float32)[:, None], (len(count), 3))
+
+    return Subject(
+        name,
+        reset=lambda keys: observe(jnp.zeros(len(keys), jnp.int32)),
+        step=lambda count, actions: observe(count + actions),
+        sample_actions=lambda key, shape: jnp.ones(shape, jnp.int32),
+    )
 
 
 def test_measures_every_set_batch_and_pattern(timed, monkeypatch):
     monkeypatch.setattr(env_throughput, "copy_bandwidth", lambda: 1e9)
+    monkeypatch.setattr(env_throughput, "task_set_subject", counter)
     options = env_throughput.Options(
         sets=("base", "sy"), num_envs=(2, 4), num_steps=3, repeats=3, patterns=("sum", "last")
     )
     results = env_throughput.main(options)
     measured = [(each.name, each.num_envs, each.pattern) for each in results]
     assert measured == list(itertools.product(("base", "sy"), (2, 4), ("sum", "last")))
-    assert {each.observation_bytes for each in results} == {12 * 12 * 3}
+    assert {each.observation_bytes for each in results} == {3 * 4}
     assert {each.timing for each in results} == {harness.Timing(7, 2, 1, 3)}
     assert results[2].steps_per_s == 4 * 3 / 2
 
 
 def test_folds_every_observation(timed):
-    observed = jnp.array((0, 1, 2, 3, 4), jnp.float32)
-
-    def observe(count):
-        return count, jnp.broadcast_to(observed[count][:, None], (len(count), 3))
-
-    subject = Subject(
-        "counter",
-        reset=lambda keys: observe(jnp.zeros(len(keys), jnp.int32)),
-        step=lambda count, actions: observe(count + actions),
-        sample_actions=lambda key, shape: jnp.ones(shape, jnp.int32),
-    )
-    result = env_throughput.measure_throughput(subject, 2, StepOptions(num_steps=4, repeats=1))
+    options = StepOptions(num_steps=4, repeats=1)
+    result = env_throughput.measure_throughput(counter("counter"), 2, options)
     assert result.observation_bytes == 3 * 4
     folded = 0x3F800000 ^ 0x40000000 ^ 0x40400000 ^ 0x40800000
     assert timed[0][1].tolist() == [[[folded] * 3] * 2], "on one device, in two environments"
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_task_set_steps_by_the_vector_environment_or_by_vmap(plain):
+    subject = env_throughput.task_set_subject("base", plain=plain)
+    state, _ = jax.eval_shape(subject.reset, jax.random.split(jax.random.key(0), 2))
+    actions = subject.sample_actions(jax.random.key(1), (2,))
+    state, timestep = jax.eval_shape(subject.step, state, actions)
+    assert isinstance(state, VectorState) != plain
+    assert subject.observe(timestep).shape == (2, 12, 12, 3)
 
 
 def test_patterns_compute_what_they_say():
