@@ -1,7 +1,4 @@
-"""Figures of a grid's results, legible at 830 pixels.
-
-Source: the paper's figures of experiments 1 and 2.
-"""
+"""Figures of a grid's results, after the paper's figures of experiments 1 and 2."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,10 +16,9 @@ COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#00
 
 
 def save(root: Path, results: Frame, curves: Frame, about: Mapping[str, Any]) -> list[Path]:
-    """Writes the figures that the results allow; arguments as in `tables.tables`.
+    """Writes the figures that the results allow, and returns their files.
 
-    Returns:
-      The files.
+    The arguments are those of `tables.tables`.
     """
     names, tested = list(curves["algorithm"].unique()), tables.reported(results)
     drawn = {}
@@ -71,11 +67,9 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
         for row, each in enumerate(values):
             axis.plot(each, [row] * len(each), "o", color=COLORS[0], alpha=0.7, markersize=4)
         if column in tables.PAPER_SETS:
-            known = [
-                [row[tables.PAPER_SETS.index(column)] for row in own] for own in paper.values()
-            ]
-            for row, (mean, sd) in enumerate(known, len(values)):
-                axis.barh(row, mean, xerr=sd, color="#BBBBBB", error_kw={"lw": 1})
+            place = tables.PAPER_SETS.index(column)
+            for row, (means, sds) in enumerate(paper.values(), len(values)):
+                axis.barh(row, means[place], xerr=sds[place], color="#BBBBBB", error_kw={"lw": 1})
         axis.set_xlim(-6, 106)
         axis.set_xticks([0, 50, 100])
     axes[0].set_yticks(range(len(names)), names)

@@ -1,7 +1,4 @@
-"""Grids of settings and seeds: the options of their commands, and the named grids.
-
-Source of `exp1` and `exp2`: the paper's section "Results".
-"""
+"""Grids of settings and seeds: the options of their commands, and the named grids."""
 
 import dataclasses
 import itertools
@@ -74,11 +71,7 @@ class Grid:
     points: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=lambda: {"": {}})
 
     def runs(self, name: str, options: Options) -> dict[Path, Run]:
-        """Returns the runs by their folders, seed after seed.
-
-        Args:
-          name: the grid's name, with which its folder's begins.
-          options: the command line.
+        """Returns the runs by their folders, seed after seed; the grid's begins with `name`.
 
         Raises:
           ValueError: an option is not allowed, or a stored run has other settings.
@@ -149,31 +142,26 @@ def _value(text: str) -> Any:
         return text
 
 
+# Source of `exp1` and `exp2`: the paper's section "Results".
 PAPER_POINTS = {"ppo": {"curiosity": "none"}, "ppo+icm": {"curiosity": "icm"}}
+PAPER_RUN = RunOptions(evaluate_every=1, reported=1000)
+BEST_RUN = RunOptions(evaluate_every=20, reported=1000)
 CURIOSITIES = ("icm", "icm-detached", "rnd", "noveld", "ride", "e3b", "effects")
 
 GRIDS = {
     "exp1": Grid(
-        Options(preset="paper", env="base", seeds=5),
-        RunOptions(evaluate_every=1, reported=1000),
-        {"iterations": 250},
-        PAPER_POINTS,
+        Options(preset="paper", env="base", seeds=5), PAPER_RUN, {"iterations": 250}, PAPER_POINTS
     ),
     "exp2": Grid(
-        Options(preset="paper", env="pstsy", seeds=5),
-        RunOptions(evaluate_every=1, reported=1000),
-        {"iterations": 500},
-        PAPER_POINTS,
+        Options(preset="paper", env="pstsy", seeds=5), PAPER_RUN, {"iterations": 500}, PAPER_POINTS
     ),
     "fast": Grid(
         Options(preset="fast", env="base", seeds=10), RunOptions(evaluate_every=100, reported=1000)
     ),
-    "best": Grid(
-        Options(preset="best", env="pstsy", seeds=5), RunOptions(evaluate_every=20, reported=1000)
-    ),
+    "best": Grid(Options(preset="best", env="pstsy", seeds=5), BEST_RUN),
     "curiosities": Grid(
         Options(preset="best", env="pstsy", seeds=2),
-        RunOptions(evaluate_every=20, reported=1000),
+        BEST_RUN,
         {"iterations": 312},
         {
             "ppo": {"curiosity": "none"},

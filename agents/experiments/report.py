@@ -2,13 +2,12 @@
 
 A grid's folder holds results.csv (rows of `agents.results`), curves.csv (metrics by iteration) and
 grid.json (title, command, settings that all runs share, machines). table.md and the figures are
-functions of these three, so that a folder of results is drawn again from them alone.
+drawn from these three alone.
 """
 
 import itertools
 import sys
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -59,22 +58,17 @@ def write(root: Path) -> str:
     about = read_json(root / "grid.json")
     found = tables.tables(results, curves, about)
     parts = [f"**{heading}**\n\n{tables.markdown(table)}" for heading, table in found.items()]
-    parts += [tables.NOTE, f"`{about['command']}`", *map(_machine, about["machines"])]
-    write_text(root / "table.md", "\n\n".join([f"# {about['title']}", *parts]) + "\n")
-    drawn = figures.save(root, results, curves, about)
-    shown = [
-        f"{heading}\n{table.to_string(line_width=WIDTH)}"
-        for heading, table in list(found.items())[:2]
-    ]
-    files = [str(path) for path in (root / "results.csv", root / "table.md", *drawn)]
-    return "\n\n".join([*shown, "\n".join(files)])
-
-
-def _machine(machine: dict[str, Any]) -> str:
-    return (
+    parts += [tables.NOTE, f"`{about['command']}`"]
+    parts += [
         f"{machine['cores']} core(s) of {machine['processor']}, {machine['device']}; "
         f"jax {machine['jax']}, commit `{machine['commit']}`."
-    )
+        for machine in about["machines"]
+    ]
+    write_text(root / "table.md", "\n\n".join([f"# {about['title']}", *parts]) + "\n")
+    drawn = figures.save(root, results, curves, about)
+    shown = [f"{name}\n{found[name].to_string(line_width=WIDTH)}" for name in list(found)[:2]]
+    files = map(str, (root / "results.csv", root / "table.md", *drawn))
+    return "\n\n".join([*shown, "\n".join(files)])
 
 
 if __name__ == "__main__":

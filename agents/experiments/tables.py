@@ -39,8 +39,7 @@ def tables(results: Frame, curves: Frame, about: Mapping[str, Any]) -> dict[str,
 
     Args:
       results: rows of `agents.results`; records also have a column `optimality`.
-      curves: rows of metrics: algorithm, seed, iteration, episodes, transitions, seconds,
-        success and evaluation.
+      curves: rows of metrics, with the columns of `report.CURVES`.
       about: `train_set`, which decides the paper's table to compare with, and `threshold`, the
         share of its validation tasks that counts as solved.
     """
@@ -65,11 +64,10 @@ def reported(results: Frame) -> Frame:
 def by_set(tested: Frame) -> Frame:
     """Returns percent solved by algorithm and seed, a column per set and one for their mean."""
     table = tested.pivot(index=["algorithm", "seed"], columns="task_set", values="percent")
-    first = dict.fromkeys(tested["algorithm"])
     order = [name for name in ALL_SETS if name in table]
     table = table[[*order, *(name for name in table if name not in order)]]
     table[MEAN] = table.drop(columns="base", errors="ignore").mean(axis=1)
-    return table.reindex(list(first), level="algorithm")
+    return table.reindex(tested["algorithm"].unique(), level="algorithm")
 
 
 def training_table(curves: Frame, threshold: float, with_paper: bool) -> Frame:
@@ -88,9 +86,8 @@ def training_table(curves: Frame, threshold: float, with_paper: bool) -> Frame:
 
 def success_table(tested: Frame, with_paper: bool) -> Frame:
     """Returns percent solved: a row per set, a column per algorithm."""
-    layouts = (
-        tested.groupby(["algorithm", "task_set"])[["layouts", "layouts_total"]].mean().dropna()
-    )
+    by_task_set = tested.groupby(["algorithm", "task_set"])
+    layouts = by_task_set[["layouts", "layouts_total"]].mean().dropna()
     columns: dict[Any, dict[str, str]] = {}
     for name, own in by_set(tested).groupby("algorithm", sort=False):
         columns[name] = {}
@@ -125,24 +122,13 @@ def optimality_table(tested: Frame) -> Frame:
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:
-    """Returns the mean of the known values and its interval, clipped to [0, high].
-
-    One value has no interval.
-    """
+    """Returns the mean of the known values and, of several, its interval within [0, high]."""
     values = values[~np.isnan(values)]
-    if not len(values):
-        return NOTHING
-    text = format(values.mean(), form)
-    if len(values) == 1:
-        return text
-    margin = margin_of(values)
+    if len(values) < 2:
+        return format(values[0], form) if len(values) else NOTHING
+    margin = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
     low, top = max(0, values.mean() - margin), min(high, values.mean() + margin)
-    return f"{text} [{low:{form}}, {top:{form}}]"
-
-
-def margin_of(values: Any) -> Any:
-    """Returns half the width of the 95 % interval of the mean over the first axis, of 2 or more."""
-    return stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
+    return f"{values.mean():{form}} [{low:{form}}, {top:{form}}]"
 
 
 def markdown(table: Frame) -> str:

@@ -31,20 +31,15 @@ class ProcessPerCall(ThreadPoolExecutor):
         """Schedules a call; function, arguments and result are pickled."""
         return super().submit(self._call, function, *args, **kwargs)
 
-    def _call(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    def _call(self, *call: Any, **kwargs: Any) -> Any:
         threads = max(1, _cores() // self._max_workers)
         with ProcessPoolExecutor(1, SPAWN, _begin, (threads,)) as pool:
-            return pool.submit(function, *args, **kwargs).result()
+            return pool.submit(*call, **kwargs).result()
 
 
 @contextlib.contextmanager
 def make_executor(processes: int | None, cluster: str | None) -> Iterator[Executor]:
-    """Makes the executor of a grid's runs.
-
-    Args:
-      processes: runs at a time on this machine; None for one per core, or for one alone where
-        JAX has other devices than the CPU.
-      cluster: address of a Dask scheduler; None for this machine.
+    """Makes the executor of a grid's runs; the arguments are fields of `grids.Options`.
 
     Raises:
       ValueError: `processes` is below 1, or Dask is not installed.
@@ -67,11 +62,7 @@ def make_executor(processes: int | None, cluster: str | None) -> Iterator[Execut
 
 
 def train_logged(path: Path, run: Run, options: RunOptions, stop_file: Path) -> str:
-    """Trains a run in this process; its output goes to a file next to its folder.
-
-    Returns:
-      `done`, `stopped`, or what has failed.
-    """
+    """Trains a run, logs it next to its folder, and returns `done`, `stopped` or an error."""
     if stop_file.exists():
         return "stopped"
     with log_of(path).open("a", buffering=1, encoding="utf-8") as log:
@@ -94,7 +85,6 @@ def log_of(path: Path) -> Path:
 
 
 def _begin(threads: int) -> None:
-    """Limits the threads of a training process, and decides what ends it."""
     os.environ.setdefault("NPROC", str(threads))  # for XLA, which starts one per core
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C arrives by the stop file
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -29,10 +29,7 @@ SEEDS, EPISODES = "seeds", "episodes"  # axes of the mesh
 
 
 def become_devices(devices: int | None) -> None:
-    """Makes the CPU appear as several devices; call it before JAX starts.
-
-    JAX_NUM_CPU_DEVICES takes precedence.
-    """
+    """Splits the CPU into devices, unless JAX_NUM_CPU_DEVICES does; call it before JAX starts."""
     if devices is not None and devices > 1 and jax.config.values["jax_num_cpu_devices"] < 0:
         with contextlib.suppress(RuntimeError):  # JAX has started: `Placement.of` says what it has
             jax.config.update("jax_num_cpu_devices", devices)
@@ -40,11 +37,7 @@ def become_devices(devices: int | None) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeAxis:
-    """Devices that share the episodes of a seed; on one device every method is the identity.
-
-    Attributes:
-      size: devices along the mesh axis `episodes`.
-    """
+    """The `size` devices that share a seed's episodes; on one every method is the identity."""
 
     size: int = 1
 
@@ -52,11 +45,8 @@ class EpisodeAxis:
         """Averages floats over the devices; integers are the same on all and stay."""
         if self.size == 1:
             return tree
-
-        def mean(x: jax.Array) -> jax.Array:
-            return jax.lax.pmean(x, EPISODES) if jnp.issubdtype(x.dtype, jnp.floating) else x
-
-        return jax.tree.map(mean, tree)
+        is_float = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
+        return jax.tree.map(lambda x: jax.lax.pmean(x, EPISODES) if is_float(x) else x, tree)
 
     def part(self, x: jax.Array) -> jax.Array:
         """Returns this device's rows i, i + size, i + 2 size, ... of `x` [B, ...]."""
@@ -80,22 +70,15 @@ ONE_DEVICE = EpisodeAxis()
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """The devices of a run.
-
-    Attributes:
-      mesh: devices, seeds × episodes; None for the default device alone.
-    """
+    """The devices of a run: a mesh, seeds × episodes; None for the default device alone."""
 
     mesh: Mesh | None = None
 
     @classmethod
     def of(cls, devices: int | None, config: Config, seeds: int) -> Self:
-        """Chooses the devices of a run.
+        """Places seeds trained side by side on a number of devices over all processes.
 
-        Args:
-          devices: devices over all processes; None for one, or for all of several processes.
-          config: settings of the run.
-          seeds: seeds trained side by side.
+        None is one device, or all of several processes.
 
         Raises:
           ValueError: the devices do not exist, or do not divide the minibatches.
@@ -117,7 +100,7 @@ class Placement:
 
     @property
     def axis(self) -> EpisodeAxis:
-        """Devices that share the episodes of a seed."""
+        """The devices that share a seed."""
         return EpisodeAxis(1 if self.mesh is None else self.mesh.shape[EPISODES])
 
     def shard(self, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -51,19 +51,14 @@ class Job:
             ) from error
 
 
-def count() -> int:
-    """Returns the number of processes."""
-    return jax.process_count() if jax.distributed.is_initialized() else 1
-
-
 def is_first() -> bool:
     """Returns whether this process writes and reports."""
-    return count() == 1 or jax.process_index() == 0
+    return not jax.distributed.is_initialized() or jax.process_index() == 0
 
 
 def agree(number: int | None) -> int | None:
     """Returns the largest number of any process, None if all have None or 0; all must call it."""
-    if count() == 1:
+    if not jax.distributed.is_initialized():
         return number
     return int(np.max(multihost_utils.process_allgather(np.int32(number or 0)))) or None
 

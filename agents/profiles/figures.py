@@ -7,13 +7,11 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from agents.experiments.figures import COLORS, WIDTH
 from agents.profiles.tasks import PARTS, Sampling
 from trap_tube_jax.rendering import render
 from trap_tube_jax.solver.search import take
 
-WIDTH = 8.3  # inches, at matplotlib's 100 pixels per inch
-# Okabe and Ito's palette, which readers with deuteranopia can tell apart.
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#000000")
 MARKERS = "osD^vPX"
 PANELS = {  # part, and the label of its x axis
     "structural": "strength of the structural transfer",
@@ -27,9 +25,7 @@ COLUMNS = 7  # of the sheet of controls
 def save_success(profile: pd.DataFrame, path: Path) -> None:
     """Draws success by strength of transfer and by plan length as PNG, with 95 % intervals.
 
-    Args:
-      profile: as `measure.profile` returns it, with at least one part of `PANELS`.
-      path: the file to write.
+    `profile` is that of `measure.profile`, with at least one part of `PANELS`.
     """
     parts = [part for part in PANELS if part in set(profile["part"])]
     rows = -(-len(parts) // 2)
@@ -40,7 +36,7 @@ def save_success(profile: pd.DataFrame, path: Path) -> None:
             groups = own.query("part == @part")
             x = groups["plan"] if part == "plan-length" else groups["level"].astype(float)
             share = groups["solved"] / groups["tasks"]
-            style = {"color": COLOURS[index % 7], "marker": MARKERS[index % 7], "label": policy}
+            style = {"color": COLORS[index % 7], "marker": MARKERS[index % 7], "label": policy}
             axis.errorbar(x, share, _margins(groups), capsize=2, clip_on=False, **style)
         axis.set(xlabel=PANELS[part], ylim=(0, 1))
         axis.grid(alpha=0.3)
@@ -56,9 +52,7 @@ def save_success(profile: pd.DataFrame, path: Path) -> None:
 def save_controls(profile: pd.DataFrame, path: Path) -> None:
     """Draws the board of each control as PNG, and below it a heat map of success by policy.
 
-    Args:
-      profile: as `measure.profile` returns it, with the part "control".
-      path: the file to write.
+    `profile` is that of `measure.profile`, with the part "control".
     """
     tasks, levels = PARTS["control"](Sampling((), 1, 3))
     policies = list(dict.fromkeys(profile["policy"]))
@@ -90,12 +84,11 @@ def _margins(groups: pd.DataFrame) -> np.ndarray:
 
     Groups of a single task have no interval.
     """
-    counts = [*zip(groups["solved"], groups["tasks"], strict=True)]
     ends = [
         binomtest(solved, tasks).proportion_ci(method="wilson") if tasks > 1 else 2 * (solved,)
-        for solved, tasks in counts
+        for solved, tasks in zip(groups["solved"], groups["tasks"], strict=True)
     ]
-    return np.abs(np.transpose(ends) - [solved / tasks for solved, tasks in counts])
+    return np.abs(np.transpose(ends) - (groups["solved"] / groups["tasks"]).to_numpy())
 
 
 def _figure(height: float) -> Any:

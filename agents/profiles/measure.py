@@ -32,7 +32,7 @@ def profile(
 
     Args:
       policies: by the name to show; all see the same number of feature channels.
-      parts: what to measure, names of `tasks.PARTS`.
+      parts: names of `tasks.PARTS`.
       strengths: of the graded transfers, from 0 (the base task) to 1 (the paper's transfer).
       num_tasks: tasks of each strength and symbolic swap, and of the other draws from {P}.
 
@@ -79,8 +79,7 @@ def _play(
     name: str, policy: Policy, parts: Mapping[str, Part], plans: Mapping[str, np.ndarray]
 ) -> pd.DataFrame:
     """Plays all parts with a policy; returns a row for each episode."""
-    limit = policy.config.step_limit("base")
-    config = dataclasses.replace(policy.config, max_steps=limit)
+    config = dataclasses.replace(policy.config, max_steps=policy.config.step_limit("base"))
     evaluator = Evaluator(config, {part: drawn.tasks for part, drawn in parts.items()})
     frames = []
     for part, played in evaluator(policy.params).items():

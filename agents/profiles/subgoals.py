@@ -12,6 +12,8 @@ from trap_tube_jax.state import State
 # left its first cell. Food out: the agent could walk to the food without moving the tool.
 SUBGOALS = ("none", "tool touched", "tool moved", "food moved", "food out")
 
+_step = jax.jit(jax.vmap(dynamics.step))
+
 
 def last_subgoals(tasks: State, actions: np.ndarray) -> np.ndarray:
     """Returns i32[B], the index in `SUBGOALS` of the last subgoal that each episode reached.
@@ -20,7 +22,11 @@ def last_subgoals(tasks: State, actions: np.ndarray) -> np.ndarray:
       tasks: B states at time 0.
       actions: i32[B, T, 2], (grasp, move); actions after the end of an episode change nothing.
     """
-    agent, tool, food = _replay(tasks, actions)
+    states = [tasks]
+    for action in np.moveaxis(actions, 1, 0):
+        states.append(_step(states[-1], action))
+    cells = [np.stack([each.agent, each.tool, each.food]) for each in states]
+    agent, tool, food = np.stack(cells, axis=2)  # i32[B, T + 1, 2] each
     extent = np.asarray(tasks.tool_extent)[:, None]
     at_hand = _covers(tool[:, :-1], extent, agent[:, :-1] + DIRECTIONS[actions[..., 0]])
     is_inside = _covers(tool[:, :-1], extent, agent[:, :-1])
@@ -34,24 +40,11 @@ def last_subgoals(tasks: State, actions: np.ndarray) -> np.ndarray:
     return np.max(np.arange(len(SUBGOALS))[:, None] * reached, axis=0)
 
 
-def _replay(tasks: State, actions: np.ndarray) -> np.ndarray:
-    """Returns i32[3, B, T + 1, 2], the cells of agent, tool and food along B episodes."""
-    states = [tasks]
-    for action in np.moveaxis(actions, 1, 0):
-        states.append(_step(states[-1], action))
-    return np.stack([np.stack([each.agent, each.tool, each.food]) for each in states], axis=2)
-
-
-_step = jax.jit(jax.vmap(dynamics.step))
-
-
 def _walks_to_food(board: np.ndarray, extent: np.ndarray, *cells: np.ndarray) -> np.ndarray:
     """Returns bool[B, T]: the agent can walk to the food with the tool left in its place.
 
-    Args:
-      board: u8[B, 12, 12].
-      extent: i32[B, 1, 2], the tool's.
-      cells: of agent, tool and food, i32[B, T, 2] each.
+    `board` is u8[B, 12, 12], the tool's `extent` i32[B, 1, 2], and the `cells` of agent, tool and
+    food i32[B, T, 2].
     """
     every = np.moveaxis(np.indices((BOARD_SIZE, BOARD_SIZE)), 0, -1)
     agent, tool, food = (x[:, :, None, None] for x in cells)

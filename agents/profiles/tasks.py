@@ -1,7 +1,4 @@
-"""The tasks of a profile, in parts.
-
-Sources: graded.md and controls.md of `trap_tube_jax`.
-"""
+"""The tasks of a profile, in parts. Sources: graded.md and controls.md of `trap_tube_jax`."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -48,9 +45,8 @@ class Sampling(NamedTuple):
 def layout_kinds(tasks: State) -> list[str]:
     """Names how food and tool are placed in each of B tasks of {P}.
 
-    Returns:
-      For each task, whether the food leaves the tube "away" from the agent, "towards" it or
-      "sideways", then whether the tool is "along" this way or "across" it.
+    The food leaves the tube "away" from the agent, "towards" it or "sideways"; the tool is "along"
+    this way or "across" it.
     """
     parts = map(np.asarray, (tasks.board, tasks.agent, tasks.tool_extent))
     found = []
@@ -67,7 +63,6 @@ def layout_kinds(tasks: State) -> list[str]:
 
 
 def _graded(grades: Sequence[Callable[[float], Transfer]], sampling: Sampling) -> Part:
-    """Applies graded transfers, in groups by strength."""
     drawn = {}
     for strength in sampling.strengths:
         transfers = [grade(strength) for grade in grades]
@@ -82,13 +77,12 @@ def _symbolic(sampling: Sampling) -> Part:
     return _join({OBJECT_NAMES[code]: swap(tasks, jnp.asarray(code)) for code in SYMBOLIC_OBJECTS})
 
 
-def _kind(sampling: Sampling) -> Part:
+def _perceptual(levels: Callable[[State], Sequence[str] | None], sampling: Sampling) -> Part:
     tasks = _draw((tt.perceptual,), sampling)
-    return Part(tasks, layout_kinds(tasks))
+    return Part(tasks, levels(tasks))
 
 
 def _control(sampling: Sampling) -> Part:
-    """Lists the layouts of all controls, in the base task's colours."""
     palette = jnp.asarray(tt.base_palette(sampling.num_features))
     made = {"base": _draw((), sampling)}
     for layouts in CONTROLS:
@@ -104,8 +98,8 @@ PARTS: dict[str, Callable[[Sampling], Part]] = {
     "perceptual": partial(_graded, (tt.graded_perceptual,)),
     "both": partial(_graded, (tt.graded_perceptual, tt.graded_structural)),
     "symbolic": _symbolic,
-    "kind": _kind,
-    "plan-length": lambda sampling: Part(_draw((tt.perceptual,), sampling), None),
+    "kind": partial(_perceptual, layout_kinds),
+    "plan-length": partial(_perceptual, lambda tasks: None),
     "control": _control,
 }
 
@@ -116,6 +110,5 @@ def _draw(transfers: Sequence[Transfer], sampling: Sampling) -> State:
 
 
 def _join(groups: dict[str, State]) -> Part:
-    """Concatenates the tasks of named groups."""
     tasks = jax.tree.map(lambda *parts: np.concatenate(parts), *groups.values())
     return Part(tasks, [name for name, states in groups.items() for _ in states.time])

@@ -19,4 +19,4 @@ def test_success_is_drawn_from_0_to_1_with_a_colour_for_each_policy(tmp_path, mo
     assert all(axis.get_ylim() == (0, 1) for axis in shown)
     assert shown[0].get_ylabel()
     colours = [[lines.lines[0].get_color() for lines in axis.containers] for axis in shown]
-    assert colours == [list(figures.COLOURS[:2])] * 3
+    assert colours == [list(figures.COLORS[:2])] * 3
