@@ -5,14 +5,15 @@ Source of the `paper` preset: agents/agent.md.
 
 import dataclasses
 import difflib
-import functools
 import math
+from functools import partial
 from typing import Any, Literal, Self, get_args, get_origin
 
 from agents import registry
 from trap_tube_jax.registry import task_set
 
 LARGEST = 2**31 - 1  # of an i32, in which training counts
+GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
 
 def _setting(group: str, default: Any, low: float | None = None, high: float = LARGEST) -> Any:
@@ -21,12 +22,7 @@ def _setting(group: str, default: Any, low: float | None = None, high: float = L
     return dataclasses.field(default=default, metadata={"group": group, "limits": limits})
 
 
-_task = functools.partial(_setting, "task")
-_length = functools.partial(_setting, "length of training")
-_ppo = functools.partial(_setting, "PPO")
-_curiosity = functools.partial(_setting, "curiosity")
-_replay = functools.partial(_setting, "replay of failed tasks")
-_network = functools.partial(_setting, "network")
+_task, _length, _ppo, _curiosity, _replay, _network = (partial(_setting, name) for name in GROUPS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,18 +33,15 @@ class Config:
       env_id: task set to train on, by id or short name.
       num_features: N, feature channels of the observation; 3 is RGB.
       max_steps: steps before an episode is truncated; None keeps the task set's limit.
-
       iterations: rollouts to train for, at most. Schedules span this number.
       max_transitions: environment steps to train for, at most; training stops before an iteration
         that could exceed it. None sets no limit.
       stop_when_solved: solved fraction at which a seed stops. Counts the validation tasks of
         `env_id`, played greedily; 0 never stops early.
       eval_episodes: fixed evaluation tasks per task set.
-
       episodes_per_iteration: episodes played per iteration.
       epochs: passes over the episodes of an iteration.
       minibatch_size: whole episodes per gradient step; divides `episodes_per_iteration`.
-
       discount: gamma.
       gae_lambda: lambda of the advantage estimates.
       bootstrap: value after an episode's last step. `value`: 0 after termination, the
@@ -59,13 +52,11 @@ class Config:
       clip_eps: half-width of the interval of probability ratios.
       value_coef: weight of the squared value error.
       entropy_coef: weight of the entropy bonus. Entropy is summed over grasp and move.
-
       learning_rate: Adam's step size.
       lr_decay_fraction: final fraction of training that decays the step size. It decays
         geometrically to a fiftieth.
       adam_epsilon: Adam's epsilon.
       max_gradient_norm: global norm of clipped gradients.
-
       curiosity: intrinsic reward, by its registered name. README.md lists them.
       intrinsic_coef: weight of the intrinsic reward. The reward is normalised; with separate value
         heads its advantage is weighted instead.
@@ -78,10 +69,8 @@ class Config:
         and the normalised advantages are added (`agents.ppo.advantages`).
       reward_ema_decay: decay of the moving moments of both rewards. They normalise the rewards;
         the rates of `effects` decay alike.
-
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: newest failed tasks kept for each of them.
-
       align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
@@ -137,11 +126,7 @@ class Config:
     encode_chunk_size: int = _network(64, 1, 1_000_000)
 
     def __post_init__(self) -> None:
-        """Checks the settings.
-
-        Raises:
-          ValueError: a setting is not allowed; the message names its value and the allowed ones.
-        """
+        """Raises ValueError for a setting that is not allowed, with its value and what is."""
         for field in dataclasses.fields(self):
             if isinstance(getattr(self, field.name), list):  # as JSON has it
                 object.__setattr__(self, field.name, tuple(getattr(self, field.name)))
@@ -159,9 +144,8 @@ class Config:
             )
         if self.num_new < 1:
             raise ValueError(
-                "replay_fractions must leave at least one of "
-                f"{self.episodes_per_iteration} episodes "
-                f"to new tasks, got {self.replay_fractions}"
+                f"replay_fractions must leave at least one of {self.episodes_per_iteration} "
+                f"episodes to new tasks, got {self.replay_fractions}"
             )
         if self.max_transitions is not None and self.max_transitions < self.longest_iteration:
             raise ValueError(
@@ -240,43 +224,40 @@ class Config:
         return self.epochs * (self.episodes_per_iteration // self.minibatch_size)
 
 
+PAYS_FOR_EFFECTS = {
+    "epochs": 4,
+    "discount": 0.98,
+    "bootstrap": "value",
+    "value_coef": 0.5,
+    "entropy_coef": 5e-3,
+    "curiosity": "effects",
+    "value_heads": "separate",
+}
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
-    # Solves the base task within a minute: pays for new effects.
+    # Solves the base task within a minute.
     "fast": {
+        **PAYS_FOR_EFFECTS,
         "iterations": 100,
         "stop_when_solved": 1.0,
         "episodes_per_iteration": 256,
-        "epochs": 4,
         "minibatch_size": 32,
-        "discount": 0.98,
-        "bootstrap": "value",
-        "value_coef": 0.5,
-        "entropy_coef": 5e-3,
         "learning_rate": 2e-3,
-        "curiosity": "effects",
         "intrinsic_coef": 2.0,
-        "value_heads": "separate",
         "filters": (8, 16),
     },
-    # Learns {P, St, Sy}: pays for new effects, replays failed tasks, encodes objects.
+    # Learns {P, St, Sy}: replays failed tasks and encodes objects.
     "best": {
+        **PAYS_FOR_EFFECTS,
         "env_id": "pstsy",
         "iterations": 1150,
         "max_transitions": 25_600_000,
         "episodes_per_iteration": 512,
-        "epochs": 4,
         "minibatch_size": 64,
-        "discount": 0.98,
-        "bootstrap": "value",
-        "value_coef": 0.5,
-        "entropy_coef": 5e-3,
         "lr_decay_fraction": 0.45,
-        "curiosity": "effects",
         "intrinsic_coef": 0.03,
         "intrinsic_coef_init": 3.0,
         "intrinsic_anneal_fraction": 0.8,
-        "value_heads": "separate",
         "replay_fractions": (0.0625, 0.125, 0.75),
         "align_to_food": True,
         "encoder": "objects",
@@ -295,12 +276,12 @@ def _check_value(field: dataclasses.Field, value: Any) -> None:
     if field.metadata["limits"] is None or (value is None and field.default is None):
         return
     low, high = field.metadata["limits"]
-    whole = "int" in str(field.type)
-    kind = "an integer" if whole else "a finite number"
+    types, kind = (int, float), "a finite number"
+    if "int" in str(field.type):
+        types, kind = (int,), "an integer"
     numbers: tuple[Any, ...] = value if isinstance(value, tuple) else (value,)
-    for number in numbers:
-        is_number = type(number) is int or (type(number) is float and not whole)
-        if not is_number or not math.isfinite(number) or not low <= number <= high:
+    for number in numbers:  # bool is no number
+        if type(number) not in types or not math.isfinite(number) or not low <= number <= high:
             raise ValueError(f"{field.name} must be {kind} in [{low:g}, {high:g}], got {value!r}")
     if field.name == "filters" and len(numbers) != 2:
         raise ValueError(f"filters must be two integers, got {value!r}")

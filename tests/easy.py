@@ -1,12 +1,15 @@
-"""A board on which random actions succeed soon, comparison of states, and 64-bit types."""
+"""A board on which random actions succeed soon, comparison and copies of values, 64-bit types."""
 
+import copy
 import importlib
+import pickle
 from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import trap_tube_jax as tt
 
@@ -36,3 +39,15 @@ def assert_same(tree: Any, other: Any) -> None:
     chex.assert_trees_all_equal_structs(tree, other)
     chex.assert_trees_all_equal_dtypes(tree, other)
     jax.tree.map(np.testing.assert_array_equal, tree, other)
+
+
+def cloudpickled(value: Any) -> Any:
+    cloudpickle = pytest.importorskip("cloudpickle")
+    return pickle.loads(cloudpickle.dumps(value))
+
+
+COPIES = {
+    "pickle": lambda value: pickle.loads(pickle.dumps(value)),
+    "cloudpickle": cloudpickled,
+    "deepcopy": copy.deepcopy,
+}

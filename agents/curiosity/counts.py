@@ -23,12 +23,9 @@ class Counts(Curiosity):
     Visits are counted in a table of 2^20 slots by a hash of the observation. Observations of one
     hash share a count: a new one does with probability n / 2^20 if n are known, 5 % at 50,000.
 
-    Args:
-      env: the environment; its tasks must recur, as in base (1 layout) and {Sy} (5 layouts).
-
     Raises:
-      ValueError: the environment has transfers other than `symbolic`. They draw so many tasks that
-        hardly any observation returns, and the table would fill up.
+      ValueError: `env` has transfers other than `symbolic`. They draw so many tasks that hardly
+        any observation returns, and the table would fill up.
     """
 
     def __init__(self, env: Environment):
@@ -47,8 +44,8 @@ class Counts(Curiosity):
         self, params: Params, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
         """Returns the bonus of the next observation, and the visits so far."""
-        episodes = experience.episodes
-        return visit_bonus(memory, observation_slots(episodes)[1:], episodes.mask)
+        slot = observation_slots(experience.episodes)[1:]
+        return visit_bonus(memory, slot, experience.episodes.mask)
 
 
 def observation_slots(episodes: Episodes) -> jax.Array:

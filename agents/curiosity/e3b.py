@@ -22,7 +22,7 @@ class E3B(DetachedICM):
     """
 
     def init_models(self, key: jax.Array, features: jax.Array) -> Params:
-        """Returns the inverse model alone."""
+        """Returns parameters of the inverse model alone."""
         return {"inverse": self._inverse.init(key, features, features)}
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
@@ -39,9 +39,8 @@ class E3B(DetachedICM):
 def elliptical_bonus(features: jax.Array) -> jax.Array:
     """Computes f_t' C_{t-1}^-1 f_t, f32[T, B], for features f32[T, B, F] of episodes.
 
-    Updates the inverse by the Sherman-Morrison formula: with u = C_{t-1}^-1 f_t and the bonus b,
-
-      C_t^-1 = C_{t-1}^-1 - u u' / (1 + b).
+    With u = C_{t-1}^-1 f_t and the bonus b, C_t^-1 = C_{t-1}^-1 - u u' / (1 + b), by Sherman and
+    Morrison.
     """
     _, batch, width = features.shape
 

@@ -27,9 +27,8 @@ class Effects(Curiosity):
     `new_effects` computes `new` from one episode's observations and actions, for three kinds:
     changes of the food, changes of anything else but the agent's body, and grasps. Each kind pays
     the inverse of its rate, a moving average of its effects per step. So all kinds pay the same in
-    total, a rare effect pays more, and a kind pays less as the agent learns it.
-
-    The decay of this average is `reward_ema_decay`.
+    total, a rare effect pays more, and a kind pays less as the agent learns it. The decay of this
+    average is `reward_ema_decay`.
     """
 
     def __init__(self, config: Config):
@@ -62,11 +61,6 @@ def new_effects(episodes: Episodes) -> jax.Array:
     cell = episodes.cells.astype(jnp.int32)
     cell = cell[..., 0] * BOARD_SIZE + cell[..., 1]
     moved = [first_visits(cell[..., thing])[1:] for thing in (CELL_FOOD, CELL_TOOL)]
-    return jnp.stack([*moved, new_grasps(episodes)])
-
-
-def new_grasps(episodes: Episodes) -> jax.Array:
-    """Returns f32[T, B], 1 where the grasped cell has a colour new to the episode's grasps."""
     hand = episodes.cells[:-1, :, CELL_AGENT].astype(jnp.int32)
     hand = hand + jnp.asarray(DIRECTIONS)[episodes.action[..., 0]]
     on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
@@ -74,4 +68,4 @@ def new_grasps(episodes: Episodes) -> jax.Array:
     time, episode = np.indices(hand.shape[:2], np.int32)
     color = hash_rows(episodes.observations()[time, episode, hand[..., 0], hand[..., 1]])
     is_new = first_visits(jnp.where(on_board, color, OFF_BOARD))
-    return jnp.where(on_board, is_new, 0.0)
+    return jnp.stack([*moved, jnp.where(on_board, is_new, 0.0)])

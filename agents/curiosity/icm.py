@@ -42,9 +42,7 @@ class InverseModel(nn.Module):
 class ICM(Curiosity):
     """Forward and inverse models over the policy's own GRU outputs.
 
-    reward: the forward model's squared error, summed over units. losses: its mean over units,
-    and the negative log-likelihood of the action under the inverse model. No gradient is
-    stopped, so both losses train the policy's encoder.
+    No gradient is stopped, so both losses train the policy's encoder.
     """
 
     needs_next_embedding = True

@@ -1,9 +1,7 @@
 """ICM with an encoder of its own, which the inverse loss alone trains.
 
-The forward loss does not train the features, so they cannot collapse to easily predicted ones,
-and the policy's encoder serves the policy only.
-
-Source: own; Burda et al. (2019a) discuss which features to predict.
+So the features cannot collapse to easily predicted ones, and the policy's encoder serves the
+policy only. Source: own; Burda et al. (2019a) discuss which features to predict.
 """
 
 from typing import Any

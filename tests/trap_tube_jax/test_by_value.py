@@ -1,6 +1,5 @@
 """Copies of public objects: equal to the original, and of the same use."""
 
-import copy
 import itertools
 import pickle
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import EASY
+from easy import COPIES, EASY
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.controls import CONTROLS, drawn_from
 
@@ -43,18 +42,6 @@ STATES = [
 TASK_SETS = (*tt.PAPER_TASK_SETS, *tt.CONTROL_TASK_SETS)
 PUBLIC = [*ENVIRONMENTS.values(), *TRANSFERS, *TASK_SETS, *itertools.chain(*STATES)]
 PUBLIC += [tt.base_state(), tt.make("base").observation_spec]
-
-
-def cloudpickled(value: Any) -> Any:
-    cloudpickle = pytest.importorskip("cloudpickle")
-    return pickle.loads(cloudpickle.dumps(value))
-
-
-COPIES = {
-    "pickle": lambda value: pickle.loads(pickle.dumps(value)),
-    "cloudpickle": cloudpickled,
-    "deepcopy": copy.deepcopy,
-}
 
 
 @pytest.mark.parametrize("duplicate", COPIES.values(), ids=COPIES)

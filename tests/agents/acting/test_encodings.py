@@ -1,9 +1,6 @@
 """Encoding each distinct observation once changes neither the loss nor its gradient."""
 
-from typing import Any
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -51,22 +48,5 @@ def test_the_loss_and_its_gradient_are_those_of_the_plain_encoding(curiosity, mo
 
     params, batch = prepare(jax.random.key(4))
     plain = loss_of(plain_encoding)(params, batch)
-    fast = loss_of(encode_episodes)
-    value, gradient = fast(params, batch)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
-        (value, gradient),
-        plain,
-    )
-    if curiosity == "icm":  # which stops no gradient
-        check_by_finite_differences(lambda p: fast(p, batch)[0], params, gradient)
-
-
-def check_by_finite_differences(loss: Any, params: Any, gradient: Any) -> None:
-    """Checks the gradient along itself."""
-    norm = np.sqrt(sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(gradient)))
-
-    def at(step):
-        return loss(jax.tree.map(lambda p, g: p + step / norm * g, params, gradient))
-
-    np.testing.assert_allclose((at(1e-2) - at(-1e-2)) / 2e-2, norm, rtol=2e-2)
+    fast = loss_of(encode_episodes)(params, batch)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), fast, plain)

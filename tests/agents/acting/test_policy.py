@@ -1,9 +1,5 @@
 """Trained policies act from observations alone, as the evaluator plays them."""
 
-import copy
-import pickle
-
-import cloudpickle
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +8,7 @@ import pytest
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator
 from agents.networks.agent import Agent
-from easy import assert_same
+from easy import COPIES, assert_same
 from tiny_policy import CONFIG, FOOD_CELLS, STEPS, food_next_to_agent, random_policy
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
@@ -95,13 +91,6 @@ def test_unusable_arguments_are_refused(batch, convert, key, message):
     observation = convert(jax.vmap(tt.observe)(food_next_to_agent()))
     with pytest.raises(ValueError, match=message):
         policy.act(observation, policy.initial(batch), None if key is None else jax.random.key(key))
-
-
-COPIES = {
-    "deepcopy": copy.deepcopy,
-    "pickle": lambda x: pickle.loads(pickle.dumps(x)),
-    "cloudpickle": lambda x: pickle.loads(cloudpickle.dumps(x)),
-}
 
 
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)

@@ -110,12 +110,6 @@ def test_episodes_follow_the_environment(played):
     np.testing.assert_array_equal(episodes.length[1:] == CONFIG.max_steps, ~episodes.solved[1:])
 
 
-def test_features_are_those_of_the_observations(played):
-    _, _, params, _, _, trajectory = played
-    plain = encoding()(params, trajectory.episodes)
-    np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
-
-
 def test_every_step_draws_its_actions_with_a_key_of_its_own(played):
     env, _, params, initial, play, _ = played
     jax.effects_barrier()
@@ -144,7 +138,7 @@ def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch)
     if bits != encodings.CACHE_BITS:
         monkeypatch.setattr(encodings, "CACHE_BITS", bits)
         play = make_play(params, initial)
-    for env_id in ("base", "st"):
+    for env_id in ("base", "psy"):
         # Several episodes of each layout, which meet again what the others have met before.
         keys = jnp.repeat(
             jax.random.split(jax.random.key(1), 3), CONFIG.episodes_per_iteration // 3

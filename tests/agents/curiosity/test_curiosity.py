@@ -1,10 +1,7 @@
 """The built-in rewards by hand, their losses and encoders, and that all can be copied."""
 
-import copy
-import pickle
 from typing import Any
 
-import cloudpickle
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,11 +11,10 @@ import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting.episodes import Episodes
 from agents.curiosity import Curiosity, Experience
-from agents.curiosity.e3b import elliptical_bonus
-from agents.curiosity.visits import first_visits, visits
 from agents.networks import make_encoder
 from agents.networks.layers import draw
 from agents.registry import curiosities
+from easy import COPIES
 from small_runs import small_config
 
 SETTINGS = Config(env_id="sy", filters=(2, 3), hidden=4, embedding=2).to_dict()
@@ -76,24 +72,6 @@ def test_an_episodes_reward_does_not_depend_on_other_episodes(name):
     assert np.std(whole) > 0
 
 
-def test_visits_are_counted_by_episode():
-    ids = jnp.array([[0, 5], [1, 5], [0, 5], [2, 6]])
-    np.testing.assert_array_equal(visits(ids), [[1, 1], [1, 2], [2, 3], [1, 1]])
-    np.testing.assert_array_equal(first_visits(ids), [[1, 1], [1, 0], [0, 0], [1, 1]])
-
-
-def test_elliptical_bonus_is_that_of_the_inverse_matrix():
-    features = np.random.default_rng(0).normal(size=(9, 3, 4))
-    bonus = elliptical_bonus(jnp.array(features, jnp.float32))
-    for episode in range(3):
-        matrix = 0.1 * np.eye(4)
-        for time in range(9):
-            f = features[time, episode]
-            expected = f @ np.linalg.inv(matrix) @ f
-            np.testing.assert_allclose(bonus[time, episode], expected, rtol=1e-3)
-            matrix += np.outer(f, f)
-
-
 def test_rnd_trains_the_predictor_alone():
     curiosity = make("rnd")
     board = jax.random.randint(jax.random.key(0), (3, 12, 12, 3), 0, 256).astype(jnp.uint8)
@@ -144,11 +122,7 @@ def test_encoders_of_a_curiosity_are_of_the_policys_kind(name):
 def test_copies_are_equal(name):
     curiosity = make(name)
     assert isinstance(curiosity, Curiosity)
-    for copied in (
-        copy.deepcopy(curiosity),
-        pickle.loads(pickle.dumps(curiosity)),
-        cloudpickle.loads(cloudpickle.dumps(curiosity)),
-    ):
+    for copied in (copies(curiosity) for copies in COPIES.values()):
         assert type(copied) is type(curiosity)
         assert vars(copied) == vars(curiosity)
 

@@ -9,8 +9,8 @@ import trap_tube_jax as tt
 from agents import Config
 from agents.acting.episodes import Episodes, cells_of
 from agents.curiosity import Experience
-from agents.curiosity.effects import Effects, new_effects, new_grasps
-from trap_tube_jax.objects import DIRECTIONS, LEFT, UP
+from agents.curiosity.effects import Effects, new_effects
+from trap_tube_jax.objects import DIRECTIONS
 
 STEPS, BATCH = 40, 48
 
@@ -105,19 +105,6 @@ def test_a_return_is_not_new(by_hand):
     food, tool, _ = np.asarray(new_effects(by_hand) * by_hand.mask[None])
     np.testing.assert_array_equal(tool.T, [[1, 0, 0, 1], [0, 1, 0, 0]])
     np.testing.assert_array_equal(food.T, [[0, 0, 1, 0], [0, 1, 0, 0]])
-
-
-def test_the_first_grasp_of_every_colour_is_new(by_hand):
-    state = tt.base_state()  # the tool above the agent, on ground
-    agent = jnp.array([[9, 1], [8, 1], [8, 1], [8, 1], [8, 1]])
-    things = jnp.broadcast_to(jnp.stack([state.tool, state.food]), (5, 2, 2))
-    cells = jnp.concatenate([agent[:, None], things], axis=1).astype(jnp.uint8)
-    grasp = jnp.array([UP, UP, UP, LEFT])
-    episodes = by_hand._replace(
-        cells=jnp.stack([cells, cells], axis=1),
-        action=jnp.zeros((4, 2, 2), jnp.int32).at[:, :, 0].set(grasp[:, None]),
-    )
-    np.testing.assert_array_equal(new_grasps(episodes).T, [[1, 1, 0, 0]] * 2)
 
 
 def test_each_kind_pays_the_inverse_of_its_rate(by_hand):

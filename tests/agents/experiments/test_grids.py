@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+import trap_tube_jax as tt
 from agents.experiments.grids import GRIDS, Grid, Options
 from agents.runs.folder import Run, RunFolder
 from agents.runs.session import RunOptions
@@ -58,14 +59,10 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, o
 
 
 @pytest.mark.parametrize(
-    ("name", "env", "iterations"),
-    [
-        ("exp1", "TrapTube-v0", 250),
-        ("exp2", "PerceptualStructuralSymbolicTrapTube-v0", 500),
-    ],
+    ("name", "short", "iterations"), [("exp1", "base", 250), ("exp2", "pstsy", 500)]
 )
-def test_the_papers_experiments(name, env, iterations):
-    grid = GRIDS[name]
+def test_the_papers_experiments(name, short, iterations):
+    grid, env = GRIDS[name], tt.task_set(short).id
     found = grid.configs(grid.options)
     assert {k: v.curiosity for k, v in found.items()} == {"ppo": "none", "ppo+icm": "icm"}
     for config in found.values():

@@ -1,5 +1,6 @@
 """Groups of equal elements, and functions of rows chunk by chunk."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -55,46 +56,38 @@ def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
     return params, jax.random.normal(keys[2], (ROWS, 3)), jax.random.normal(keys[3], (ROWS, WIDTH))
 
 
+def total(fn: Any, chunk: int, problem: Any, params: Any, count: Any) -> jax.Array:
+    """Weighs the features of the first `count` rows; those of `plain` if there is no `fn`."""
+    _, rows, cotangent = problem
+    if fn is None:
+        features = plain(params, rows)
+    else:
+        features: Any = chunks.map_rows(fn, chunk, params, rows, count)
+    return jnp.sum(jnp.where((jnp.arange(ROWS) < count)[:, None], features, 0) * cotangent)
+
+
+def assert_close(tree: Any, other: Any) -> None:
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), tree, other)
+
+
 @pytest.mark.parametrize("fn", [forgetful, remembering])
 @pytest.mark.parametrize("chunk", [1, 8, 37, 64])
 def test_map_rows_and_its_gradient(problem, fn, chunk, monkeypatch):
     monkeypatch.setattr(chunks, "REMEMBERED_BYTES", 16 * 4 * WIDTH)
-    params, rows, cotangent = problem
-
-    def ours(params, count):
-        features: Any = chunks.map_rows(fn, chunk, params, rows, count)
-        return jnp.sum(jnp.where((jnp.arange(ROWS) < count)[:, None], features, 0) * cotangent)
-
-    def reference(params, count):
-        return jnp.sum(plain(params, rows[:count]) * cotangent[:count])
-
-    compiled = jax.jit(jax.value_and_grad(ours))
+    got, want = (
+        jax.jit(jax.value_and_grad(partial(total, each, chunk, problem))) for each in (fn, None)
+    )
     for count in (0, 1, 8, 9, ROWS):
-        got, want = compiled(params, count), jax.value_and_grad(reference)(params, count)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), got, want)
+        assert_close(got(problem[0], count), want(problem[0], count))
 
 
 def test_map_rows_under_vmap_with_different_counts(problem):
-    params, rows, cotangent = problem
-    many = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, -leaf]), params)
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, -leaf]), problem[0])
     counts = jnp.array([0, 5, ROWS])
-
-    def gradient(params, count):
-        def total(params):
-            features: Any = chunks.map_rows(remembering, 8, params, rows, count)
-            return jnp.sum(features * cotangent * (jnp.arange(ROWS) < count)[:, None])
-
-        return jax.grad(total)(params)
-
-    together = jax.jit(jax.vmap(gradient))(many, counts)
-    alone = [
-        gradient(jax.tree.map(lambda leaf, i=index: leaf[i], many), counts[index])
-        for index in range(3)
-    ]
-    alone = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), together, alone
+    got, want = (
+        jax.jit(jax.vmap(jax.grad(partial(total, fn, 8, problem)))) for fn in (remembering, None)
     )
+    assert_close(got(many, counts), want(many, counts))
 
 
 def test_shared_maximum_is_unbatched():

@@ -13,7 +13,7 @@ from agents.networks import chunks
 from agents.networks.convolution import convolve
 from agents.networks.encoder import Encoder
 from agents.networks.layers import init_module
-from agents.networks.windows import cut_into_windows, encode_rows
+from agents.networks.windows import encode_rows
 
 EPISODES, STEPS = 3, 6
 encoder = Encoder((4, 6))
@@ -116,12 +116,3 @@ def test_convolution_and_its_derivatives_are_those_of_jax(size):
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
     for ours, theirs in zip(pulled, expected, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
-
-
-def test_windows_are_the_parts_of_the_board():
-    board = jax.random.randint(jax.random.key(0), (2, 12, 12, 3), 0, 256).astype(jnp.uint8)
-    padded = np.pad(board, ((0, 0), (0, 2), (0, 2), (0, 0)))
-    for index, window in enumerate(cut_into_windows(board)):
-        row, column = divmod(index % 36, 6)
-        part = padded[index // 36, 2 * row : 2 * row + 4, 2 * column : 2 * column + 4]
-        np.testing.assert_array_equal(window, part)

@@ -61,9 +61,8 @@ def test_one_device_computes_as_it_is_told():
     assert str(alone) == "cpu"
 
 
-@pytest.fixture(scope="module")
-def two():
-    """What `sharded_training` found on two simulated devices."""
+def test_two_devices_train_as_one():
+    """By what `sharded_training` finds on two simulated devices."""
     environment = {k: v for k, v in os.environ.items() if k != "JAX_NUM_CPU_DEVICES"}
     done = subprocess.run(
         [sys.executable, "-W", "error", ROOT / "tests" / "sharded_training.py"],
@@ -73,27 +72,10 @@ def two():
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-def test_two_devices_hold_the_same_state_of_a_seed(two):
-    assert two["unequal_copies"] == []
+    two = json.loads(done.stdout)
+    assert two["unequal_copies"] == two["different_shapes"] == two["different_metrics"] == []
     assert two["iteration"] == 3
     assert two["is_finite"] == [1, 1, 1]
-
-
-def test_two_devices_count_what_both_have_played(two):
     assert two["transitions"] == two["steps_played"] > 0
-
-
-def test_the_mean_gradient_of_two_halves_is_that_of_the_whole(two):
-    assert two["gradient_gap"] < 1e-5
-
-
-def test_two_seeds_on_two_devices_are_those_of_one(two):
-    assert two["seeds_gap"] < 1e-5
-
-
-def test_states_and_metrics_do_not_depend_on_the_devices(two):
-    assert two["different_shapes"] == []
-    assert two["different_metrics"] == []
+    assert two["gradient_gap"] < 1e-5  # of the mean of two halves and the whole
+    assert two["seeds_gap"] < 1e-5  # of a seed on each device and both on one

@@ -108,7 +108,8 @@ def test_new_tasks_are_new_and_others_are_of_the_lists():
     assert set(drawn[6:]) <= set(twice)
 
 
-def test_failed_tasks_are_remembered_and_success_is_that_on_new_tasks(scripted):
+def test_an_iteration_remembers_failed_tasks_and_counts_what_was_played(scripted):
+    """Success is that on new tasks."""
     _, state, iterate = scripted
     after, metrics = iterate(state)
     keys, first, second = data(reset_keys()), *map(data, state.task_replay.keys)
@@ -117,14 +118,10 @@ def test_failed_tasks_are_remembered_and_success_is_that_on_new_tasks(scripted):
     assert data(after.task_replay.keys[1]) == [keys[4], *second[1:]]
     assert float(metrics["success"]) == 1 / 4
     assert float(metrics["replayed_success"]) == 3 / 4
-
-
-def test_an_iteration_counts_what_was_played(scripted):
-    _, state, iterate = scripted
-    after, metrics = iterate(iterate(state)[0])
+    assert float(metrics["episode_length"]) == STEPS
+    after, _ = iterate(after)
     counts = [int(x) for x in (after.iteration, after.episodes, after.transitions)]
     assert counts == [2, 2 * EPISODES, 2 * EPISODES * STEPS]
-    assert float(metrics["episode_length"]) == STEPS
 
 
 @pytest.mark.parametrize(("iteration", "coef"), [(0, 3.0), (4, 0.3), (8, 0.03), (9, 0.03)])

@@ -1,4 +1,4 @@
-"""Returns, advantages and moments against float64 NumPy, on random episodes with masks."""
+"""Moments against float64 NumPy on random episodes with masks, and the rules of bootstrap."""
 
 from typing import Any
 
@@ -8,50 +8,10 @@ import numpy as np
 import pytest
 
 from agents.acting.episodes import Episodes
-from agents.config import PRESETS, Config
+from agents.config import Config
 from agents.ppo import advantages, returns
 
 CASES, STEPS = 1_000, 23
-
-
-@pytest.fixture(scope="module")
-def episodes() -> dict[str, np.ndarray]:
-    """Random episodes, each masked after an end of its own (0 to STEPS steps)."""
-    rng = np.random.default_rng(0)
-    length = rng.integers(0, STEPS + 1, CASES)
-    mask = (np.arange(STEPS)[None] < length[:, None]).astype(np.float32)
-    return {
-        "mask": mask,
-        "reward": (rng.normal(size=mask.shape) * mask).astype(np.float32),
-        "value": rng.normal(size=mask.shape).astype(np.float32),
-        "values": rng.normal(size=(CASES, STEPS + 1)).astype(np.float32),
-        "discounts": rng.uniform(0, 1, mask.shape).astype(np.float32),
-        "discount": rng.uniform(0, 1, CASES).astype(np.float32),
-        "lambda": rng.uniform(0, 1, CASES).astype(np.float32),
-    }
-
-
-def test_returns(episodes):
-    result = jax.vmap(returns.discounted_returns)(episodes["reward"], episodes["discount"])
-    for case in range(CASES):
-        reward = episodes["reward"][case].astype(np.float64)
-        powers = np.float64(episodes["discount"][case]) ** np.arange(STEPS)
-        expected = [reward[t:] @ powers[: STEPS - t] for t in range(STEPS)]
-        np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
-
-
-def test_advantages(episodes):
-    names = ("reward", "discounts", "values", "mask", "lambda")
-    result = jax.vmap(returns.generalized_advantages)(*(episodes[name] for name in names))
-    for case in range(CASES):
-        reward, discount, value, mask, lambda_ = (
-            episodes[name][case].astype(np.float64) for name in names
-        )
-        delta = mask * (reward + discount * value[1:] - value[:-1])
-        expected, following = np.zeros(STEPS), 0.0
-        for t in reversed(range(STEPS)):
-            expected[t] = following = delta[t] + discount[t] * lambda_ * following
-        np.testing.assert_allclose(result[case], expected, rtol=1e-5, atol=1e-5)
 
 
 TERMINATED, TRUNCATED = ([1, 0, 0], [1, 1, 0]), ([1, 1, 1], [1, 1, 1])  # discount and mask
@@ -80,23 +40,23 @@ def test_the_rules_of_bootstrap_differ_at_the_end(bootstrap, end, advantage, tar
     np.testing.assert_allclose(found[1][: len(target), 0], target)
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_the_paper_alone_has_the_baselines_rule(name):
-    assert (Config.preset(name).bootstrap == "baseline") == (name == "paper")
-
-
-def test_masked_moments_and_normalize(episodes):
-    mean, variance = jax.vmap(returns.masked_moments)(episodes["value"], episodes["mask"])
-    normalized = jax.vmap(returns.normalize)(episodes["value"], episodes["mask"])
-    for case in range(CASES):
-        chosen = episodes["value"][case][episodes["mask"][case] > 0].astype(np.float64)
-        expected = (chosen.mean(), chosen.var()) if len(chosen) else (0, 0)
+def test_masked_moments_and_normalize():
+    """Episodes are masked after an end of their own, of 0 to STEPS steps."""
+    rng = np.random.default_rng(0)
+    length = rng.integers(0, STEPS + 1, CASES)
+    mask = (np.arange(STEPS)[None] < length[:, None]).astype(np.float32)
+    value = rng.normal(size=mask.shape).astype(np.float32)
+    arrays = jnp.asarray(value), jnp.asarray(mask)
+    mean, variance = jax.vmap(returns.masked_moments)(*arrays)
+    normalized = np.asarray(jax.vmap(returns.normalize)(*arrays))
+    for case, count in enumerate(length):
+        chosen = value[case, :count].astype(np.float64)
+        expected = (chosen.mean(), chosen.var()) if count else (0, 0)
         np.testing.assert_allclose([mean[case], variance[case]], expected, rtol=1e-4, atol=1e-6)
-        if len(chosen) > 2:
+        if count > 2:
             want = (chosen - chosen.mean()) / chosen.std()
-            got = np.asarray(normalized[case])[: len(chosen)]
-            np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-3)
-        assert np.all(np.asarray(normalized[case])[len(chosen) :] == 0)
+            np.testing.assert_allclose(normalized[case, :count], want, rtol=1e-3, atol=1e-3)
+        assert np.all(normalized[case, count:] == 0)
 
 
 def test_moving_moments():
