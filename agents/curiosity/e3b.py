@@ -17,8 +17,7 @@ RIDGE = 0.1  # lambda of the paper
 class E3B(DetachedICM):
     """reward_t = f_{t+1}' C_t^-1 f_{t+1}, with C_t = 0.1 I + the sum over i <= t of f_i f_i'.
 
-    f_i are features of the episode's observation i, by an encoder that the inverse loss alone
-    trains: the negative log-likelihood of the action between two observations.
+    f_i are features of the episode's observation i, by an encoder that the inverse loss trains.
     """
 
     def init_models(self, key: jax.Array, features: jax.Array) -> Params:

@@ -33,8 +33,7 @@ class DetachedICM(ICM):
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws the parameters of the encoder and of the models."""
         # As in `Agent.init`, only layers of Flax use the folded key.
-        encoder_key = jax.random.fold_in(key, 0)
-        features, encoder = self._encoder.init_with_output(encoder_key, board)
+        features, encoder = self._encoder.init_with_output(jax.random.fold_in(key, 0), board)
         return draw(key, {"encoder": encoder, **self.init_models(key, features)})
 
     def init_models(self, key: jax.Array, features: jax.Array) -> Params:

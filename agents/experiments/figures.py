@@ -59,16 +59,17 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
     """Draws percent of test tasks solved by set: a bar per algorithm, a point per seed."""
     table = tables.by_set(tested)
     paper = tables.PAPER_SUCCESS if about["train_set"] == "pstsy" else {}
-    names = [*dict.fromkeys(tested["algorithm"]), *paper]
+    own = list(tested["algorithm"].unique())
+    names = [*own, *paper]
     figure, axes = _panels(list(map(label, table)), 5, 0.25 * len(names) + 0.4, about["title"])
     for axis, column in zip(axes, table, strict=True):
-        values = [table.loc[name, column].to_numpy() for name in names[: len(names) - len(paper)]]
-        axis.barh(range(len(values)), [each.mean() for each in values], color=COLORS[5])
-        for row, each in enumerate(values):
-            axis.plot(each, [row] * len(each), "o", color=COLORS[0], alpha=0.7, markersize=4)
+        for row, name in enumerate(own):
+            values = table.loc[name, column].to_numpy()
+            axis.barh(row, values.mean(), color=COLORS[5])
+            axis.plot(values, [row] * len(values), "o", color=COLORS[0], alpha=0.7, markersize=4)
         if column in tables.PAPER_SETS:
             place = tables.PAPER_SETS.index(column)
-            for row, (means, sds) in enumerate(paper.values(), len(values)):
+            for row, (means, sds) in enumerate(paper.values(), len(own)):
                 axis.barh(row, means[place], xerr=sds[place], color="#BBBBBB", error_kw={"lw": 1})
         axis.set_xlim(-6, 106)
         axis.set_xticks([0, 50, 100])

@@ -55,8 +55,7 @@ def make_executor(processes: int | None, cluster: str | None) -> Iterator[Execut
         return
     if processes is None:
         with ProcessPoolExecutor(1, SPAWN) as pool:  # this process leaves GPUs to the runs
-            backend = pool.submit(jax.default_backend).result()
-        processes = _cores() if backend == "cpu" else 1
+            processes = _cores() if pool.submit(jax.default_backend).result() == "cpu" else 1
     with ProcessPerCall(processes) as executor:
         yield executor
 

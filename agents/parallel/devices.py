@@ -119,9 +119,8 @@ class Placement:
             return states
         rows = NamedSharding(self.mesh, PartitionSpec(SEEDS))
         # Unlike `device_put`, takes keys to the devices of several processes.
-        return jax.tree.map(
-            lambda x: jax.make_array_from_callback(x.shape, rows, lambda index: x[index]), states
-        )
+        place = jax.make_array_from_callback
+        return jax.tree.map(lambda x: place(x.shape, rows, lambda index: x[index]), states)
 
     def local(self, states: Tree) -> Tree:
         """Copies arrays [S, ...] to one device of this process; all processes must call it."""
@@ -132,10 +131,10 @@ class Placement:
 
     def __str__(self) -> str:
         """Names the devices, as in "4 gpu devices of 2 process(es)"."""
-        platform, processes = jax.default_backend(), jax.process_count()
+        platform = jax.default_backend()
         if self.mesh is None:
             return platform
-        return f"{self.mesh.size} {platform} devices of {processes} process(es)"
+        return f"{self.mesh.size} {platform} devices of {jax.process_count()} process(es)"
 
 
 def _same(tree: Tree) -> Tree:

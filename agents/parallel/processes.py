@@ -1,7 +1,4 @@
-"""Several processes for one run, joined by `jax.distributed`.
-
-All processes run the same command and read the same folder; the first one writes and reports.
-"""
+"""Several processes for one run, joined by `jax.distributed`; the first writes and reports."""
 
 import dataclasses
 from collections.abc import Callable

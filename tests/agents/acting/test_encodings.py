@@ -4,20 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from agents import Config, make_train
+from agents import make_train
 from agents.acting.encodings import encode_episodes
 from agents.ppo import learner
+from small_runs import small_config
 
-CONFIG = Config(
-    env_id="psy",
-    max_steps=7,
-    episodes_per_iteration=12,
-    minibatch_size=6,
-    filters=(3, 4),
-    hidden=6,
-    embedding=2,
-    encode_chunk_size=4,
-)
 SLOW = [
     pytest.param(name, marks=pytest.mark.slow) for name in ("icm-detached", "rnd", "ride", "e3b")
 ]
@@ -25,7 +16,7 @@ SLOW = [
 
 @pytest.mark.parametrize("curiosity", ["icm", "none", *SLOW])
 def test_the_loss_and_its_gradient_are_those_of_the_plain_encoding(curiosity, monkeypatch):
-    train = make_train(Config.from_dict({**CONFIG.to_dict(), "curiosity": curiosity}))
+    train = make_train(small_config(env_id="psy", curiosity=curiosity))
 
     def plain_encoding(encode_rows, params, episodes, *, chunk):
         del encode_rows, chunk
@@ -38,7 +29,7 @@ def test_the_loss_and_its_gradient_are_those_of_the_plain_encoding(curiosity, mo
     @jax.jit
     def prepare(key):
         state = train.init(key)
-        trajectory = train.play(state.params, jax.random.split(key, 12), key)
+        trajectory = train.play(state.params, jax.random.split(key, 8), key)
         reward, _ = train.intrinsic_reward(state, trajectory)
         return state.params, train.make_batch(state, trajectory, reward)[0]
 

@@ -8,25 +8,14 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config
 from agents.acting import encodings
 from agents.acting.rollout import rollout
 from agents.networks import chunks
 from agents.networks.actions import ActionDistribution
 from agents.networks.agent import Agent
+from small_runs import small_config
 
-CONFIG = Config(
-    env_id="psy",
-    max_steps=7,
-    episodes_per_iteration=12,
-    minibatch_size=6,
-    epochs=2,
-    filters=(3, 4),
-    hidden=6,
-    embedding=2,
-    encode_chunk_size=4,
-)
-
+CONFIG = small_config(env_id="psy", episodes_per_iteration=12, encode_chunk_size=4)
 
 counts: list[int] = []  # distinct observations that `play` encoded, step by step
 drawn_with: list[bytes] = []  # the keys that actions were drawn with, step by step
@@ -80,15 +69,10 @@ def played(make_play):
     return env, agent, params, initial, play, play(params, initial)
 
 
-@functools.cache
-def encoding():
-    """The plain encoding of all observations, u8[T + 1, B, 12, 12, N]."""
-    agent = Agent(CONFIG)
-    return jax.jit(
-        lambda params, episodes: jax.vmap(lambda rows: agent.encode(params, rows))(
-            episodes.observations()
-        )
-    )
+@jax.jit
+def encode(params, episodes):
+    """Encodes all observations u8[T + 1, B, 12, 12, N], each by itself."""
+    return jax.vmap(functools.partial(Agent(CONFIG).encode, params))(episodes.observations())
 
 
 def test_episodes_follow_the_environment(played):
@@ -148,7 +132,7 @@ def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch)
         counts.clear()
         trajectory = play(params, layouts)
         jax.effects_barrier()
-        plain = encoding()(params, trajectory.episodes)
+        plain = encode(params, trajectory.episodes)
         np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
         distinct = check_ids(trajectory.episodes)
         assert len(counts) == len(trajectory.episodes.cells)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, make_train
+from agents import make_train
 from agents.acting.episodes import Episodes
 from agents.curiosity import Curiosity, Experience
 from agents.networks import make_encoder
@@ -17,12 +17,11 @@ from agents.registry import curiosities
 from easy import COPIES
 from small_runs import small_config
 
-SETTINGS = Config(env_id="sy", filters=(2, 3), hidden=4, embedding=2).to_dict()
 BOARD = jnp.zeros((1, 12, 12, 3), jnp.uint8)
 
 
 def make(name: str, **settings: Any) -> Any:
-    config = Config.from_dict({**SETTINGS, "curiosity": name, **settings})
+    config = small_config(env_id="sy", curiosity=name, **settings)
     return curiosities.factory(name)(config, tt.make("sy"))
 
 
@@ -108,7 +107,7 @@ def test_the_forward_loss_trains_the_features_of_ride_alone(name, trained):
 
 @pytest.mark.parametrize("name", ["icm-detached", "rnd", "noveld", "ride", "e3b"])
 def test_encoders_of_a_curiosity_are_of_the_policys_kind(name):
-    encoder = make_encoder(Config.from_dict({**SETTINGS, "encoder": "objects"}))
+    encoder = make_encoder(small_config(encoder="objects"))
     wanted, found = (
         jax.tree.map(jnp.shape, jax.eval_shape(init, jax.random.key(0), BOARD))
         for init in (encoder.init, make(name, encoder="objects").init)

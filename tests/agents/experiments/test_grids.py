@@ -30,7 +30,6 @@ def test_a_grid_holds_every_combination_by_name():
         ("filters=[2,3],[4,5]", "filters=4x5", "filters", (4, 5)),
         ("align_to_food=true,false", "align_to_food=true", "align_to_food", True),
         ("max_steps=null,7", "max_steps=null", "max_steps", None),
-        ("clip_eps=0.3", "paper", "clip_eps", 0.3),
     ],
 )
 def test_values_are_json_or_text(text, name, setting, value):

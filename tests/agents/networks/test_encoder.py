@@ -34,12 +34,7 @@ def boards(env_id: str, num_features: int) -> jax.Array:
     return observations.reshape(-1, *observations.shape[2:])
 
 
-SETS = [
-    ("base", 3),
-    ("pstsy", 3),
-    ("pst", 5),
-    pytest.param(("pstsy", 1), marks=pytest.mark.slow),
-]
+SETS = [("base", 3), ("pstsy", 3), ("pst", 5), pytest.param(("pstsy", 1), marks=pytest.mark.slow)]
 
 
 @pytest.fixture(scope="module", params=SETS)
@@ -91,21 +86,14 @@ def test_windows_give_the_plain_features_and_gradient(observation, remembered_by
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4])
 def test_convolution_and_its_derivatives_are_those_of_jax(size):
+    shapes = (2, 6, 4, 3), (2, 6, 4, 5), (size, size, 3, 5)
     keys = jax.random.split(jax.random.key(size), 3)
-    x, cotangent = (
-        jax.random.normal(keys[0], (2, 6, 4, 3)),
-        jax.random.normal(keys[1], (2, 6, 4, 5)),
-    )
-    kernel = jax.random.normal(keys[2], (size, size, 3, 5))
+    x, cotangent, kernel = map(jax.random.normal, keys, shapes)
 
     def reference(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        layout = ("NHWC", "HWIO", "NHWC")
         return jax.lax.conv_general_dilated(
-            x,
-            kernel,
-            (1, 1),
-            "SAME",
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision="highest",
+            x, kernel, (1, 1), "SAME", dimension_numbers=layout, precision="highest"
         )
 
     def derived(function: Any) -> Any:

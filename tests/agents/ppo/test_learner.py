@@ -25,26 +25,17 @@ from agents.ppo.learner import Learner, TrainState
 from agents.ppo.memory import memory_estimate
 from agents.registry import curiosities
 from easy import rows
+from small_runs import SETTINGS
 
-SIZES = {
-    "epochs": 1,
-    "filters": (4, 4),
-    "hidden": 4,
-    "embedding": 2,
-    "max_steps": 6,
-    "encode_chunk_size": 8,
-    "iterations": 10,
-}
 BEST = Config.preset(
     "best",
-    **{**SIZES, "epochs": 3},
-    episodes_per_iteration=8,
-    minibatch_size=4,
+    **{**SETTINGS, "epochs": 3},
+    iterations=10,
     replay_capacity=5,
     replay_fractions=(0.25, 0.25),
     max_transitions=None,
 )
-PLAIN = Config(**SIZES, episodes_per_iteration=2, minibatch_size=2, curiosity="none")
+PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
 STEPS, EPISODES = 6, 8
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 

@@ -64,20 +64,14 @@ def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
     return done
 
 
-def assert_close(actual: Any, expected: Any, tolerance: float = 1e-4) -> None:
-    """Equal within `tolerance` of the largest magnitude of `expected`."""
-    expected = np.asarray(expected)
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(np.asarray(actual) / scale, expected / scale, rtol=0, atol=tolerance)
-
-
-def assert_trees_close(actual: Any, expected: Any, tolerance: float) -> None:
+def assert_close(actual: Any, expected: Any) -> None:
+    """Leaves are equal within 1e-4 of the largest magnitude of the expected one."""
     leaves = jax.tree_util.tree_leaves_with_path(expected)
     for (path, want), got in zip(leaves, jax.tree.leaves(actual), strict=True):
-        try:
-            assert_close(got, want, tolerance)
-        except AssertionError as error:
-            raise AssertionError(f"{jax.tree_util.keystr(path)}: {error}") from None
+        scale, name = np.abs(want).max(), jax.tree_util.keystr(path)
+        np.testing.assert_allclose(
+            np.asarray(got) / scale, np.asarray(want) / scale, rtol=0, atol=1e-4, err_msg=name
+        )
 
 
 def test_parameter_count(ours):
@@ -137,10 +131,10 @@ def test_loss_terms_and_gradient_norm(recording, updates, index):
 
 def test_clipped_gradient(recording, ours, updates):
     expected = recording.params("clipped_gradient1", ours["params"])
-    assert_trees_close(updates[0]["clipped"], expected, 1e-4)
+    assert_close(updates[0]["clipped"], expected)
 
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_parameters_after_updates(recording, ours, updates, count):
     expected = recording.params(f"param_after{count}", ours["params"])
-    assert_trees_close(updates[count - 1]["params"], expected, 1e-4)
+    assert_close(updates[count - 1]["params"], expected)
