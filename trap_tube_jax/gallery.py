@@ -1,7 +1,4 @@
-"""Draws tasks of the eight task sets in one picture, and solved episodes as GIFs.
-
-On the command line: `python -m trap_tube_jax.gallery --output figures --gifs`.
-"""
+"""Draws tasks of the eight task sets: python -m trap_tube_jax.gallery --help."""
 
 import argparse
 import os
@@ -18,8 +15,7 @@ from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import NUM_OBJECTS, OBJECT_NAMES
 from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
-from trap_tube_jax.rendering import episode_frames, render, save_gif
-from trap_tube_jax.solver import solve
+from trap_tube_jax.rendering import render
 from trap_tube_jax.state import base_state
 from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
 
@@ -28,7 +24,6 @@ CHANGES: dict[Transfer, str] = {
     structural: "colours",
     symbolic: "role of the tool",
 }
-SOLVED_SETS = ("base", "p", "st", "sy", "pstsy")
 DRAWS = 64  # tasks of which the first distinct ones are shown
 CELL_SIZE = 16  # pixels
 SIGN_SIZE = 48  # pixels
@@ -82,20 +77,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    add("--output", type=pathlib.Path, default=".", help="folder of gallery.png and the GIFs")
+    add("--output", type=pathlib.Path, default=".", help="folder of gallery.png")
     add("--tasks", type=int, default=4, help="distinct tasks per set, at least 2")
     add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1")
-    add("--gifs", action="store_true", help="also solve a task each of base, p, st, sy and pstsy")
     options = parser.parse_args(arguments)
     with plain_errors():
         options.output.mkdir(parents=True, exist_ok=True)
-        paths = [options.output / "gallery.png"]
-        save_gallery(paths[0], tasks=options.tasks, seed=options.seed)
-        for short in SOLVED_SETS if options.gifs else ():
-            state, _ = make(short).reset(jax.random.key(options.seed))
-            paths.append(options.output / f"solved_{short}.gif")
-            save_gif(episode_frames(state, solve(state).actions), paths[-1], fps=4)
-        print(*paths, sep="\n")
+        save_gallery(options.output / "gallery.png", tasks=options.tasks, seed=options.seed)
+        print(options.output / "gallery.png")
 
 
 def _title(entry: TaskSet) -> str:
