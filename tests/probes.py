@@ -40,7 +40,7 @@ class Probe(tt.Environment):
         bit = (jax.random.bernoulli(key) & has_cue).astype(jnp.int32)
         state = state.replace(
             food=jnp.stack([jnp.int32(5), 5 + bit]),
-            agent=jnp.array([11, 0]),
+            agent=jnp.array([11, 0], jnp.int32),
             time=HIDDEN_UNIT * bit,
         )
         return state, timestep.replace(observation=tt.observe(state))
@@ -51,7 +51,7 @@ class Probe(tt.Environment):
         bit = jnp.where(chosen, (action[0] == 3).astype(jnp.int32), bit)
         reward = self._reward(bit, time, action)
         state = state.replace(
-            food=jnp.array([5, 5]),
+            food=jnp.array([5, 5], jnp.int32),
             agent=jnp.stack([jnp.int32(11), time + 1]),
             time=HIDDEN_UNIT * bit + time + 1,
             truncated=time + 1 >= STEPS,
@@ -61,7 +61,7 @@ class Probe(tt.Environment):
             reward=reward,
             terminated=state.terminated,
             truncated=state.truncated,
-            discount=jnp.ones(()),
+            discount=jnp.ones((), jnp.float32),
         )
 
     def _is(self, kind: str) -> jax.Array:

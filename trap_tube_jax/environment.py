@@ -24,7 +24,14 @@ from trap_tube_jax.objects import (
     NUM_DIRECTIONS,
 )
 from trap_tube_jax.observation import observe
-from trap_tube_jax.state import State, TimeStep, base_state, check_state, validate
+from trap_tube_jax.state import (
+    State,
+    TimeStep,
+    base_state,
+    check_state,
+    validate,
+    with_narrow_integers,
+)
 from trap_tube_jax.transfers import (
     Transfer,
     compose,
@@ -228,7 +235,7 @@ def _timestep(state: State, reward: jax.Array) -> TimeStep:
 
 def _check_base(base: State) -> State:
     """Returns `base` if it is a valid state at time 0."""
-    validate(base)
+    base = validate(with_narrow_integers(base))
     time = int(base.time)
     if time != 0:
         raise ValueError(
@@ -242,7 +249,7 @@ def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
     """Returns the state that a transfer returns, if it is a valid one."""
     name = transfer_name(transfer)
     try:
-        drawn = jax.jit(transfer)(key, state)
+        drawn = jax.jit(compose(transfer))(key, state)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"transfer {name} failed; allowed: a function (key, state) -> state that runs under "

@@ -10,7 +10,7 @@ from trap_tube_jax.checks import check_registered_name
 from trap_tube_jax.controls import CONTROLS, drawn_from
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
-from trap_tube_jax.state import State, base_state, check_state
+from trap_tube_jax.state import State, base_state
 from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic, transfer_name
 
 
@@ -111,14 +111,14 @@ def make(
     base = entry.base if base is None else base
     if base is None:
         base = base_state(3 if num_features is None else num_features)
-    check_state(base)
-    if num_features not in (None, base.palette.shape[-1]):
+    max_steps = entry.max_steps if max_steps is None else max_steps
+    env = Environment(entry.transfers, base=base, max_steps=max_steps)
+    if num_features not in (None, env.num_features):
         raise ValueError(
             f"num_features={num_features} contradicts the base state, whose palette has "
-            f"{base.palette.shape[-1]} features; give one of them"
+            f"{env.num_features} features; give one of them"
         )
-    max_steps = entry.max_steps if max_steps is None else max_steps
-    return Environment(entry.transfers, base=base, max_steps=max_steps)
+    return env
 
 
 def register(
@@ -154,5 +154,6 @@ def register(
         if name in taken:
             raise ValueError(f"the name {name!r} is taken; taken are: {', '.join(sorted(taken))}")
     env = Environment(transfers, base=base, max_steps=max_steps)
+    base = None if base is None else env.base
     _task_sets[id] = TaskSet(id, short, env.transfers, base, env.max_steps)
     return _task_sets[id]

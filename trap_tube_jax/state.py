@@ -258,6 +258,15 @@ def check_state(state: Any) -> None:
             )
 
 
+def with_narrow_integers(state: Any) -> Any:
+    """Cuts 64-bit integers, which arithmetic gives under `jax_enable_x64`, to 32 bits."""
+
+    def narrow(field: Any) -> Any:
+        return field.astype(np.int32) if getattr(field, "dtype", None) == np.int64 else field
+
+    return jax.tree.map(narrow, state)
+
+
 def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
     pairs = zip(found, shape, strict=False)
     return len(found) == len(shape) and all(a == b if b else a >= 1 for a, b in pairs)

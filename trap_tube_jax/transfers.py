@@ -31,7 +31,7 @@ from trap_tube_jax.objects import (
     TUBE2,
 )
 from trap_tube_jax.prng import fold_in, loop_free, typed_key
-from trap_tube_jax.state import State, check_state
+from trap_tube_jax.state import State, check_state, with_narrow_integers
 
 Transfer = Callable[[jax.Array, State], State]
 
@@ -75,7 +75,7 @@ class Composition:
         """Applies the transfers to `state`."""
         key = typed_key(key)
         for index, transfer in enumerate(self.transfers):
-            state = transfer(fold_in(key, index), state)
+            state = with_narrow_integers(transfer(fold_in(key, index), state))
             # Without the barrier XLA fuses a draw into each of its uses and repeats it there.
             state = jax.lax.optimization_barrier(state)
         return state

@@ -56,12 +56,14 @@ def rollout(
         initial = jax.vmap(Frame.state)(frame, initial)
 
     def step(carry: Any, inputs: Any) -> Any:
-        time, step_key = inputs
+        time, data = inputs
         state, embedding, action_tm1, reward_tm1, cache = carry
         features, cache = cache.encode(agent, params, state, time)
         embedding = agent.step(params, embedding, features, action_tm1, reward_tm1)
         actions, value = agent.policy_and_value(params, embedding)
-        action = actions.mode() if step_key is None else actions.sample(step_key)
+        action = actions.mode()
+        if key is not None:
+            action = actions.sample(jax.random.wrap_key_data(data, impl=jax.random.key_impl(key)))
         after, timestep = jax.vmap(env.step)(state, action)
         taken = {
             "action": action,
@@ -81,7 +83,8 @@ def rollout(
     )
     # One more step than the episode has, for the last observation; states do not change any more.
     times = jnp.arange(env.max_steps + 1, dtype=jnp.int32)
-    keys = None if key is None else jax.random.split(key, len(times))
+    # As data: under `jax.vmap` over seeds, `jax_debug_key_reuse` takes scanned keys for used.
+    keys = None if key is None else jax.random.key_data(jax.random.split(key, len(times)))
     (*_, cache), (cells, value, *outputs) = jax.lax.scan(step, first, (times, keys))
     taken, embedding, log_prob = jax.tree.map(lambda x: x[:-1], outputs)
     episodes = Episodes(initial, cells, **taken, observation_id=cache.observation_id())

@@ -162,9 +162,10 @@ class PlainPPO:
         reset_key, key = jax.random.split(key)
         state, timestep = self.env.reset(reset_key)
 
-        def step(carry: Any, key: jax.Array) -> Any:
+        def step(carry: Any, data: jax.Array) -> Any:
             state, mask, inputs = carry
             hidden, logits, value = self.network.apply(params, *inputs, method="act")
+            key = jax.random.wrap_key_data(data)
             action = jax.random.categorical(key, logits).astype(jnp.int32)
             state, timestep = self.env.step(state, action)
             reward = mask * timestep.reward
@@ -174,7 +175,8 @@ class PlainPPO:
 
         start, nothing = params["params"]["initial"], (jnp.zeros(2, jnp.int32), jnp.zeros(1))
         first = (state, jnp.ones(()), (start, timestep.observation, *nothing))
-        keys = jax.random.split(key, self.env.max_steps)
+        # As data: under `jax.vmap`, `jax_debug_key_reuse` takes scanned keys for used.
+        keys = jax.random.key_data(jax.random.split(key, self.env.max_steps))
         (_, _, inputs), record = jax.lax.scan(step, first, keys)
         return Episode(jnp.concatenate([record[0], inputs[1][None]]), *record[1:])
 

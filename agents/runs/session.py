@@ -6,6 +6,7 @@ saving, then evaluation. No thread runs JAX in the background.
 
 import contextlib
 import dataclasses
+import functools
 import os
 import tempfile
 import time
@@ -22,7 +23,7 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import evaluate, own_and_paper_sets
 from agents.acting.policy import Policy
 from agents.acting.policy_files import load_policy
-from agents.arrays import from_arrays
+from agents.arrays import from_arrays, is_key, key_data
 from agents.command_line import option
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
@@ -351,10 +352,15 @@ def make_advance(learner: Learner) -> Advance:
             after, metrics = one_seed(jax.tree.map(lambda x: x[0], states))
             return jax.tree.map(lambda x: x[None], (after, metrics))
         after, metrics = jax.vmap(one_seed)(states)
-        keep = jax.vmap(jnp.where)
-        return jax.tree.map(lambda new, old: keep(active, new, old), after, states), metrics
+        return jax.tree.map(functools.partial(_where, active), after, states), metrics
 
     return advance
+
+
+def _where(chosen: Any, new: jax.Array, old: jax.Array) -> jax.Array:
+    """Takes `new` [S, ...] where `chosen` bool[S], else `old`; keys as data, used or not."""
+    data = jax.vmap(jnp.where)(chosen, key_data(new), key_data(old))
+    return jax.random.wrap_key_data(data, impl=jax.random.key_impl(new)) if is_key(new) else data
 
 
 def check_memory(run: Run) -> None:

@@ -18,6 +18,7 @@ from agents.runs.folder import read_json
 from agents.train import main
 from paths import ROOT
 from refusal import assert_refused, refused
+from settings import HAS_DEFAULT_DRAWS
 from small_runs import final_state, options, small_config, untimed
 from trap_tube_jax.imports import import_modules
 
@@ -57,7 +58,7 @@ def test_a_run_records_the_module_and_needs_leave_to_import_it(here):
     assert (stored["imports"], stored["config"]["max_steps"]) == (["my_module"], None)
     (row,) = untimed(folder)
     assert 6 < float(row["episode_length"]) <= 30
-    assert float(row["intrinsic_reward"]) > 0
+    assert float(row["intrinsic_reward"]) > 0 or not HAS_DEFAULT_DRAWS
 
     assert_refused(["my_module", "--import"], agents.load, folder)
     assert "my_module" not in sys.modules

@@ -36,8 +36,11 @@ TRANSFERS: list[tt.Transfer] = [
     *map(drawn_from, CONTROLS),
 ]
 STATES = [
-    *(ENVIRONMENTS[name].reset(KEY) for name in ("own base", "more features", "statistics")),
-    tt.VectorEnvironment(tt.make("base")).reset(jax.random.split(KEY, 2)),
+    *(
+        ENVIRONMENTS[name].reset(jax.random.clone(KEY))
+        for name in ("own base", "more features", "statistics")
+    ),
+    tt.VectorEnvironment(tt.make("base")).reset(jax.random.split(jax.random.clone(KEY), 2)),
 ]
 TASK_SETS = (*tt.PAPER_TASK_SETS, *tt.CONTROL_TASK_SETS)
 PUBLIC = [*ENVIRONMENTS.values(), *TRANSFERS, *TASK_SETS, *itertools.chain(*STATES)]
@@ -55,7 +58,7 @@ def test_a_copy_equals_its_original_and_nothing_else(duplicate):
 @pytest.mark.parametrize("name", ["graded", "control", "statistics"])
 def test_an_unpickled_environment_plays_the_same(name):
     def play(env: Any) -> Any:
-        state, first = jax.jit(env.reset)(KEY)
+        state, first = jax.jit(env.reset)(jax.random.clone(KEY))
         return [first, *jax.jit(env.step)(state, np.zeros(2, np.int32))]
 
     env = ENVIRONMENTS[name]

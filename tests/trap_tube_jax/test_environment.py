@@ -173,8 +173,8 @@ def test_own_transfers_get_keys_that_mix_with_own_keys(make_key):
     """Typed keys, whatever `reset` was given, and those that `compose` promises."""
 
     def own(key, state):
-        jnp.stack([key, jax.random.key(1)])
-        jax.lax.cond(state.time == 0, lambda: key, lambda: jax.random.key(2))
+        jnp.stack([jax.random.clone(key), jax.random.key(1)])
+        jax.lax.cond(state.time == 0, lambda: jax.random.clone(key), lambda: jax.random.key(2))
         return state.replace(agent=jax.random.randint(key, (2,), 8, 12))
 
     key = make_key(3)
@@ -263,7 +263,7 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
         ["broken", "share cell (0, 0)"],
     ),
     (
-        {"transfers": (broken(agent=jnp.zeros(2)),)},
+        {"transfers": (broken(agent=jnp.zeros(2, jnp.float32)),)},
         ["broken", "state.agent", "int32[2]", "float32[2]"],
     ),
     ({"transfers": (broken(tool=jnp.array((12, 0))),)}, ["broken", "tool", "(12, 0)", "0 to 11"]),

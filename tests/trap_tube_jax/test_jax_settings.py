@@ -12,18 +12,28 @@ import trap_tube_jax as tt
 from easy import assert_same, bits, enable_x64
 
 OPTIMISED = False  # few steps
+
+
+def raised_agent(key: jax.Array, state: tt.State) -> tt.State:
+    """Moves the agent up, in integers of 64 bits if these are enabled."""
+    del key
+    return state.replace(agent=jnp.stack([0, jnp.argmax(state.board[0])]))
+
+
 TRANSFERS = (
     *tt.task_set("two-traps").transfers,
     *(tt.graded_perceptual(0.5), tt.perceptual),
     *(tt.graded_structural(0.5), tt.structural),
     tt.symbolic,
+    raised_agent,
 )
+BASE = tt.base_state().replace(food=np.array([5, 6]))  # of NumPy's own 64 bits
 STEPS = 4
 
 
 def play() -> Any:
     """Episodes of two steps, alone and in a batch, and a picture; keys as their bits."""
-    env = tt.Environment(TRANSFERS, max_steps=2)
+    env = tt.Environment(TRANSFERS, base=BASE, max_steps=2)
     alone = tt.EpisodeStatistics(tt.AutoReset(env))
     batch = tt.EpisodeStatistics(tt.VectorEnvironment(env, chunk_size=2))
     keys = jax.random.split(jax.random.key(5), 3)

@@ -24,7 +24,9 @@ DRAWS = {
     "normal": lambda key: jax.random.normal(key, (5, 3), jnp.float32),
     "randint": lambda key: jax.random.randint(key, (), 0, 5, jnp.int32),
     "split": lambda key: jax.random.key_data(jax.random.split(key, 3)),
-    "chain": lambda key: jax.random.bits(jax.random.fold_in(jax.random.split(key)[1], 3)),
+    "chain": lambda key: jax.random.bits(
+        jax.random.fold_in(jax.random.split(key)[1], 3), (), jnp.uint32
+    ),
 }
 
 
@@ -35,7 +37,7 @@ def test_the_hash_is_threefry(key, counter, result):
 
 
 def all_draws(key):
-    return {name: draw(key) for name, draw in DRAWS.items()}
+    return {name: draw(jax.random.clone(key)) for name, draw in DRAWS.items()}
 
 
 def test_draws_are_those_of_jax():
@@ -75,7 +77,7 @@ NO_KEYS = {
     "a number": (0, ["int"]),
     "nothing": (None, ["NoneType"]),
     "a text": ("key", ["str"]),
-    "floats": (jnp.zeros(2), ["float32", "(2,)"]),
+    "floats": (jnp.zeros(2, jnp.float32), ["float32", "(2,)"]),
     "a batch": (jax.random.split(jax.random.key(0), 3), ["(3,)", "jax.vmap"]),
     "a raw batch": (np.zeros((3, 2), np.uint32), ["(3, 2)", "jax.vmap"]),
 }

@@ -81,7 +81,8 @@ def test_the_tool_is_one_bar_and_hidden_below_the_agent():
 
 def test_a_horizontal_tool_is_the_vertical_one_turned():
     def draw(tool, extent):
-        state = tt.base_state().replace(tool=jnp.array(tool), tool_extent=jnp.array(extent))
+        tool, extent = jnp.array([tool, extent], jnp.int32)
+        state = tt.base_state().replace(tool=tool, tool_extent=extent)
         return cells(tt.render(state, CELL, grid=False))
 
     lying, standing = draw([2, 3], [1, 4])[2, 3:7], draw([3, 2], [4, 1])[3:7, 2]
@@ -157,7 +158,7 @@ def test_the_padding_of_a_plan_is_drawn_as_a_step_that_moves_nothing():
 
 def test_gif_holds_the_frames(tmp_path):
     state = tt.base_state()
-    agents = jnp.array([[9, 1], [9, 2], [9, 3]])
+    agents = jnp.array([[9, 1], [9, 2], [9, 3]], jnp.int32)
     frames = [np.asarray(tt.render(state.replace(agent=agent), 8)) for agent in agents]
     path = tmp_path / "episode.gif"
     tt.save_gif(frames, path, fps=10, hold=0.5)

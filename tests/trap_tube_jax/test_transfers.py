@@ -258,7 +258,7 @@ def test_symbolic_leaves_alone_what_could_not_be_a_tool():
 @pytest.mark.parametrize("covered", ["agent", "food"])
 def test_symbolic_leaves_alone_what_would_put_an_object_below_agent_or_food(covered):
     start = tt.base_state()
-    tool = {"agent": start.agent, "food": start.food}[covered] - jnp.array([3, 0])
+    tool = {"agent": start.agent, "food": start.food}[covered] - jnp.array([3, 0], jnp.int32)
     drawn = draw(tt.symbolic, 7, start.replace(tool=tool), 64)
     np.testing.assert_array_equal(drawn.board, np.broadcast_to(start.board, (64, 12, 12)))
     np.testing.assert_array_equal(drawn.tool, np.broadcast_to(tool, (64, 2)))

@@ -28,8 +28,9 @@ def test_the_loss_and_its_gradient_are_those_of_the_plain_encoding(curiosity, mo
 
     @jax.jit
     def prepare(key):
-        state = train.init(key)
-        trajectory = train.play(state.params, jax.random.split(key, 8), key)
+        init_key, play_key, action_key = jax.random.split(key, 3)
+        state = train.init(init_key)
+        trajectory = train.play(state.params, jax.random.split(play_key, 8), action_key)
         reward, _ = train.intrinsic_reward(state, trajectory)
         return state.params, train.make_batch(state, trajectory, reward)[0]
 

@@ -36,7 +36,7 @@ def make_play():
     def recording(actions, key):
         data = jax.random.key_data(key)
         jax.debug.callback(lambda data: drawn_with.append(data.tobytes()), data)
-        return sample(actions, key).at[0].set(jnp.array([0, 3]))
+        return sample(actions, key).at[0].set(jnp.array([0, 3], jnp.int32))
 
     def play(params, initial):
         key = jax.random.key(2)
@@ -61,9 +61,9 @@ def played(make_play):
     initial, _ = jax.jit(jax.vmap(env.reset))(keys)
     # One episode is solved by its first move, so that an early end is among them.
     initial = initial.replace(
-        agent=initial.agent.at[0].set(jnp.array([11, 4])),
-        food=initial.food.at[0].set(jnp.array([11, 5])),
-        tool=initial.tool.at[0].set(jnp.array([0, 0])),
+        agent=initial.agent.at[0].set(jnp.array([11, 4], jnp.int32)),
+        food=initial.food.at[0].set(jnp.array([11, 5], jnp.int32)),
+        tool=initial.tool.at[0].set(jnp.array([0, 0], jnp.int32)),
     )
     play = make_play(params, initial)
     return env, agent, params, initial, play, play(params, initial)

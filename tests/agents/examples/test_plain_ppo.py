@@ -80,9 +80,14 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
         trajectory.value[:-1, :, 0],
     )
     steps = jax.tree.map(lambda x: x.swapaxes(0, 1), (episodes.observations(), *steps))
-    plain_state = plain.init(jax.random.key(0)).replace(params=plain_params(state.params))
+    start = plain.init(jax.random.key(0))
+
+    def translated(params):  # in 64 bits where the plain program computes in these
+        return jax.tree.map(lambda x, own: x.astype(own.dtype), plain_params(params), start.params)
+
+    plain_state = start.replace(params=translated(state.params))
     variance, (episode, advantage, target) = plain.prepare(plain_state, plain_ppo.Episode(*steps))
-    total, terms = plain.loss(plain_params(now), (episode, advantage, target))
+    total, terms = plain.loss(translated(now), (episode, advantage, target))
     chex.assert_trees_all_close(
         [*variance, advantage.T, target.T[..., None], {**terms, "loss": total}],
         [

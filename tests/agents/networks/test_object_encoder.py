@@ -83,7 +83,7 @@ def test_any_number_of_features_will_do(num_features):
     assert features.shape == (1, 12)
     _, exists, _ = describe(board)
     assert exists.sum() == 5  # ground, trap, exit, tubes, tool
-    moved = tt.observe(tt.base_state(num_features).replace(agent=jnp.array([0, 0])))[None]
+    moved = tt.observe(tt.base_state(num_features).replace(agent=jnp.zeros(2, jnp.int32)))[None]
     assert (encode(params, moved) != features).any()
 
 
@@ -98,7 +98,7 @@ def test_objects_that_are_not_there_do_not_count(monkeypatch):
 
     def filled(board):
         described, exists, *rest = described_by(board)
-        noise = jax.random.normal(jax.random.key(1), described.shape)
+        noise = jax.random.normal(jax.random.key(1), described.shape, described.dtype)
         return (jnp.where(exists[..., None], described, noise), exists, *rest)
 
     described_by = object_encoder.describe_board

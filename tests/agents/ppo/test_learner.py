@@ -84,9 +84,14 @@ def data(keys: jax.Array) -> list[tuple[int, ...]]:
 
 @pytest.fixture(scope="module")
 def scripted() -> tuple[Learner, TrainState, Any]:
-    """A scripted learner, its first state, and its iteration, compiled."""
+    """A scripted learner, its first state, and its iteration, compiled; keys may be used again."""
     scripted = Scripted(**vars(make_train(BEST)))
-    return scripted, scripted.init(jax.random.key(0)), jax.jit(scripted.iterate)
+
+    def iterate(state):
+        replay = state.task_replay._replace(keys=jax.random.clone(state.task_replay.keys))
+        return scripted.iterate(state._replace(key=jax.random.clone(state.key), task_replay=replay))
+
+    return scripted, scripted.init(jax.random.key(0)), jax.jit(iterate)
 
 
 def test_new_tasks_are_new_and_others_are_of_the_lists():
@@ -243,9 +248,12 @@ def with_curiosity(monkeypatch):
 @pytest.mark.parametrize(
     ("returned", "words"),
     [
-        ({"reward": jnp.zeros(3)}, ["reward must return", "float32[6, 2]", "float32[3]"]),
-        ({"reward": jnp.zeros((6, 2), int)}, ["float32[6, 2]", "int32[6, 2]"]),
-        ({"given": jnp.zeros(2)}, ["int32[]", "float32[2]"]),
+        (
+            {"reward": jnp.zeros(3, jnp.float32)},
+            ["reward must return", "float32[6, 2]", "float32[3]"],
+        ),
+        ({"reward": jnp.zeros((6, 2), jnp.int32)}, ["float32[6, 2]", "int32[6, 2]"]),
+        ({"given": jnp.zeros(2, jnp.float32)}, ["int32[]", "float32[2]"]),
         ({"losses": ["policy_loss"]}, ["losses must end in '_loss'", "got 'policy_loss'"]),
         ({"losses": ["mine"]}, ["policy_loss, value_loss, entropy_loss", "got 'mine'"]),
     ],

@@ -319,5 +319,5 @@ def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
         assert_refused(words, tt.score, action, ["near"], 20)
     with pytest.raises(ValueError, match="act returned a carry with NaN on near"):
         tt.score(Broken(), ["near"], 20)
-    floats = Constant([0.0, 3.0])
+    floats = Constant(np.array([0, 3], np.float32))
     assert_refused(["must hold integers", "float32[2]"], tt.score, floats, ["near"], 20)
