@@ -1,6 +1,5 @@
 """Evaluation from the command line: python -m agents.evaluate --help."""
 
-import csv
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from agents.command_line import option, parse
 from agents.runs import compilation
 from agents.runs.evaluator import evaluation_rows
 from agents.runs.loading import load_policies
+from agents.runs.metrics import write_rows
 from agents.runs.report import save_first_solved
 from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
@@ -76,10 +76,7 @@ def evaluate(options: Options) -> None:
             for policy, own in zip(policies, scores, strict=True)
             for row in evaluation_rows(own, policy, 0, "test")
         ]
-        with options.output.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(options.output, rows)
         notes.append(f"results: {options.output}")
     if options.gif is not None:
         options.gif.parent.mkdir(parents=True, exist_ok=True)

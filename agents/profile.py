@@ -8,11 +8,11 @@ from pathlib import Path
 
 from agents.acting.policy import Policy
 from agents.command_line import option, parse
+from agents.files import write_json
 from agents.profiles import figures
 from agents.profiles.measure import failure_table, profile, success_table
 from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation
-from agents.runs.folder import write_json
 from agents.runs.loading import load_policies
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import plain_errors

@@ -26,7 +26,7 @@ ENVIRONMENT = (
     ("adapters", "gallery", "play"),
 )
 AGENTS = (
-    ("arrays", "command_line", "registry"),
+    ("arrays", "command_line", "files", "registry"),
     ("config",),
     ("parallel",),
     ("networks",),

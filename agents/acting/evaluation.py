@@ -14,7 +14,13 @@ from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.scoring.benchmark import blocks
 from trap_tube_jax.scoring.scores import Optimality, Score
-from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks, label, layout_numbers
+from trap_tube_jax.scoring.tasks import (
+    ALL_SETS,
+    Purpose,
+    evaluation_tasks,
+    label,
+    layout_numbers,
+)
 from trap_tube_jax.solver.search import take
 from trap_tube_jax.state import State
 
@@ -78,7 +84,9 @@ class Evaluator:
         self._play: Any = jax.jit(lambda params, states: evaluate(agent, params, env, states))
 
     @classmethod
-    def of_sets(cls, config: Config, sets: Sequence[str], num_tasks: int) -> "Evaluator":
+    def of_sets(
+        cls, config: Config, sets: Sequence[str], num_tasks: int, purpose: Purpose = "test"
+    ) -> "Evaluator":
         """Makes an evaluator of registered task sets.
 
         Raises:
@@ -87,8 +95,8 @@ class Evaluator:
         if not sets:
             raise ValueError(f"name at least one task set; allowed: {', '.join(ALL_SETS)}")
         names = [tt.task_set(name).short for name in sets]
-        tasks = {name: evaluation_tasks(name, num_tasks, config.num_features) for name in names}
-        return cls(config, tasks)
+        features = config.num_features
+        return cls(config, {x: evaluation_tasks(x, num_tasks, features, purpose) for x in names})
 
     def __call__(self, params: Params) -> dict[str, Evaluation]:
         """Plays all tasks; returns NumPy arrays by the names of the sets."""

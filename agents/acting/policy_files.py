@@ -4,7 +4,6 @@ Reading a file runs no code from it and allocates no more than its size.
 """
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import safetensors.numpy
 from agents.acting.policy import Policy
 from agents.arrays import Arrays, from_arrays, to_arrays
 from agents.config import Config
+from agents.files import write_bytes
 from agents.networks.agent import PARTS, Agent
 
 SUFFIX = ".safetensors"
@@ -28,12 +28,7 @@ def save_policy(path: Path, policy: Policy) -> None:
         "policy": json.dumps({"config": policy.config.to_dict(), "iteration": policy.iteration})
     }
     params = {part: policy.params[part] for part in PARTS}
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        draft.write_bytes(safetensors.numpy.save(to_arrays(params), header))
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    write_bytes(path, safetensors.numpy.save(to_arrays(params), header))
 
 
 def load_policy(path: Path) -> Policy:

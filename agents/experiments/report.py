@@ -13,7 +13,7 @@ import pandas as pd
 
 import agents
 from agents.experiments import figures, tables
-from agents.runs.folder import read_json, write_json, write_text
+from agents.files import read_json, write_json, write_text
 from agents.runs.results import find_runs, metrics
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.registry import task_set

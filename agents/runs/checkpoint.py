@@ -1,8 +1,8 @@
 """Checkpoints of the whole training state, by Orbax.
 
-A checkpoint is a flat table of NumPy arrays and a JSON record. Orbax writes it atomically and in
-the foreground. The record holds a digest of the arrays, because Orbax returns other numbers
-without an error where a byte of its files has changed.
+A checkpoint is a folder named by its iteration. It holds a flat table of NumPy arrays and a JSON
+record. Orbax writes it atomically and in the foreground. The record has a digest of the arrays,
+because Orbax returns other numbers without an error where a byte of its files has changed.
 """
 
 import hashlib
@@ -10,7 +10,7 @@ import logging
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,53 +21,32 @@ from agents.arrays import Arrays, to_arrays
 logging.getLogger("absl").setLevel(logging.CRITICAL)  # a stack trace for every refused file
 
 
-class CheckpointError(ValueError):
-    """A checkpoint cannot be read; the message names it and says what to do."""
+def save(folder: Path, iteration: int, state: Any, record: dict[str, Any], *, keep: int) -> None:
+    """Saves a pytree of arrays and keys with a record of plain values.
 
+    Returns once both are on disk, and the `keep` newest checkpoints alone are left. A checkpoint
+    of this iteration is kept as it is.
 
-class Checkpoints:
-    """Writes the checkpoints of one run, each named by its iteration. A context manager."""
-
-    def __init__(self, folder: Path, *, keep: int):
-        """Makes the folder if missing; the `keep` newest checkpoints stay in it."""
-        folder.mkdir(parents=True, exist_ok=True)  # Orbax refuses to for one of many processes
-        self._folder = folder
-        self._manager = ocp.CheckpointManager(
-            folder.absolute(),
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=keep,
-                create=False,
-                cleanup_tmp_directories=True,
-                enable_async_checkpointing=False,
-                multiprocessing_options=_this_process_alone(),
-            ),
-        )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._manager.close()
-
-    def save(self, iteration: int, state: Any, record: dict[str, Any]) -> None:
-        """Saves a pytree of arrays and keys with a record of plain values.
-
-        Returns once both are on disk. A checkpoint of this iteration is kept as it is.
-
-        Raises:
-          OSError: the checkpoint cannot be written.
-        """
-        if iteration in iterations(self._folder):
-            return
-        arrays = to_arrays(state)
-        record = {**record, "iteration": iteration, "digest": digest(arrays)}
-        items = ocp.args.Composite(
-            state=ocp.args.StandardSave(arrays), record=ocp.args.JsonSave(record)
-        )
-        try:
-            self._manager.save(iteration, args=items, force=True)
-        except Exception as error:  # Orbax passes on what its many back ends raise
-            raise OSError(f"cannot write checkpoint {iteration}: {_first_line(error)}") from error
+    Raises:
+      OSError: the checkpoint cannot be written.
+    """
+    folder.mkdir(exist_ok=True)
+    for draft in folder.glob("*.orbax-checkpoint-tmp*"):  # of a killed process
+        shutil.rmtree(draft)
+    if iteration in iterations(folder):
+        return
+    arrays = to_arrays(state)
+    record = {**record, "iteration": iteration, "digest": digest(arrays)}
+    items = ocp.args.Composite(
+        state=ocp.args.StandardSave(arrays), record=ocp.args.JsonSave(record)
+    )
+    try:
+        with _checkpointer() as checkpointer:
+            checkpointer.save((folder / str(iteration)).absolute(), args=items)
+    except Exception as error:  # Orbax passes on what its many back ends raise
+        raise OSError(f"cannot write checkpoint {iteration}: {_first_line(error)}") from error
+    for old in iterations(folder)[:-keep]:
+        shutil.rmtree(folder / str(old))
 
 
 def iterations(folder: Path) -> list[int]:
@@ -82,19 +61,24 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
     A writer may delete a checkpoint meanwhile; the next newest is then read.
 
     Raises:
-      CheckpointError: there is none, or it is damaged.
+      ValueError: there is none, or it is damaged; the message says what to do.
     """
     known = iterations(folder)
     if not known:
-        raise CheckpointError(f"{folder} holds no checkpoint")
+        raise ValueError(f"{folder} holds no checkpoint")
     chosen = known[-1] if iteration is None else iteration
     if chosen not in known:
         allowed = ", ".join(map(str, known))
-        raise CheckpointError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
+        raise ValueError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
     try:
         with tempfile.TemporaryDirectory() as copy:  # which no writer deletes
             shutil.copytree(folder / str(chosen), copy, dirs_exist_ok=True)
-            arrays, record = _restore(Path(copy))
+            items = ocp.args.Composite(
+                state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore()
+            )
+            with _checkpointer() as checkpointer:
+                restored = checkpointer.restore(Path(copy), args=items)
+        arrays, record = restored["state"], restored["record"]
         if digest(arrays) == record["digest"]:
             return arrays, record
         problem = "its numbers have changed"
@@ -104,21 +88,9 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
         return load(folder)
     others = [other for other in known if other != chosen]
     advice = f"use checkpoint {others[-1]}" if others else "begin again"
-    raise CheckpointError(
+    raise ValueError(
         f"checkpoint {folder / str(chosen)} is damaged ({problem}); delete it to {advice}"
     )
-
-
-def _restore(path: Path) -> tuple[Arrays, dict[str, Any]]:
-    items = ocp.args.Composite(state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore())
-    options = _this_process_alone()
-    handler = ocp.CompositeCheckpointHandler(
-        state=ocp.StandardCheckpointHandler(multiprocessing_options=options),
-        record=ocp.JsonCheckpointHandler(multiprocessing_options=options),
-    )
-    with ocp.Checkpointer(handler, multiprocessing_options=options) as checkpointer:
-        restored = checkpointer.restore(path, args=items)
-    return restored["state"], restored["record"]
 
 
 def digest(arrays: Arrays) -> str:
@@ -131,14 +103,19 @@ def digest(arrays: Arrays) -> str:
     return total.hexdigest()
 
 
-def _this_process_alone() -> ocp.options.MultiprocessingOptions:
-    """Tells Orbax to wait for no other process: one of them reads and writes."""
-    if not jax.distributed.is_initialized():
-        return ocp.options.MultiprocessingOptions()
-    own = jax.process_index()
-    return ocp.options.MultiprocessingOptions(
-        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+def _checkpointer() -> ocp.Checkpointer:
+    """Reads and writes in this process alone; by default Orbax waits for all of a job."""
+    alone = ocp.options.MultiprocessingOptions()
+    if jax.distributed.is_initialized():
+        own = jax.process_index()
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+        )
+    handler = ocp.CompositeCheckpointHandler(
+        state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+        record=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
     )
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _first_line(error: Exception) -> str:

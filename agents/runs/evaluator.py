@@ -12,7 +12,7 @@ from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import Row
 from trap_tube_jax.registry import task_set
 from trap_tube_jax.scoring.scores import Score
-from trap_tube_jax.scoring.tasks import Purpose, evaluation_tasks
+from trap_tube_jax.scoring.tasks import Purpose
 
 
 class PeriodicEvaluator:
@@ -23,18 +23,12 @@ class PeriodicEvaluator:
     """
 
     def __init__(self, folder: RunFolder, run: Run, sets: Sequence[str], rows: Sequence[Row]):
-        """Draws the tasks, and continues after rows of `evaluations.csv`.
-
-        Args:
-          folder: the run's files.
-          run: what is trained.
-          sets: short names of the task sets.
-          rows: those of earlier evaluations.
-        """
+        """Draws the tasks of sets, and continues after earlier rows of `evaluations.csv`."""
         self._folder = folder
         trained_on_base = task_set(run.config.env_id).short == "base"
         self._ranked = [name for name in sets if name != "base" or trained_on_base] or list(sets)
-        self._evaluator = make_evaluator(run, sets, run.config.eval_episodes, "validation")
+        tasks = run.config.eval_episodes
+        self._evaluator = Evaluator.of_sets(run.config, sets, tasks, "validation")
         self._best: dict[int, float] = {}
         evaluated = itertools.groupby(
             (row for row in rows if row["purpose"] == "validation"),
@@ -57,13 +51,6 @@ class PeriodicEvaluator:
         mean, before = float(np.mean(shares)), self._best.get(seed, -1.0)
         self._best[seed] = max(mean, before)
         return mean > before
-
-
-def make_evaluator(run: Run, sets: Sequence[str], tasks: int, purpose: Purpose) -> Evaluator:
-    """Prepares greedy play on fixed tasks of several sets."""
-    features = run.config.num_features
-    drawn = {name: evaluation_tasks(name, tasks, features, purpose) for name in sets}
-    return Evaluator(run.config, drawn)
 
 
 def evaluation_rows(

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 import shutil
 import socket
@@ -13,6 +12,7 @@ from typing import Any, Self
 import filelock
 
 from agents.config import PRESETS, Config
+from agents.files import read_json, write_json
 from trap_tube_jax._version import __version__
 from trap_tube_jax.imports import import_modules
 
@@ -44,11 +44,7 @@ class Run:
     imports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Checks preset and seeds, and names the algorithm.
-
-        Raises:
-          ValueError: a value is not allowed; the message names the allowed ones.
-        """
+        """Names the algorithm; ValueError names the allowed values of preset and seeds."""
         if self.preset not in PRESETS:
             raise ValueError(f"unknown preset {self.preset!r}; allowed: {', '.join(PRESETS)}")
         for name, low, high in (("seed", 0, MAX_SEED), ("seeds", 1, 65_536)):
@@ -214,10 +210,7 @@ class RunFolder:
         import_modules(imports)
         folder = cls(path)
         if not folder.config.is_file():
-            known = sorted(entry.parent.name for entry in path.parent.glob(f"*/{CONFIG_FILE}"))
-            raise ValueError(
-                f"{path} holds no run; runs in {path.parent}: {', '.join(known) or 'none'}"
-            )
+            raise ValueError(f"{path} holds no run; {runs_next_to(path)}")
         values = read_json(folder.config)
         version = values.pop("version", "unknown") if isinstance(values, dict) else "unknown"
         try:
@@ -231,40 +224,13 @@ class RunFolder:
             ) from error
 
 
-def check_name(name: str) -> None:
-    """Checks that a name is a plain folder name.
+def runs_next_to(path: Path) -> str:
+    """Lists the runs in the parent of a folder, for messages."""
+    known = sorted(entry.parent.name for entry in path.parent.glob(f"*/{CONFIG_FILE}"))
+    return f"runs in {path.parent}: {', '.join(known) or 'none'}"
 
-    Raises:
-      ValueError: it is empty, hidden or a path.
-    """
+
+def check_name(name: str) -> None:
+    """Raises ValueError unless a name is a plain folder name."""
     if not name or Path(name).name != name or name.startswith("."):
         raise ValueError(f"name must be a folder's name without a path, got {name!r}")
-
-
-def write_json(path: Path, values: Any) -> None:
-    """Writes a JSON file atomically, and makes its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(values, indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file atomically."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-def read_json(path: Path) -> Any:
-    """Reads a JSON file.
-
-    Raises:
-      ValueError: the file is not JSON; the message names it.
-      OSError: the file cannot be read.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error

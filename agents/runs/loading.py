@@ -12,7 +12,7 @@ from agents.acting.policy import Policy
 from agents.arrays import from_arrays
 from agents.networks.agent import PARTS, Agent
 from agents.runs import checkpoint
-from agents.runs.folder import CONFIG_FILE, Run, RunFolder
+from agents.runs.folder import CONFIG_FILE, Run, RunFolder, runs_next_to
 from trap_tube_jax.imports import import_modules
 
 SEED = "seed "  # prefix of the names of a run's policies
@@ -42,10 +42,9 @@ def load_policies(
         if path.is_file():
             return [policy_files.load_policy(path)]
         return [pretrained.load_shipped(str(source))]
-    known = sorted(entry.parent.name for entry in path.parent.glob(f"*/{CONFIG_FILE}"))
     raise ValueError(
-        f"{source} is neither a run, a file nor a shipped agent; runs in {path.parent}: "
-        f"{', '.join(known) or 'none'}; shipped agents: {', '.join(pretrained.names())}"
+        f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
+        f"shipped agents: {', '.join(pretrained.names())}"
     )
 
 
@@ -65,13 +64,7 @@ def load_run(path: Path, iteration: int | None, imports: tuple[str, ...]) -> lis
 
 
 def policies(run: Run, params: Any, iterations: np.ndarray) -> list[Policy]:
-    """Splits the parameters [S, ...] of a run's seeds into one policy per seed.
-
-    Args:
-      run: the run.
-      params: the parameters; those of a curiosity are left out.
-      iterations: i32[S], iterations trained.
-    """
+    """Splits parameters [S, ...] of a run, trained i32[S] iterations, into a policy per seed."""
     params = {part: params[part] for part in PARTS}
     return [
         Policy(

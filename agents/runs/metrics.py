@@ -7,48 +7,37 @@ from pathlib import Path
 from typing import Any
 
 from agents.config import Config
-from agents.runs.folder import write_text
+from agents.files import write_text
 
 Row = Mapping[str, Any]
 
 
-class CsvLog:
-    """A CSV file that grows by rows, each on disk as soon as it is appended.
+def append_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Appends rows to a CSV file, which the first of them begin with a header.
 
-    Attributes:
-      rows: all rows.
+    Raises:
+      ValueError: a row has a column that the header lacks.
+      OSError: the file cannot be written.
     """
-
-    def __init__(self, path: Path, *, last_iteration: int = 0):
-        """Opens the file, made at the first row if missing; drops rows after `last_iteration`."""
-        self._path = path
-        rows = read_rows(path)
-        self.rows: list[Row] = [row for row in rows if row["iteration"] <= last_iteration]
-        if rows:
-            write_text(path, self._text(self.rows, header=True))
-
-    def append(self, rows: Sequence[Row]) -> None:
-        """Appends rows of the columns of the first row.
-
-        Raises:
-          ValueError: a row has a further column.
-          OSError: the file cannot be written.
-        """
-        self.rows.extend(rows)
-        with self._path.open("a", newline="", encoding="utf-8") as file:
-            file.write(self._text(rows, header=not file.tell()))
-
-    def _text(self, rows: Sequence[Row], *, header: bool) -> str:
-        text = io.StringIO()
-        if self.rows:
-            writer = csv.DictWriter(text, list(self.rows[0]), lineterminator="\n")
-            if header:
-                writer.writeheader()
-            writer.writerows(rows)
-        return text.getvalue()
+    with path.open("a+", newline="", encoding="utf-8") as file:
+        file.seek(0)
+        header = next(csv.reader(file), None)
+        writer = csv.DictWriter(file, header or list(rows[0]), lineterminator="\n")
+        if header is None:
+            writer.writeheader()
+        writer.writerows(rows)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Writes one or more rows of the same columns to a CSV file, atomically."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def read_rows(path: Path) -> list[Row]:
     """Reads the rows of a CSV file, numbers parsed; none if it is missing.
 
     A torn last line, which a killed process leaves, is dropped.
@@ -56,14 +45,22 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     Raises:
       ValueError: the file has no column `iteration`.
     """
-    if not path.exists():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    reader = csv.DictReader(line for line in lines if line.endswith("\n"))
-    if lines and "iteration" not in (reader.fieldnames or ()):
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    reader = csv.DictReader(line for line in text.splitlines(True) if line.endswith("\n"))
+    if text and "iteration" not in (reader.fieldnames or ()):
         raise ValueError(f"{path} has no header with a column 'iteration'; delete or restore it")
     whole = [row for row in reader if None not in row and None not in row.values()]
-    return [{name: _parse(text) for name, text in row.items()} for row in whole]
+    return [{name: _parse(value) for name, value in row.items()} for row in whole]
+
+
+def rewind_rows(path: Path, iteration: int) -> list[Row]:
+    """Deletes the rows after an iteration from a CSV file; returns the others."""
+    rows = [row for row in read_rows(path) if row["iteration"] <= iteration]
+    if rows:
+        write_rows(path, rows)
+    else:
+        path.unlink(missing_ok=True)
+    return rows
 
 
 def is_last(row: Row, config: Config) -> bool:

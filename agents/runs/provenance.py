@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from agents.runs.folder import read_json, write_json
+from agents.files import read_json, write_json
 
 ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")

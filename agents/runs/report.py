@@ -20,8 +20,9 @@ import numpy as np
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.acting.rollout import rollout
+from agents.files import write_text
 from agents.ppo.learner import Learner, TrainState
-from agents.runs.folder import Run, RunFolder, write_text
+from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import Row, read_rows
 from trap_tube_jax import solver
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES, NO_DIRECTION

@@ -7,7 +7,8 @@ from typing import Any
 
 import pandas as pd
 
-from agents.runs.folder import CONFIG_FILE, RunFolder, read_json
+from agents.files import read_json
+from agents.runs.folder import CONFIG_FILE, RunFolder
 
 Paths = str | Path | Iterable[str | Path]
 

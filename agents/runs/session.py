@@ -20,7 +20,7 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import evaluate, own_and_paper_sets
+from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets
 from agents.acting.policy import Policy
 from agents.acting.policy_files import load_policy
 from agents.arrays import from_arrays, is_key, key_data
@@ -32,13 +32,13 @@ from agents.ppo.learner import Learner, TrainState, make_train
 from agents.ppo.memory import memory_estimate
 from agents.runs import checkpoint, report
 from agents.runs.display import ProgressLine
-from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows, make_evaluator
+from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows
 from agents.runs.folder import Run, RunFolder
 from agents.runs.loading import policies
 from agents.runs.loggers import open_loggers
-from agents.runs.metrics import CsvLog, Row, is_last
+from agents.runs.metrics import Row, append_rows, is_last, read_rows, rewind_rows
 from agents.runs.provenance import note_provenance
-from agents.runs.stopping import DivergedError, Stopped, StopSignals
+from agents.runs.stopping import Stopped, StopSignals
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
@@ -112,7 +112,7 @@ def train_run(
       The scores on test tasks by seed; none if the run was finished before.
 
     Raises:
-      ValueError: the run cannot be trained or continued, or it diverged (`DivergedError`).
+      ValueError: the run cannot be trained or continued, or it diverged.
       OSError: a file cannot be written.
       Stopped: on SIGINT or SIGTERM, after the current iteration has been saved.
     """
@@ -125,9 +125,8 @@ def train_run(
         if not processes.is_first():  # only the first process's files are kept
             written = RunFolder(Path(stack.enter_context(tempfile.TemporaryDirectory())))
         session = Session(run, options, console, folder.checkpoints, written, stop_file)
-        with session.checkpoints:
-            session.train()
-            return session.finish() if processes.is_first() else {}
+        session.train()
+        return session.finish() if processes.is_first() else {}
 
 
 class Session:
@@ -160,14 +159,11 @@ class Session:
         self.compile_seconds: float = record["compile_seconds"]
         self._last = {int(row["seed"]): row for row in record["last"]}
         self.state = self.placement.put(init(keys) if state is None else state)
-        self.checkpoints = checkpoint.Checkpoints(folder.checkpoints, keep=options.keep)
-        self.metrics = CsvLog(folder.metrics, last_iteration=self.iteration)
-        self.evaluations = CsvLog(folder.evaluations, last_iteration=self.iteration)
-        if len(self.metrics.rows) < self.iteration:
+        if len(rewind_rows(folder.metrics, self.iteration)) < self.iteration:
             self._say(f"{folder.metrics} has lost rows; learning curves lack these iterations.")
-        self._evaluator = None
+        evaluated, self._evaluator = rewind_rows(folder.evaluations, self.iteration), None
         if options.evaluate_every:
-            self._evaluator = PeriodicEvaluator(folder, run, self.sets, self.evaluations.rows)
+            self._evaluator = PeriodicEvaluator(folder, run, self.sets, evaluated)
         folder.note(run)  # it may have other limits than before
 
     @property
@@ -182,7 +178,7 @@ class Session:
 
         Raises:
           Stopped: on request; everything is saved.
-          DivergedError: a loss or a parameter is not finite; the last checkpoint stays.
+          ValueError: a loss or a parameter is not finite; the last checkpoint stays.
         """
         if not self.active.any():
             return
@@ -221,18 +217,19 @@ class Session:
         for seed in shown:
             if self._evaluator and self.folder.best(seed).is_file():
                 shown[seed] = load_policy(self.folder.best(seed))
-        tested = [row for row in self.evaluations.rows if row["purpose"] == "test"]
-        known = {(row["seed"], row["iteration"]) for row in tested}
+        rows = read_rows(self.folder.evaluations)
+        known = {(row["seed"], row["iteration"]) for row in rows if row["purpose"] == "test"}
         missing = [seed for seed in shown if (seed, shown[seed].iteration) not in known]
         if not missing and (self.folder.page.exists() or not self.options.report):
             return {}
         self._say("Evaluating ...")
         tasks = self.options.reported or self.run.config.eval_episodes
-        evaluator = make_evaluator(self.run, self.sets, tasks, "test")
+        evaluator = Evaluator.of_sets(self.run.config, self.sets, tasks)
         played = {seed: evaluator(policy.params) for seed, policy in shown.items()}
         scores = {seed: evaluator.scores(outcome) for seed, outcome in played.items()}
         for seed in missing:
-            self.evaluations.append(evaluation_rows(scores[seed], shown[seed], seed, "test"))
+            rows = evaluation_rows(scores[seed], shown[seed], seed, "test")
+            append_rows(self.folder.evaluations, rows)
         if self.options.report:
             first = jax.tree.map(lambda x: x[0], self.placement.local(self.state))
             report.write(self.folder, self.run, self.learner, first, evaluator, played)
@@ -247,7 +244,7 @@ class Session:
         self.iteration, self.seconds = self.iteration + 1, self.seconds + taken
         steps, finite = host.pop("steps"), host.pop("is_finite")
         if not finite[active].all():
-            raise DivergedError(
+            raise ValueError(
                 f"training diverged in iteration {self.iteration}: a loss or a parameter is not "
                 f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
             )
@@ -262,7 +259,7 @@ class Session:
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
         ]
-        self.metrics.append(rows)
+        append_rows(self.folder.metrics, rows)
         self._last |= {int(row["seed"]): row for row in rows}
         self._evaluate(active)
         return rows
@@ -276,7 +273,8 @@ class Session:
         found = self._policies() if chosen.any() else {}
         for seed, is_chosen in zip(self.run.seed_range, chosen, strict=True):
             if is_chosen:
-                self.evaluations.append(self._evaluator.evaluate(seed, found[seed]))
+                rows = self._evaluator.evaluate(seed, found[seed])
+                append_rows(self.folder.evaluations, rows)
 
     def _policies(self) -> dict[int, Policy]:
         """Returns the present policy of each seed."""
@@ -291,7 +289,8 @@ class Session:
             "compile_seconds": self.compile_seconds,
             "last": list(self._last.values()),
         }
-        self.checkpoints.save(self.iteration, self.placement.local(self.state), record)
+        state, keep = self.placement.local(self.state), self.options.keep
+        checkpoint.save(self.folder.checkpoints, self.iteration, state, record, keep=keep)
 
     def _say(self, line: str) -> None:
         self.console.print(line, soft_wrap=True, highlight=False, markup=False)
@@ -311,9 +310,7 @@ def restore(folder: Path, run: Run, shapes: TrainState) -> tuple[TrainState | No
         run.check_continues(Run.from_dict(record["run"]))
         state = from_arrays(arrays, shapes)
     except (KeyError, ValueError) as error:
-        raise checkpoint.CheckpointError(
-            f"checkpoint {done} in {folder} cannot be continued: {error}"
-        ) from error
+        raise ValueError(f"checkpoint {done} in {folder} cannot be continued: {error}") from error
     for row in record["last"]:
         if row["iteration"] < done and not is_last(row, run.config):
             raise ValueError(

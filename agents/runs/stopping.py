@@ -19,10 +19,6 @@ class Stopped(Exception):  # noqa: N818  not an error
         self.signal = number
 
 
-class DivergedError(ValueError):
-    """A loss or a parameter is not finite."""
-
-
 class StopSignals:
     """Turns the first Ctrl-C or SIGTERM into a request and the second into KeyboardInterrupt.
 

@@ -14,7 +14,7 @@ import pytest
 import agents
 import trap_tube_jax as tt
 from agents import make_train, registry
-from agents.runs.folder import read_json
+from agents.files import read_json
 from agents.train import main
 from paths import ROOT
 from refusal import assert_refused, refused

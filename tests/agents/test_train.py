@@ -12,8 +12,9 @@ import pytest
 import agents
 from agents import evaluate
 from agents.config import PRESETS, Config
+from agents.files import read_json
 from agents.runs import compilation
-from agents.runs.folder import Run, RunFolder, read_json
+from agents.runs.folder import Run, RunFolder
 from agents.train import main, parse, run_path
 from refusal import refused
 from small_runs import final_state, options, read_iterations, run, start, untimed

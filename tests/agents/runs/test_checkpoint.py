@@ -8,7 +8,7 @@ import pytest
 
 from agents.arrays import to_arrays
 from agents.runs import checkpoint
-from agents.runs.checkpoint import CheckpointError, Checkpoints, digest
+from agents.runs.checkpoint import digest
 
 
 def example(offset):
@@ -16,13 +16,16 @@ def example(offset):
     return {"kernel": kernel, "key": jax.random.split(jax.random.key(7), 2)}
 
 
+def save(folder, iteration, offset):
+    checkpoint.save(folder, iteration, example(offset), {"note": f"after {offset}"}, keep=2)
+
+
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     """A folder with checkpoints 1 to 4, of which two are kept. Not to be changed."""
     folder = tmp_path_factory.mktemp("run") / "checkpoints"
-    with Checkpoints(folder, keep=2) as checkpoints:
-        for iteration in range(1, 5):
-            checkpoints.save(iteration, example(iteration), {"note": f"after {iteration}"})
+    for iteration in range(1, 5):
+        save(folder, iteration, iteration)
     return folder
 
 
@@ -37,19 +40,18 @@ def test_the_newest_are_kept_and_come_back(saved):
         arrays, record = checkpoint.load(saved, iteration)
         assert (record["note"], record["iteration"]) == (f"after {expected}", expected)
         assert digest(arrays) == digest(to_arrays(example(expected)))
-    with pytest.raises(CheckpointError, match=r"no checkpoint 7; allowed: 3, 4"):
+    with pytest.raises(ValueError, match=r"no checkpoint 7; allowed: 3, 4"):
         checkpoint.load(saved, 7)
 
 
 def test_a_taken_name_is_not_written_again(folder):
-    with Checkpoints(folder, keep=2) as checkpoints:
-        checkpoints.save(4, example(99), {"note": "other"})
+    save(folder, 4, 99)
     assert checkpoint.load(folder)[1]["note"] == "after 4"
 
 
 def test_reading_makes_nothing(tmp_path):
     for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(CheckpointError, match=r"holds no checkpoint$"):
+        with pytest.raises(ValueError, match=r"holds no checkpoint$"):
             checkpoint.load(folder)
     assert not list(tmp_path.iterdir())
 
@@ -58,8 +60,7 @@ def test_a_save_that_was_killed_is_passed_over_and_removed(folder):
     draft = folder / "5.orbax-checkpoint-tmp"
     shutil.copytree(folder / "4", draft)
     assert checkpoint.iterations(folder) == [3, 4]
-    with Checkpoints(folder, keep=2) as checkpoints:
-        checkpoints.save(5, example(5), {"note": "after 5"})
+    save(folder, 5, 5)
     assert checkpoint.iterations(folder) == [4, 5]
     assert not draft.exists()
 
@@ -74,15 +75,16 @@ def test_a_reader_goes_on_with_the_newest_where_the_writer_deletes(folder, monke
     assert checkpoint.load(folder)[1]["note"] == "after 4"
 
 
-def test_a_save_that_fails_is_an_error_of_the_file_system(tmp_path, monkeypatch):
-    with Checkpoints(tmp_path / "x", keep=1) as checkpoints:
+def test_a_save_that_fails_is_an_error_of_the_file_system(folder, monkeypatch):
+    def fail(*args, **kwargs):
+        raise ValueError("NOT_ENOUGH_SPACE: disk full\nmore")
 
-        def fail(*args, **kwargs):
-            raise ValueError("NOT_ENOUGH_SPACE: disk full\nmore")
-
-        monkeypatch.setattr(checkpoints._manager, "save", fail)
-        with pytest.raises(OSError, match=r"cannot write checkpoint 3: .*disk full$"):
-            checkpoints.save(3, example(0), {})
+    monkeypatch.setattr(checkpoint.ocp.Checkpointer, "save", fail)
+    with pytest.raises(OSError, match=r"cannot write checkpoint 5: .*disk full$"):
+        save(folder, 5, 5)
+    assert checkpoint.iterations(folder) == [3, 4]
+    with pytest.raises(FileNotFoundError):
+        save(folder / "vanished" / "checkpoints", 5, 5)
 
 
 # Orbax, where it fails, leaves work to an event loop that it has closed.
@@ -104,7 +106,7 @@ def test_damage_to_any_file_is_refused_or_without_effect(saved, folder, damage):
             path.write_bytes(content[:middle])
         try:
             assert digest(checkpoint.load(folder, 4)[0]) == expected
-        except CheckpointError as error:
+        except ValueError as error:
             num_refused += 1
             assert f"{folder / '4'} is damaged" in str(error)  # noqa: PT017
             assert "delete it to use checkpoint 3" in str(error)  # noqa: PT017

@@ -6,7 +6,8 @@ import multiprocessing
 import pytest
 
 from agents.config import Config
-from agents.runs.folder import Run, RunFolder, check_name, read_json, write_json
+from agents.files import read_json, write_json
+from agents.runs.folder import Run, RunFolder, check_name
 from refusal import assert_refused
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 import agents
-from agents.runs.checkpoint import Checkpoints
+from agents.runs import checkpoint
 from agents.runs.folder import Run, RunFolder
 from easy import assert_same
 from tiny_policy import CONFIG, random_params
@@ -23,8 +23,8 @@ def run_path(tmp_path_factory) -> Path:
     folder.note(Run(CONFIG, seed=SEEDS[0], seeds=2))
     params = [random_params(seed=seed) for seed in SEEDS]
     both = jax.tree.map(lambda *x: jnp.stack(x), *params)
-    with Checkpoints(folder.checkpoints, keep=1) as checkpoints:
-        checkpoints.save(6, {"params": both, "iteration": jnp.full(2, 6)}, {})
+    state = {"params": both, "iteration": jnp.full(2, 6)}
+    checkpoint.save(folder.checkpoints, 6, state, {}, keep=1)
     return path
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.config import Config
-from agents.runs.metrics import CsvLog, is_last, read_rows
+from agents.runs.metrics import append_rows, is_last, read_rows, rewind_rows
 
 
 def row(iteration, seed=0, **values):
@@ -14,43 +14,34 @@ def row(iteration, seed=0, **values):
 
 def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
     path = tmp_path / "metrics.csv"
-    log = CsvLog(path)
     for iteration in (1, 2, 3):
-        log.append([row(iteration, loss=float(np.float32(1 / 3)), length="")])
+        append_rows(path, [row(iteration, loss=float(np.float32(1 / 3)), length="")])
+    before = path.read_text()
     with path.open("a") as file:
         file.write("0,2,1")  # a kill in mid-write
-    log = CsvLog(path, last_iteration=2)
-    assert [entry["iteration"] for entry in log.rows] == [1, 2]
-    log.append([row(3, loss=0.5, length=7)])
-    assert read_rows(path) == log.rows
-    assert read_rows(path)[0]["loss"] == float(np.float32(1 / 3))
-    assert read_rows(path)[0]["length"] == ""
+    assert [entry["iteration"] for entry in read_rows(path)] == [1, 2, 3]
+    kept = rewind_rows(path, 2)
+    assert [(entry["iteration"], entry["loss"], entry["length"]) for entry in kept] == [
+        (1, float(np.float32(1 / 3)), ""),
+        (2, float(np.float32(1 / 3)), ""),
+    ]
+    append_rows(path, [row(3, loss=float(np.float32(1 / 3)), length="")])
+    assert path.read_text() == before
+    assert rewind_rows(path, 0) == []
+    append_rows(path, [row(1)])
+    assert read_rows(path) == [row(1)], "begun again with its header"
 
 
-def test_a_file_deleted_in_mid_training_is_begun_again_with_its_header(tmp_path):
-    log = CsvLog(tmp_path / "x.csv")
-    log.append([row(1)])
-    (tmp_path / "x.csv").unlink()
-    log.append([row(2)])
-    assert read_rows(tmp_path / "x.csv") == [row(2)]
-
-
-def test_a_vanished_folder_is_an_error(tmp_path):
+def test_files_without_folder_header_or_column_are_refused(tmp_path):
+    path = tmp_path / "x.csv"
     with pytest.raises(FileNotFoundError):
-        CsvLog(tmp_path / "none" / "x.csv").append([row(1)])
-
-
-def test_a_file_without_header_is_refused(tmp_path):
-    (tmp_path / "x.csv").write_text("0,2,1\n0,3,1\n")
-    with pytest.raises(ValueError, match=r"x.csv has no header with a column 'iteration'"):
-        CsvLog(tmp_path / "x.csv", last_iteration=3)
-
-
-def test_columns_never_change(tmp_path):
-    log = CsvLog(tmp_path / "x.csv")
-    log.append([row(1)])
+        append_rows(tmp_path / "none" / "x.csv", [row(1)])
+    append_rows(path, [row(1)])
     with pytest.raises(ValueError, match="fields not in fieldnames: 'more'"):
-        log.append([row(2, more=1)])
+        append_rows(path, [row(2, more=1)])
+    path.write_text("0,2,1\n0,3,1\n")
+    with pytest.raises(ValueError, match=r"x.csv has no header with a column 'iteration'"):
+        rewind_rows(path, 3)
 
 
 @pytest.mark.parametrize(

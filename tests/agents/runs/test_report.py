@@ -21,7 +21,7 @@ from agents import make_train
 from agents.acting.evaluation import Evaluator
 from agents.runs import display, report
 from agents.runs.folder import Run, RunFolder
-from agents.runs.metrics import CsvLog
+from agents.runs.metrics import append_rows
 from small_runs import small_config
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.scoring.scores import Score
@@ -59,7 +59,7 @@ def page(played, tmp_path_factory):
     learner, state, evaluator, outcome = played
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "<mine>")
     folder.path.mkdir()
-    CsvLog(folder.metrics).append([row(1), row(2, policy_loss=0.5)])
+    append_rows(folder.metrics, [row(1), row(2, policy_loss=0.5)])
     report.write(folder, Run(CONFIG, "fast"), learner, state, evaluator, {0: outcome})
     start, end = '<script type="application/json" id="data">', "</script>"
     return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
@@ -176,7 +176,8 @@ def score(name, solved):
 def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
     run, folder = Run(small_config(iterations=7, **settings)), RunFolder(tmp_path)
     solved = [row(2, evaluation=1.0, episodes=episodes)] if episodes else []
-    CsvLog(folder.metrics).append([row(1), *solved, row(3, evaluation=1.0)] if solved else [row(1)])
+    rows = [row(1), *solved, row(3, evaluation=1.0)] if solved else [row(1)]
+    append_rows(folder.metrics, rows)
     scores = {0: [score("base", 10), score("p", 5), score("st", 0)]}
     lines = display.summary(folder, run, scores)
     assert lines[-1].endswith(expected)
