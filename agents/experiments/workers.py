@@ -47,7 +47,7 @@ def make_executor(processes: int | None, cluster: str | None) -> Iterator[Execut
     """
     if cluster is not None:
         try:
-            from distributed import Client  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+            from distributed import Client  # noqa: PLC0415  # pyright: ignore
         except ImportError:
             raise ValueError("--cluster needs Dask: pip install -e '.[agents,cluster]'") from None
         with Client(cluster) as client:

@@ -29,7 +29,7 @@ def open_loggers(
         logs: list[Log] = []
         if tensorboard:
             with needs_extra("logging"):
-                from tensorboard.summary import Writer  # noqa: PLC0415  an extra
+                from tensorboard.summary import Writer  # noqa: PLC0415  # pyright: ignore
             writer = Writer(str(folder / "tensorboard"))
             stack.callback(writer.close)
             logs.append(
@@ -37,7 +37,7 @@ def open_loggers(
             )
         if wandb:
             with needs_extra("logging"):
-                import wandb as wandb_library  # noqa: PLC0415  an extra
+                import wandb as wandb_library  # noqa: PLC0415  # pyright: ignore
             logged = stack.enter_context(
                 wandb_library.init(
                     project="trap-tube-jax", group=folder.name, config=run.to_dict(), dir=folder
