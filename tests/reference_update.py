@@ -121,12 +121,12 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
             cells=cells,
             action=action,
             reward=reward,
-            discount=jnp.full_like(reward, jnp.nan),  # which the baseline does not look at
+            discount=jnp.full_like(reward, 1e9),  # which the baseline does not look at
             mask=jnp.asarray(recording.steps("batch/weight")),
             observation_id=jnp.asarray(observation_id.reshape(images.shape[:2]), jnp.int32),
         ),
         features=features,
         embedding=embedding,
         log_prob=actions.log_prob(action),
-        value=jnp.concatenate([value, jnp.full_like(value[:1], jnp.nan)]),
+        value=jnp.concatenate([value, jnp.full_like(value[:1], 1e9)]),
     )

@@ -51,23 +51,28 @@ def _raw_shape() -> tuple[int, ...]:
 def loop_free(key: Any) -> jax.Array:
     """Returns a key whose draws, of at most 32 bits each, are those of `key`, without loops.
 
-    A key of another implementation than Threefry stays as it is, as does any key if
-    `jax_threefry_partitionable` is off.
+    A key of `rbg` or `unsafe_rbg` counts as the Threefry key in its first two words: its own draws
+    depend on the batch under `jax.vmap`, and would repeat tasks. A key of a foreign implementation
+    stays as it is. If `jax_threefry_partitionable` is off, draws are those of JAX, with loops.
 
     Raises:
       ValueError: `key` is not one PRNG key.
     """
     key = typed_key(key)
-    is_default = str(jax.random.key_impl(key)) == "threefry2x32"
-    if not is_default or not jax.config.jax_threefry_partitionable:  # pyright: ignore[reportAttributeAccessIssue]
+    if str(jax.random.key_impl(key)) not in ("threefry2x32", "rbg", "unsafe_rbg"):
         return key
-    return jax.random.wrap_key_data(jax.random.key_data(key), impl=_LOOP_FREE)
+    has_loops = not jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
+    impl = "threefry2x32" if has_loops else _LOOP_FREE
+    return jax.random.wrap_key_data(jax.random.key_data(key)[:2], impl=impl)
 
 
 def fold_in(key: jax.Array, data: int) -> jax.Array:
     """Returns `jax.random.fold_in(key, data)` of a typed key, computed without loops."""
+    impl = jax.random.key_impl(key)
+    if str(impl) != "threefry2x32":
+        return jax.random.fold_in(key, data)
     folded = jax.random.key_data(jax.random.fold_in(loop_free(key), data))
-    return jax.random.wrap_key_data(folded, impl=jax.random.key_impl(key))
+    return jax.random.wrap_key_data(folded, impl=impl)
 
 
 def threefry(key: jax.Array, high: jax.Array, low: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -54,8 +54,8 @@ class VectorEnvironment:
     """B environments in lockstep, each starting its next episode when one ends.
 
     States, observations and everything else equal `jax.vmap` of `AutoReset(env)` for the same
-    keys and actions. Keys of JAX's `rbg` implementations are an exception: their draws depend on
-    the batch, so the tasks after the first differ from those of `jax.vmap`.
+    keys and actions. Transfers of your own that draw with keys of JAX's `rbg` implementations are
+    an exception: such draws depend on the batch.
 
     The environment is batched: jit and scan it, and do not vmap it over environments. A vmap over
     seeds works; each step then runs as many chunks as the seed with the most finished

@@ -10,6 +10,7 @@ import pytest
 
 import trap_tube_jax as tt
 from easy import assert_same, rows
+from settings import needs_threefry
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 SIZE = 20
@@ -24,6 +25,7 @@ def wander(key, state):
 ACTIONS = np.random.default_rng(0).integers(0, 4, (6, SIZE, 2), np.int32)
 
 
+@needs_threefry
 def test_next_step_spends_a_step_on_the_reset():
     # Fewer at a time than end together, so that the resets take more than one round.
     batch = NextStepVectorEnvironment(tt.Environment((wander,), max_steps=4), chunk_size=8)

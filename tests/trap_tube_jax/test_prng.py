@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same
+from easy import assert_same, rows
 from refusal import assert_refused
 from trap_tube_jax.prng import fold_in, loop_free, threefry, typed_key
 
@@ -41,7 +41,7 @@ def all_draws(key):
 
 
 def test_draws_are_those_of_jax():
-    keys = jax.random.split(jax.random.key(7), 100)
+    keys = jax.random.split(jax.random.key(7, impl="threefry2x32"), 100)
     expected = jax.jit(jax.vmap(all_draws))(keys)
     loopless = jax.jit(jax.vmap(lambda key: all_draws(loop_free(key))))(keys)
     jax.tree.map(np.testing.assert_array_equal, loopless, expected)
@@ -49,18 +49,32 @@ def test_draws_are_those_of_jax():
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
-def test_keys_of_every_kind_keep_their_draws(impl):
+def test_keys_of_either_kind_fold_as_in_jax_and_draw_the_same_tasks(impl):
     key = jax.random.key(5, impl=impl)
     assert_same(fold_in(key, 3), jax.random.fold_in(key, 3))
-    with jax.threefry_partitionable(impl == "rbg"):
+    reset = tt.make("pstsy").reset
+    assert_same(reset(key), reset(jax.random.key(5, impl="threefry2x32")))
+
+
+def test_draws_of_another_order_than_jaxs_own_are_left_to_jax():
+    key = jax.random.key(5, impl="threefry2x32")
+    with jax.threefry_partitionable(False):
         assert loop_free(key).dtype == key.dtype
+
+
+@pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
+def test_tasks_of_rbg_keys_do_not_depend_on_the_batch(impl):
+    keys = jax.random.split(jax.random.key(5, impl=impl), 4)
+    reset = tt.make("pstsy").reset
+    assert_same(rows(jax.vmap(reset)(keys), 3), reset(keys[3]))
 
 
 @pytest.mark.parametrize("transfer", [tt.perceptual, tt.structural, tt.symbolic])
 def test_the_transfers_draw_without_loops(transfer):
     """The environment's reset is as fast as its draws."""
     env = tt.Environment((transfer,))
-    assert "while" not in jax.jit(env.reset).lower(jax.random.key(0)).as_text()
+    key = jax.random.key(0, impl="threefry2x32")
+    assert "while" not in jax.jit(env.reset).lower(key).as_text()
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])

@@ -79,7 +79,7 @@ def reset_keys() -> jax.Array:
 
 def data(keys: jax.Array) -> list[tuple[int, ...]]:
     """Keys as numbers, to compare."""
-    return [tuple(key) for key in np.asarray(jax.random.key_data(keys)).reshape(-1, 2)]
+    return [tuple(key) for key in np.asarray(jax.random.key_data(keys.reshape(-1)))]
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from agents.runs.metrics import read_rows
 from agents.runs.results import metrics, results
 from agents.runs.session import RunOptions, train_run
 from agents.runs.stopping import Stopped
+from settings import needs_threefry
 from small_runs import final_state, small_config, untimed
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
@@ -119,6 +120,7 @@ def test_a_finished_run_is_extended(copy):
         train_run(copy, small_run(), TRACKED)
 
 
+@needs_threefry
 def test_seeds_side_by_side_are_those_trained_alone(tmp_path):
     train_run(tmp_path / "two", small_run(iterations=3, seeds=2), PLAIN)
     train_run(tmp_path / "one", small_run(iterations=3, seed=1), PLAIN)
