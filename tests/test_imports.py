@@ -120,7 +120,7 @@ def test_training_imports_no_command_line(tmp_path):
 
 
 def test_the_environment_is_light(tmp_path):
-    """What JAX, Flax and NumPy import themselves is free."""
+    """Libraries that JAX, Flax and NumPy import themselves are free."""
     program = """
 import json, sys
 import jax, numpy

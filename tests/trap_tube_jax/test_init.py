@@ -1,4 +1,4 @@
-"""What a user meets first: `import trap_tube_jax`, `dir` and `help`."""
+"""The first things a user meets: `import trap_tube_jax`, `dir` and `help`."""
 
 import pydoc
 import re
