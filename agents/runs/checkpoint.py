@@ -31,8 +31,6 @@ def save(folder: Path, iteration: int, state: Any, record: dict[str, Any], *, ke
       OSError: the checkpoint cannot be written.
     """
     folder.mkdir(exist_ok=True)
-    for draft in folder.glob("*.orbax-checkpoint-tmp*"):  # of a killed process
-        shutil.rmtree(draft)
     if iteration in iterations(folder):
         return
     arrays = to_arrays(state)
@@ -41,12 +39,18 @@ def save(folder: Path, iteration: int, state: Any, record: dict[str, Any], *, ke
         state=ocp.args.StandardSave(arrays), record=ocp.args.JsonSave(record)
     )
     try:
-        with _checkpointer() as checkpointer:
-            checkpointer.save((folder / str(iteration)).absolute(), args=items)
+        # A plain Checkpointer waits in vain for the other processes of a job.
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep,
+            create=False,
+            cleanup_tmp_directories=True,
+            enable_async_checkpointing=False,
+            multiprocessing_options=_this_process_alone(),
+        )
+        with ocp.CheckpointManager(folder.absolute(), options=options) as manager:
+            manager.save(iteration, args=items, force=True)
     except Exception as error:  # Orbax passes on what its many back ends raise
         raise OSError(f"cannot write checkpoint {iteration}: {_first_line(error)}") from error
-    for old in iterations(folder)[:-keep]:
-        shutil.rmtree(folder / str(old))
 
 
 def iterations(folder: Path) -> list[int]:
@@ -76,7 +80,12 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
             items = ocp.args.Composite(
                 state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore()
             )
-            with _checkpointer() as checkpointer:
+            options = _this_process_alone()
+            handler = ocp.CompositeCheckpointHandler(
+                state=ocp.StandardCheckpointHandler(multiprocessing_options=options),
+                record=ocp.JsonCheckpointHandler(multiprocessing_options=options),
+            )
+            with ocp.Checkpointer(handler, multiprocessing_options=options) as checkpointer:
                 restored = checkpointer.restore(Path(copy), args=items)
         arrays, record = restored["state"], restored["record"]
         if digest(arrays) == record["digest"]:
@@ -103,19 +112,14 @@ def digest(arrays: Arrays) -> str:
     return total.hexdigest()
 
 
-def _checkpointer() -> ocp.Checkpointer:
-    """Reads and writes in this process alone; by default Orbax waits for all of a job."""
-    alone = ocp.options.MultiprocessingOptions()
-    if jax.distributed.is_initialized():
-        own = jax.process_index()
-        alone = ocp.options.MultiprocessingOptions(
-            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
-        )
-    handler = ocp.CompositeCheckpointHandler(
-        state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
-        record=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
+def _this_process_alone() -> ocp.options.MultiprocessingOptions:
+    """Tells Orbax to wait for no other process: one of them reads and writes."""
+    if not jax.distributed.is_initialized():
+        return ocp.options.MultiprocessingOptions()
+    own = jax.process_index()
+    return ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
     )
-    return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _first_line(error: Exception) -> str:

@@ -79,7 +79,7 @@ def test_a_save_that_fails_is_an_error_of_the_file_system(folder, monkeypatch):
     def fail(*args, **kwargs):
         raise ValueError("NOT_ENOUGH_SPACE: disk full\nmore")
 
-    monkeypatch.setattr(checkpoint.ocp.Checkpointer, "save", fail)
+    monkeypatch.setattr(checkpoint.ocp.CheckpointManager, "save", fail)
     with pytest.raises(OSError, match=r"cannot write checkpoint 5: .*disk full$"):
         save(folder, 5, 5)
     assert checkpoint.iterations(folder) == [3, 4]
