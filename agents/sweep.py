@@ -2,7 +2,6 @@
 
 import multiprocessing
 import shlex
-import signal
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
@@ -15,9 +14,10 @@ from agents.command_line import add_options, build, make_parser
 from agents.experiments import report
 from agents.experiments.grids import Grid, Options
 from agents.experiments.workers import ProcessPerCall, log_of, make_executor, train_logged
+from agents.runs.display import say
 from agents.runs.folder import Run, RunFolder
 from agents.runs.session import RunOptions
-from agents.runs.stopping import Stopped, StopSignals
+from agents.runs.stopping import Stopped, StopSignals, exit_code
 from trap_tube_jax.command_line import plain_errors
 
 LINES = 5  # of a failed run's log that are shown
@@ -57,11 +57,10 @@ def main(
                 failed = launch(runs, how, pool, console)
                 if any((path / "config.json").exists() for path in runs):
                     report.collect(root, f"{program} {shlex.join(arguments)}".strip())
-                    _say(console, report.write(root))
+                    say(console, report.write(root))
         except (Stopped, KeyboardInterrupt) as stopped:
-            _say(console, "Stopped. The same command continues.")
-            number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT
-            raise SystemExit(128 + number) from None
+            say(console, "Stopped. The same command continues.")
+            raise SystemExit(exit_code(stopped)) from None
     raise SystemExit(1 if failed else 0)
 
 
@@ -87,7 +86,7 @@ def launch(
 
     def request() -> None:
         stop_file.touch()
-        _say(console, "Finishing the current iterations; Ctrl-C again stops now.")
+        say(console, "Finishing the current iterations; Ctrl-C again stops now.")
 
     stop_file.unlink(missing_ok=True)
     calls: dict[Future, Path] = {}
@@ -103,10 +102,10 @@ def launch(
                 if call.cancelled():
                     continue
                 path, outcome = calls[call], _outcome(call)
-                _say(console, f"[{count}/{len(runs)}] {path.name}: {outcome}")
+                say(console, f"[{count}/{len(runs)}] {path.name}: {outcome}")
                 failed += [] if outcome == "done" else [path]
                 if outcome.startswith("failed"):
-                    _say(console, _tail(log_of(path)))
+                    say(console, _tail(log_of(path)))
         except BaseException:  # not even the current iteration is waited for
             stop_file.touch()
             for call in calls:
@@ -130,10 +129,6 @@ def _outcome(call: Future) -> str:
 def _tail(log: Path) -> str:
     lines = log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
     return "\n".join([f"The end of {log}:", *lines[-LINES:]])
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from agents.parallel.devices import become_devices
 from agents.runs import compilation, display
 from agents.runs.folder import Run, RunFolder, check_name
 from agents.runs.session import RunOptions, train_run
-from agents.runs.stopping import Stopped
+from agents.runs.stopping import Stopped, exit_code
 from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import import_modules
@@ -117,24 +116,19 @@ def train(options: Options, run: Run, how: RunOptions, job: processes.Job) -> No
     try:
         scores = train_run(folder.path, run, how, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
-        console.print(f"Stopped. {again}", soft_wrap=True, highlight=False, markup=False)
-        number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT
-        raise SystemExit(128 + number) from None
+        display.say(console, f"Stopped. {again}")
+        raise SystemExit(exit_code(stopped)) from None
     except BrokenPipeError:
         raise
     except OSError as error:
         raise OSError(f"{error}. Saved checkpoints are kept. {again}") from error
     tables = [str(Scores(PROTOCOL, __version__, None, tuple(each))) for each in scores.values()]
     for line in (*tables, *display.summary(folder, run, scores)):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+        display.say(console, line)
 
 
 def run_path(options: Options, run: Run) -> Path:
-    """Returns the run's folder.
-
-    Raises:
-      ValueError: the name is not a folder's name.
-    """
+    """Returns the run's folder; ValueError if its name is a path."""
     if options.resume is not None:
         return options.resume
     last = f"to{run.seed_range[-1]}" if run.seeds > 1 else ""

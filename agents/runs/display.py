@@ -52,17 +52,16 @@ class ProgressLine:
         if self._console.is_terminal:
             self._progress.update(self._task, completed=done, description=text, refresh=True)
         else:
-            self._console.print(f"iteration {done}: {text}", soft_wrap=True, highlight=False)
+            say(self._console, f"iteration {done}: {text}")
+
+
+def say(console: Console, text: str) -> None:
+    """Prints text as it is: unwrapped, and without markup."""
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def summary(folder: RunFolder, run: Run, scores: Mapping[int, Sequence[Score]]) -> list[str]:
-    """Returns the facts that a run ends with, one a line.
-
-    Args:
-      folder: its files.
-      run: what was trained.
-      scores: its scores on test tasks, by seed; none if the run was finished before.
-    """
+    """Returns the facts that a run ends with, one a line; scores as `train_run` returns them."""
     lines = [f"Report with curves and episodes to step through: {folder.page}"]
     own, config = tt.task_set(run.config.env_id), run.config
     if scores:

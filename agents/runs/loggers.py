@@ -18,9 +18,8 @@ def open_loggers(
 ) -> Iterator[Callable[[Sequence[Row]], None]]:
     """Opens the loggers asked for; yields a function that logs the rows of an iteration.
 
-    Names are those of `metrics.csv`; a run of several seeds puts `seed<n>/` in front.
-
-    Both write into the run's folder; Weights & Biases is offline with WANDB_MODE=offline.
+    Both write into the run's folder. Names are those of `metrics.csv`; a run of several seeds
+    puts `seed<n>/` in front.
 
     Raises:
       ImportError: a library is missing; the message names its extra.

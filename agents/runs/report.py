@@ -61,10 +61,10 @@ def write(
 
     Args:
       folder: the run's files.
-      run: what was trained.
-      learner: what trained it.
+      run: the run.
+      learner: its learner.
       state: the final state of the first seed, for the intrinsic reward of the page's episodes.
-      evaluator: what played.
+      evaluator: the evaluator of `played`.
       played: the outcomes of every seed.
     """
     save_curves(read_rows(folder.metrics), folder.curves, folder.path.name)
@@ -86,13 +86,7 @@ def write(
 
 
 def save_curves(rows: Sequence[Row], path: Path, title: str) -> None:
-    """Draws the learning curves over episodes as PNG, a line per seed; gaps where not finite.
-
-    Args:
-      rows: all rows of metrics, at least one.
-      path: the file to write.
-      title: over all panels.
-    """
+    """Draws learning curves over episodes as PNG, a line per seed; gaps where not finite."""
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
 
     panels = [
@@ -138,14 +132,7 @@ def save_first_solved(
 ) -> str | None:
     """Writes a GIF of the first solved episode of the first policy that solves one.
 
-    Args:
-      path: the file to write.
-      evaluator: what played.
-      played: the outcomes of one policy after the other.
-      prefer: the task set whose episodes come first.
-
-    Returns:
-      The episode's task set; None, and no file, if no episode is solved.
+    Returns the episode's task set, `prefer` if possible; None, and no file, if none is solved.
     """
     for outcomes in played:
         for name in sorted(outcomes, key=lambda name: name != prefer):

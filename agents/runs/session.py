@@ -31,7 +31,7 @@ from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
 from agents.ppo.memory import memory_estimate
 from agents.runs import checkpoint, report
-from agents.runs.display import ProgressLine
+from agents.runs.display import ProgressLine, say
 from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows
 from agents.runs.folder import Run, RunFolder
 from agents.runs.loading import policies
@@ -47,7 +47,7 @@ Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
 
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
-    """How a run is carried out; nothing here changes what it learns on one device.
+    """Options of carrying out a run; none changes what it learns on one device.
 
     Attributes:
       checkpoint_every: iterations between checkpoints.
@@ -74,11 +74,7 @@ class RunOptions:
     devices: int | None = option(None, "devices and hosts")
 
     def __post_init__(self) -> None:
-        """Checks the numbers.
-
-        Raises:
-          ValueError: a number is too small.
-        """
+        """Raises ValueError for a number that is too small or an unknown set."""
         smallest = {"checkpoint_every": 1, "keep": 1, "evaluate_every": 0, "reported": 1}
         for name, low in smallest.items():
             value = getattr(self, name)
@@ -160,7 +156,10 @@ class Session:
         self._last = {int(row["seed"]): row for row in record["last"]}
         self.state = self.placement.put(init(keys) if state is None else state)
         if len(rewind_rows(folder.metrics, self.iteration)) < self.iteration:
-            self._say(f"{folder.metrics} has lost rows; learning curves lack these iterations.")
+            say(
+                self.console,
+                f"{folder.metrics} has lost rows; learning curves lack these iterations.",
+            )
         evaluated, self._evaluator = rewind_rows(folder.evaluations, self.iteration), None
         if options.evaluate_every:
             self._evaluator = PeriodicEvaluator(folder, run, self.sets, evaluated)
@@ -184,17 +183,19 @@ class Session:
             return
         note_provenance(self.folder.provenance, str(self.placement))
         count = num_parameters(self.state.params) // self.run.seeds
-        self._say(
+        say(
+            self.console,
             f"{self.folder.path}: {tt.task_set(self.run.config.env_id).id}, curiosity "
             f"{self.run.config.curiosity}, seed {', '.join(map(str, self.run.seed_range))}, "
-            f"{count:,} parameters, on {self.placement}. Compiling ..."
+            f"{count:,} parameters, on {self.placement}. Compiling ...",
         )
         started = time.perf_counter()
         advance = self.placement.shard(make_advance(self.learner))
         advance = jax.jit(advance, donate_argnums=0).lower(self.state, self.active).compile()
         self.compile_seconds += time.perf_counter() - started
         stop = StopSignals(
-            lambda: self._say("Finishing this iteration; Ctrl-C again stops now."), self.stop_file
+            lambda: say(self.console, "Finishing this iteration; Ctrl-C again stops now."),
+            self.stop_file,
         )
         progress = ProgressLine(self.console, self.run.config.iterations)
         chosen = {"tensorboard": self.options.tensorboard, "wandb": self.options.wandb}
@@ -222,7 +223,7 @@ class Session:
         missing = [seed for seed in shown if (seed, shown[seed].iteration) not in known]
         if not missing and (self.folder.page.exists() or not self.options.report):
             return {}
-        self._say("Evaluating ...")
+        say(self.console, "Evaluating ...")
         tasks = self.options.reported or self.run.config.eval_episodes
         evaluator = Evaluator.of_sets(self.run.config, self.sets, tasks)
         played = {seed: evaluator(policy.params) for seed, policy in shown.items()}
@@ -291,9 +292,6 @@ class Session:
         }
         state, keep = self.placement.local(self.state), self.options.keep
         checkpoint.save(self.folder.checkpoints, self.iteration, state, record, keep=keep)
-
-    def _say(self, line: str) -> None:
-        self.console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def restore(folder: Path, run: Run, shapes: TrainState) -> tuple[TrainState | None, dict[str, Any]]:

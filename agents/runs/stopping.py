@@ -19,6 +19,11 @@ class Stopped(Exception):  # noqa: N818  not an error
         self.signal = number
 
 
+def exit_code(stopped: Stopped | KeyboardInterrupt) -> int:
+    """Returns the exit code of a command that a signal has stopped."""
+    return 128 + (stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT)
+
+
 class StopSignals:
     """Turns the first Ctrl-C or SIGTERM into a request and the second into KeyboardInterrupt.
 
