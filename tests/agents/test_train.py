@@ -62,8 +62,8 @@ def test_killed_runs_continue_to_the_same_bits(whole, tmp_path):
 
 def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
     path = tmp_path / "stopped"
-    process = start("agents.train", *options(), "--iterations", 100_000, "--out", tmp_path,
-                    "--name", "stopped")  # fmt: skip
+    arguments = ["--iterations", 100_000, "--checkpoint-every", 100_000, "--out", tmp_path]
+    process = start("agents.train", *options(), *arguments, "--name", "stopped")
     read_iterations(process, 3)
     second = start("agents.train", "--resume", path)
     _, errors = second.communicate()

@@ -1,4 +1,4 @@
-"""What a reader of a run sees: curves, a GIF, the page, and lines on the terminal."""
+"""Results of a run for a reader: curves, a GIF, the page, and lines on the terminal."""
 
 import base64
 import html

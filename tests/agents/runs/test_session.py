@@ -12,7 +12,6 @@ from agents.acting.policy_files import load_policy
 from agents.ppo.learner import Learner
 from agents.runs import checkpoint, session
 from agents.runs.folder import Run, RunFolder
-from agents.runs.loading import load_policies
 from agents.runs.metrics import read_rows
 from agents.runs.results import metrics, results
 from agents.runs.session import RunOptions, train_run
@@ -96,13 +95,6 @@ def _raise(error):
     raise error
 
 
-def test_a_request_saves_and_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr(session.StopSignals, "request", lambda self: 2)
-    with pytest.raises(Stopped):
-        train_run(tmp_path / "x", small_run(), PLAIN)
-    assert final_state(tmp_path / "x")[0] == 1
-
-
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(session, "Evaluator", None)
     before = (copy / "evaluations.csv").read_bytes()
@@ -128,11 +120,7 @@ def test_seeds_side_by_side_are_those_trained_alone(tmp_path):
     for row, alone in zip(both, untimed(tmp_path / "one"), strict=True):
         for name, value in alone.items():
             np.testing.assert_allclose(float(row[name]), float(value), rtol=1e-4, atol=1e-6)
-    names = [policy.name for policy in load_policies(tmp_path / "two")]
-    assert names == ["seed 0", "seed 1"]
     assert agents.load(tmp_path / "two", seed=1).name == "seed 1"
-    with pytest.raises(ValueError, match="has no seed 7; allowed: 0, 1"):
-        agents.load(tmp_path / "two", seed=7)
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
@@ -149,21 +137,21 @@ def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "message"),
+    ("name", "change"),
     [
-        ("discount", lambda v: v["config"].update(discount=0.5), "discount=0.5"),
-        ("seed", lambda v: v.update(seed=3), "seed=3"),
+        ("discount=0.5", lambda v: v["config"].update(discount=0.5)),
+        ("seed=3", lambda v: v.update(seed=3)),
     ],
 )
-def test_settings_changed_on_disk_are_noticed(copy, name, change, message):
+def test_settings_changed_on_disk_are_noticed(copy, name, change):
     path = copy / "config.json"
     values = json.loads(path.read_text())
     change(values)
     path.write_text(json.dumps(values))
-    with pytest.raises(ValueError, match=f"the run has {message}"):
+    with pytest.raises(ValueError, match=f"the run has {name}"):
         train_run(copy, small_run(iterations=9), TRACKED)
     values.pop("version")
-    with pytest.raises(ValueError, match=rf"checkpoint 6 .* the run has {name}="):
+    with pytest.raises(ValueError, match=rf"checkpoint 6 .* the run has {name.partition('=')[0]}="):
         train_run(copy, Run.from_dict(values), TRACKED)
 
 
