@@ -52,6 +52,8 @@ class Config:
       clip_eps: half-width of the interval of probability ratios.
       value_coef: weight of the squared value error.
       entropy_coef: weight of the entropy bonus. Entropy is summed over grasp and move.
+      motion_coef: weight of the auxiliary loss of a head that predicts motion
+        (`agents.ppo.motion`); 0 has no such head.
       learning_rate: Adam's step size.
       lr_decay_fraction: final fraction of training that decays the step size. It decays
         geometrically to a fiftieth.
@@ -101,6 +103,7 @@ class Config:
     clip_eps: float = _ppo(0.2, 0)
     value_coef: float = _ppo(0.01, 0)
     entropy_coef: float = _ppo(1e-4, 0)
+    motion_coef: float = _ppo(0.0, 0)
     learning_rate: float = _ppo(1e-3, 0)
     lr_decay_fraction: float = _ppo(0.0, 0, 1)
     adam_epsilon: float = _ppo(1e-7, 1e-12)

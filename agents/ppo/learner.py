@@ -21,8 +21,10 @@ from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
+from agents.networks.layers import init_module
 from agents.parallel.devices import ONE_DEVICE, EpisodeAxis
 from agents.ppo import advantages, losses, returns
+from agents.ppo.motion import MotionHead, motion_loss
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
 from agents.registry import curiosities
@@ -39,7 +41,8 @@ class TrainState(NamedTuple):
     """Everything that training carries from one iteration to the next.
 
     Attributes:
-      params: parameters by part: `encoder`, `core`, `heads` of the policy network, `curiosity`.
+      params: parameters by part: `encoder`, `core`, `heads` of the policy network, `curiosity`, and
+        `motion` if `motion_coef` is above 0.
       opt_state: state of the optimizer.
       extrinsic: moments of the extrinsic reward.
       intrinsic: moments of the intrinsic reward, or of its returns with separate value heads.
@@ -110,6 +113,11 @@ class Learner:
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
         curiosity = self.curiosity.init(curiosity_key, board)
         params = {**self.agent.init(agent_key), "curiosity": curiosity}
+        if config.motion_coef:
+            embedding = jnp.zeros((1, config.hidden), jnp.float32)
+            action = self.agent.embed_action(params, jnp.zeros((1, 2), jnp.int32))
+            motion_key = jax.random.fold_in(jax.random.clone(params_key), 2)
+            params["motion"] = init_module(MotionHead(), motion_key, embedding, action)
         zero = jnp.zeros((), jnp.int32)
         return TrainState(
             params=params,
@@ -245,7 +253,7 @@ class Learner:
     def loss(self, params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
         """Computes the loss of a minibatch.
 
-          L = policy + value - entropy + curiosity_coef * curiosity's losses
+          L = policy + value - entropy + curiosity_coef * curiosity's losses + motion_coef * motion
 
         Returns:
           L f32[] and metrics: its terms as weighted in L, and the mean entropy of a step.
@@ -267,6 +275,12 @@ class Learner:
             "value_loss": config.value_coef * losses.padded_mean(value_error, mask),
             "entropy_loss": -config.entropy_coef * losses.padded_mean(entropy, mask),
         }
+        if config.motion_coef:
+            logits: Any = MotionHead().apply(
+                params["motion"], experience.embedding, experience.action_embedding
+            )
+            motion = motion_loss(logits, batch.episodes.cells)
+            terms["motion_loss"] = config.motion_coef * losses.padded_mean(motion, mask)
         for name, term in self.curiosity.losses(params["curiosity"], experience).items():
             if name in terms or not name.endswith("_loss"):
                 raise ValueError(
