@@ -10,7 +10,7 @@ from agents.ppo.motion import motion_loss
 from small_runs import SETTINGS
 
 # The agent moves down, the food right; the tool stays.
-CELLS = np.array([[[[3, 3], [5, 5], [7, 7]]], [[[4, 3], [5, 5], [7, 8]]]], np.uint8)
+CELLS = jnp.array([[[[3, 3], [5, 5], [7, 7]]], [[[4, 3], [5, 5], [7, 8]]]], jnp.uint8)
 
 
 def test_motion_is_a_change_of_row_or_column():
