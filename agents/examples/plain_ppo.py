@@ -1,16 +1,16 @@
 """Recurrent PPO with an intrinsic curiosity module in one file, to read from top to bottom.
 
-Network, rewards, losses and settings are those of preset `paper`, computed in the plainest way.
-`agents.ppo` computes the same losses; `python -m benchmarks.learner_peers` compares the two in
-speed. To train:
+Network, rewards, losses and settings are those of preset `paper`, computed in the plainest way:
 
-    python -m agents.examples.plain_ppo --help
+    python -m agents.examples.plain_ppo
+
+`python -m benchmarks.learner_peers` compares its speed with that of `agents.ppo`.
 
 An episode has T steps, and step t leads from observation t to observation t + 1. B episodes are an
 iteration. The GRU has H units. Source: Schulman et al. (2017); Pathak et al. (2017); agent.md.
 """
 
-import dataclasses
+import argparse
 import functools
 from typing import Any, NamedTuple
 
@@ -22,7 +22,6 @@ from flax.training import train_state
 
 import trap_tube_jax as tt
 from agents import Config
-from agents.command_line import parse
 from agents.examples.near_food import NEAR_FOOD
 
 Batch = tuple["Episode", jax.Array, jax.Array]  # [B, ...]; advantage and value target f32[B, T]
@@ -221,26 +220,13 @@ class PlainPPO:
         return sum(terms.values(), jnp.zeros(())), terms
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Trains with 64 episodes and 20 gradient steps an iteration.
-
-    Attributes:
-      env: task set, by id or short name; by default one that is learned within a minute.
-      iterations: number of iterations.
-    """
-
-    env: str = NEAR_FOOD.short
-    iterations: int = 10
-
-
-def main(options: Options) -> float:
-    """Trains; returns the fraction of the last iteration's episodes that were solved."""
+def main(env: str = NEAR_FOOD.short, iterations: int = 10) -> float:
+    """Trains on a small scale; returns the fraction of the last episodes that were solved."""
     small = {"episodes_per_iteration": 64, "minibatch_size": 16, "epochs": 5}
-    learner = PlainPPO(Config.preset("paper", env_id=options.env, **small))
+    learner = PlainPPO(Config.preset("paper", env_id=env, **small))
     collect, update = jax.jit(learner.collect), jax.jit(learner.update)
     state, success = learner.init(jax.random.key(0)), 0.0
-    for iteration in range(1, options.iterations + 1):
+    for iteration in range(1, iterations + 1):
         state, batch, minibatches = collect(state)
         for places in minibatches:
             state, _ = update(state, batch, places)
@@ -250,4 +236,5 @@ def main(options: Options) -> float:
 
 
 if __name__ == "__main__":
-    main(parse(Options, None, "python -m agents.examples.plain_ppo"))
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    main()

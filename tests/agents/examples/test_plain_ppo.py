@@ -110,5 +110,5 @@ def test_an_update_lowers_the_loss():
 
 @pytest.mark.slow
 def test_learns_to_reach_near_food(capsys):
-    assert plain_ppo.main(plain_ppo.Options(iterations=10)) > 0.9
+    assert plain_ppo.main(iterations=10) > 0.9
     assert capsys.readouterr().out.count("solved") == 10
