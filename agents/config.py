@@ -49,11 +49,11 @@ class Config:
         `baseline`, as in the paper's published baseline: the value of the final board after
         termination, the last step's own value after truncation; the value target is the
         discounted sum of rewards.
-      clip_eps: half-width of the interval of probability ratios.
+      clip_eps: half-width of the interval of ratios.
       value_coef: weight of the squared value error.
       entropy_coef: weight of the entropy bonus. Entropy is summed over grasp and move.
-      motion_coef: weight of the auxiliary loss of a head that predicts motion
-        (`agents.ppo.motion`); 0 has no such head.
+      motion_coef: weight of the motion-prediction loss. 0 trains without its head
+        (`agents.ppo.motion`).
       learning_rate: Adam's step size.
       lr_decay_fraction: final fraction of training that decays the step size. It decays
         geometrically to a fiftieth.
@@ -69,8 +69,8 @@ class Config:
       value_heads: one for all rewards, or one each. `shared`: rewards are divided by their standard
         deviation and added, and one head values the sum. `separate`: each reward has its own head,
         and the normalised advantages are added (`agents.ppo.advantages`).
-      reward_ema_decay: decay of the moving moments of both rewards. They normalise the rewards;
-        the rates of `effects` decay alike.
+      reward_ema_decay: decay of the rewards' moving moments. They normalise both rewards; the
+        rates of `effects` decay alike.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: newest failed tasks kept for each of them.
       align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
