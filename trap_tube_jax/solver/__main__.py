@@ -1,16 +1,14 @@
 """The solver's command line: `python -m trap_tube_jax.solver --help`."""
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
-from trap_tube_jax.checks import check_seed
+from trap_tube_jax.checks import check_integer, check_seed
 from trap_tube_jax.command_line import add_import_option, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import DIRECTION_NAMES
@@ -18,14 +16,14 @@ from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
 from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.solver.distance import distances
-from trap_tube_jax.solver.search import Plan, replay, solve
-from trap_tube_jax.solver.survey import QUANTILES, Survey, survey
+from trap_tube_jax.solver.search import Plan, replay, solve, solve_batch
 from trap_tube_jax.state import State
 from trap_tube_jax.tables import markdown_table
 
 DESCRIPTION = """Find exact shortest plans of the trap-tube tasks. Without --show and --distances,
 print statistics of whole task sets and draw a histogram. Sets that differ in colours alone have
 the same statistics."""
+QUANTILES = (5, 25, 50, 75, 95)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -55,7 +53,6 @@ def _parser() -> argparse.ArgumentParser:
     modes.add_argument("--show", metavar="SET", help="plan one task, as text and GIF")
     modes.add_argument("--distances", metavar="SET", help="draw distances to the goal in one task")
     add("--output", type=Path, help="file to write, shortest_plans.png, plan.gif or distances.png")
-    add("--format", choices=("text", "json"), default="text", help="format of what is printed")
     add_import_option(parser)
     return parser
 
@@ -63,16 +60,30 @@ def _parser() -> argparse.ArgumentParser:
 def _survey(options: argparse.Namespace) -> None:
     from trap_tube_jax.solver.pictures import save_histogram  # noqa: PLC0415  matplotlib is slow
 
-    sets = [task_set(name) for name in options.sets]
-    surveys = []
-    for entry in sets:
-        print(f"solving {options.tasks:,} tasks of {entry.label}", file=sys.stderr)
-        surveys.append(survey(entry, tasks=options.tasks, seed=options.seed))
+    tasks, seed = check_integer("tasks", options.tasks), check_seed(options.seed)
+    keys = jax.random.split(jax.random.key(seed), tasks)
+    lengths = {}
+    for entry in [task_set(name) for name in options.sets]:
+        print(f"solving {tasks:,} tasks of {entry.label}", file=sys.stderr)
+        states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
+        lengths[entry.label] = solve_batch(states).length
     path = options.output or Path("shortest_plans.png")
-    save_histogram(surveys, path)
-    summaries = [entry.summary() for entry in surveys]
-    _print(options, summaries, _table(surveys))
+    save_histogram(lengths, path)
+    quantiles = (f"{quantile} %" for quantile in QUANTILES)
+    head = ["set", "tasks", "solvable", "mean", *quantiles, "longest"]
+    rows = [row_of_lengths(label, length) for label, length in lengths.items()]
+    print(f"Steps of the shortest plans\n\n{markdown_table([head, *rows])}")
     print(f"histogram: {path}", file=sys.stderr)
+
+
+def row_of_lengths(label: str, length: np.ndarray) -> list[str]:
+    """Returns the cells of a set whose tasks' shortest plans have `length` i32[T], -1 for none."""
+    solved = length[length >= 0]
+    start = [label, str(len(length)), f"{100 * len(solved) / len(length):.2f} %"]
+    if not len(solved):
+        return start + ["-"] * (len(QUANTILES) + 2)
+    quantiles = (f"{value:.0f}" for value in np.percentile(solved, QUANTILES))
+    return [*start, f"{solved.mean():.1f}", *quantiles, str(solved.max())]
 
 
 def _show(options: argparse.Namespace) -> None:
@@ -80,18 +91,8 @@ def _show(options: argparse.Namespace) -> None:
     plan = solve(state)
     path = options.output or Path("plan.gif")
     save_gif(episode_frames(state, plan.actions, cell_size=32), path, fps=4)
-    report = {
-        "id": task_set(options.show).id,
-        "seed": options.seed,
-        "solvable": bool(plan.solvable),
-        "length": int(plan.length),
-        "actions": plan.actions.tolist(),
-    }
-    boards = (
-        f"{_caption(plan, time)}\n{render_ascii(at)}\n"
-        for time, at in enumerate(replay(state, plan))
-    )
-    _print(options, report, "\n".join(boards))
+    for time, at in enumerate(replay(state, plan)):
+        print(f"{_caption(plan, time)}\n{render_ascii(at)}\n")
     print(f"animation: {path}", file=sys.stderr)
 
 
@@ -102,42 +103,11 @@ def _distances(options: argparse.Namespace) -> None:
     plan, found = solve(state), distances(state)
     path = options.output or Path("distances.png")
     save_distances(state, plan, found, path)
-    report = {
-        "id": task_set(options.distances).id,
-        "seed": options.seed,
-        "length": int(plan.length),
-        "reachable": found.num_reachable,
-        "solvable": int(np.count_nonzero(found.to_goal >= 0)),
-        "farthest": int(found.to_goal.max()),
-    }
-    _print(options, report, "\n".join(f"{name}: {value}" for name, value in report.items()))
+    print(f"length of the plan: {plan.length}")
+    print(f"reachable states: {found.num_reachable}")
+    print(f"with a way to the goal: {np.count_nonzero(found.to_goal >= 0)}")
+    print(f"farthest from the goal: {found.to_goal.max()}")
     print(f"picture: {path}", file=sys.stderr)
-
-
-def _print(options: argparse.Namespace, report: Any, text: str) -> None:
-    print(json.dumps(report, indent=2) if options.format == "json" else text)
-
-
-def _table(surveys: Sequence[Survey]) -> str:
-    quantiles = (f"{quantile} %" for quantile in QUANTILES)
-    rows = [["set", "tasks", "solvable", "mean", *quantiles, "longest"]]
-    for entry in surveys:
-        summary = entry.summary()
-        rows.append(
-            [
-                entry.task_set.label,
-                str(summary["tasks"]),
-                f"{100 * summary['solvable']:.2f} %",
-                _number(summary["mean"], 1),
-                *(_number(value, 0) for value in summary["quantiles"].values()),
-                _number(summary["longest"], 0),
-            ]
-        )
-    return f"Steps of the shortest plans\n\n{markdown_table(rows)}"
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _task(name: str, seed: int) -> State:

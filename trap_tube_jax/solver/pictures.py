@@ -1,7 +1,7 @@
 """Distances in a task and lengths of plans, drawn with matplotlib as PNG."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.rendering import render
 from trap_tube_jax.solver.distance import Distances
 from trap_tube_jax.solver.search import Plan, replay
-from trap_tube_jax.solver.survey import Survey
 from trap_tube_jax.state import State
 
 with needs_extra("pictures"):
@@ -54,19 +53,22 @@ def save_distances(
     figure.savefig(path, format="png", dpi=100)
 
 
-def save_histogram(surveys: Sequence[Survey], path: str | os.PathLike[str]) -> None:
-    """Writes a PNG of the shortest plans' lengths, one panel per task set."""
-    longest = max((survey.solved_length.max(initial=1) for survey in surveys), default=1)
-    figure = Figure(figsize=(7, 1.8 * len(surveys) + 0.6), layout="constrained")
-    axes = figure.subplots(len(surveys), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, survey in zip(axes, surveys, strict=True):
-        solved = survey.solved_length
-        share = np.bincount(solved, minlength=longest + 1) / len(survey.length)
+def save_histogram(lengths: Mapping[str, np.ndarray], path: str | os.PathLike[str]) -> None:
+    """Writes a PNG with a histogram per task set, by label, of its tasks' shortest plans.
+
+    Lengths are i32[T], -1 for an unsolvable task.
+    """
+    longest = max(length.max(initial=1) for length in lengths.values())
+    figure = Figure(figsize=(7, 1.8 * len(lengths) + 0.6), layout="constrained")
+    axes = figure.subplots(len(lengths), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, (label, length) in zip(axes, lengths.items(), strict=True):
+        solved = length[length >= 0]
+        share = np.bincount(solved, minlength=longest + 1) / len(length)
         axis.bar(np.arange(len(share)), 100 * share, width=0.9)
         if len(solved):
             axis.axvline(solved.mean(), color="black", linewidth=1, linestyle="--")
         axis.set_ylabel("% of tasks")
-        axis.set_title(f"{survey.task_set.label}: {len(survey.length)} tasks", loc="left")
+        axis.set_title(f"{label}: {len(length)} tasks", loc="left")
     axes[-1].set_xlabel("steps of the shortest plan (dashed: mean)")
     figure.savefig(path, format="png", dpi=100)
 

@@ -13,7 +13,6 @@ from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver import pictures
 from trap_tube_jax.solver.search import checked, levels, replay, take
-from trap_tube_jax.solver.survey import draw_tasks
 from trap_tube_jax.transfers import swap_with_tool
 
 NUM_ROOMS = 30
@@ -122,7 +121,8 @@ def test_lengths_of_the_symbolic_tasks(code, length):
 def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
     name, mean, standard_deviation
 ):
-    states = draw_tasks(tt.task_set(name), tasks=NUM_DRAWN, seed=0)
+    keys = jax.random.split(jax.random.key(0), NUM_DRAWN)
+    states, _ = jax.jit(jax.vmap(tt.make(name).reset))(keys)
     plans = tt.solve_batch(states)
     assert plans.solvable.all()
     assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(NUM_DRAWN)

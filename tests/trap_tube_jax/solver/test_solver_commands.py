@@ -1,6 +1,5 @@
-"""Surveys of task sets, and the command line of the solver."""
+"""The command line of the solver."""
 
-import json
 import subprocess
 import sys
 
@@ -11,33 +10,24 @@ from PIL import Image
 
 import trap_tube_jax as tt
 from refusal import refused
-from trap_tube_jax.solver.__main__ import main
-from trap_tube_jax.solver.survey import Survey
+from trap_tube_jax.solver.__main__ import main, row_of_lengths
 
 
-def test_the_figures_of_a_survey():
-    found = Survey(tt.task_set("p"), 3, np.array([4, -1, 8, 6, -1])).summary()
-    quantiles = found.pop("quantiles")
-    assert found == {
-        "id": "PerceptualTrapTube-v0",
-        "tasks": 5,
-        "seed": 3,
-        "solvable": 0.6,
-        "mean": 6,
-        "longest": 8,
-    }
-    assert quantiles == pytest.approx({"5": 4.2, "25": 5, "50": 6, "75": 7, "95": 7.8})
+def test_statistics_of_shortest_plans():
+    row = row_of_lengths("{P}", np.array([4, -1, 8, 6, -1]))
+    assert row == ["{P}", "5", "60.00 %", "6.0", "4", "5", "6", "7", "8", "8"]
+    assert row_of_lengths("none", np.array([-1])) == ["none", "1", "0.00 %", *["-"] * 7]
 
 
 def test_command_line_surveys_task_sets(tmp_path, capsys):
     picture = tmp_path / "histogram.png"
-    arguments = ["--tasks", "12", "--seed", "4", "--output", str(picture), "--sets"]
-    main([*arguments, "sy", "--format", "json"])
-    (found,) = json.loads(capsys.readouterr().out)
+    arguments = ["--tasks", "12", "--seed", "4", "--output", str(picture), "--sets", "sy", "base"]
+    main(arguments)
+    text = capsys.readouterr().out
     states, _ = jax.jit(jax.vmap(tt.make("sy").reset))(jax.random.split(jax.random.key(4), 12))
-    assert found == Survey(tt.task_set("sy"), 4, tt.solve_batch(states).length).summary()
-    main([*arguments, "base"])
-    assert "| base |    12 | 100.00 % | 11.0 |  11 |" in capsys.readouterr().out
+    row = row_of_lengths("{Sy}", tt.solve_batch(states).length)
+    assert row in [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    assert "| base |    12 | 100.00 % | 11.0 |  11 |" in text
     with Image.open(picture) as image:
         assert image.format == "PNG"
 
@@ -47,13 +37,6 @@ def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypa
         monkeypatch.setitem(sys.modules, module, None)
     animation = tmp_path / "plan.gif"
     arguments = ["--show", "SymbolicTrapTube-v0", "--seed", "3", "--output", str(animation)]
-    main([*arguments, "--format", "json"])
-    plan = json.loads(capsys.readouterr().out)
-    state, _ = tt.make("sy").reset(jax.random.key(3))
-    assert plan["actions"] == tt.solve(state).actions.tolist()
-    with Image.open(animation) as image:
-        assert image.format == "GIF"
-    animation.unlink()
 
     def print_nothing(*words, **options):
         raise OSError("closed")
@@ -64,10 +47,14 @@ def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypa
             main(arguments)
     assert animation.exists(), "files are written before anything is printed"
     main(arguments)
-    text = capsys.readouterr().out
-    grasp, move = (("up", "down", "left", "right")[code] for code in plan["actions"][-1])
-    assert text.startswith(f"start ({plan['length']} steps)\n{tt.render_ascii(state)}\n")
-    assert f"step {plan['length']}: grasp {grasp}, move {move}" in text
+    with Image.open(animation) as image:
+        assert image.format == "GIF"
+    state, _ = tt.make("sy").reset(jax.random.key(3))
+    plan, text = tt.solve(state), capsys.readouterr().out
+    assert text.startswith(f"start ({plan.length} steps)\n{tt.render_ascii(state)}\n")
+    for time, action in enumerate(plan.actions, start=1):
+        grasp, move = (("up", "down", "left", "right")[code] for code in action)
+        assert f"step {time}: grasp {grasp}, move {move}" in text
 
 
 def test_command_line_shows_that_there_is_no_plan(tmp_path, capsys):
@@ -80,7 +67,7 @@ def test_command_line_draws_distances(tmp_path, capsys):
     picture = tmp_path / "distances.png"
     main(["--distances", "base", "--output", str(picture)])
     lines = capsys.readouterr().out.splitlines()
-    assert {"id: TrapTube-v0", "seed: 0", "length: 11", "reachable: 1547184"} < set(lines)
+    assert {"length of the plan: 11", "reachable states: 1547184"} < set(lines)
     with Image.open(picture) as image:
         assert image.format == "PNG"
 
@@ -94,7 +81,6 @@ def test_command_line_draws_distances(tmp_path, capsys):
         (["--seed", str(2**32)], "seed must be an integer >= 0 and <= 4294967295"),
         (["--show", "base", "--seed", "-1"], "seed must be an integer >= 0"),
         (["--sets"], "--sets: expected at least one argument"),
-        (["--format", "csv"], "choose from"),
     ],
 )
 def test_command_line_refuses(arguments, message, capsys):
