@@ -111,6 +111,13 @@ def modules_after(program: str, folder: pathlib.Path) -> list[set[str]]:
     return list(map(set, json.loads(output.splitlines()[-1])))
 
 
+def test_nothing_is_unpickled():
+    """Reading somebody's file runs none of its code."""
+    for own, tree in TREES.items():
+        assert not IMPORTS[own] & {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
+        assert not re.search("allow_pickle|read_pickle", ast.unparse(tree)), own
+
+
 def test_training_imports_no_command_line(tmp_path):
     """Nor matplotlib: learning needs arrays alone."""
     program = "import json, sys, agents; print(json.dumps([sorted(sys.modules)]))"

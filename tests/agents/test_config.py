@@ -41,9 +41,12 @@ def test_paper_preset_is_the_specification():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_survive_json(name):
+def test_presets_survive_json_and_train_without_curiosity_and_in_an_environment_of_ones_own(name):
     config = Config.preset(name)
     assert Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    own = tt.make("sy", max_steps=9)
+    for each in (config, Config.preset(name, curiosity="none")):
+        assert make_train(each, own).env is own
 
 
 def test_every_setting_is_documented():
@@ -89,11 +92,6 @@ def test_refusals_name_the_value_and_what_is_allowed(settings, words):
         assert word in str(error.value)
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_can_be_had_without_curiosity(name):
-    assert Config.preset(name, curiosity="none").curiosity == "none"
-
-
 def test_unknown_preset_lists_the_known():
     with pytest.raises(ValueError, match=r"quick.*paper.*fast"):
         Config.preset("quick")
@@ -106,9 +104,3 @@ def test_the_sets_own_limit_holds_unless_the_settings_give_one(own_task_sets):
     assert config.step_limit("p") == 50
     longer = Config(env_id="Short-v0", max_steps=60)
     assert make_train(longer).env.max_steps == longer.step_limit("p") == 60
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_trains_in_an_environment_of_ones_own(name):
-    own = tt.make("sy", max_steps=9)
-    assert make_train(Config.preset(name), own).env is own

@@ -1,6 +1,7 @@
 """The gymnax adapter, under gymnax 0.x and 1.x and under agents written for it."""
 
 import copy
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -104,7 +105,7 @@ def test_a_finished_episode_stays_without_the_reset(easy):
 def test_pairs_as_actions_batches_and_copies(easy, easy_env):
     env, params = to_gymnax.make(easy_env, flat_actions=False)
     assert isinstance(env.action_space(params), spaces.Tuple)
-    flat = copy.deepcopy(easy[0])
+    flat = pickle.loads(pickle.dumps(copy.deepcopy(easy[0])))
     keys = jax.random.split(jax.random.key(0), 3)
     _, states = jax.vmap(flat.reset, in_axes=(0, None))(keys, params)
     indices = jnp.array([0, 7, 9])
@@ -171,6 +172,14 @@ def test_stoa_steps_it(easy):
     assert float(timestep.reward) == 1.0
     assert float(timestep.discount) == 0.0
     assert stoa.observation_space().shape == (12, 12, 3)
+
+
+@needs_six_values
+def test_an_own_set_may_be_registered_again(own_task_sets):
+    for limit in (7, 9):
+        tt.register("GymnaxTest-v0", (), max_steps=limit)
+        to_gymnax.register()
+        assert gymnax.make("GymnaxTest-v0")[1].max_steps_in_episode == limit
 
 
 @needs_six_values

@@ -66,10 +66,3 @@ def test_every_layout_is_drawn_as_often_and_as_it_is_in_the_states_colours():
         counts = Counter(rows(drawn, index) for index in range(len(keys)))
         assert counts.keys() == set(choices)
         assert all(abs(count - len(keys) / len(choices)) < 50 for count in counts.values())
-
-
-def test_layouts_compose_with_other_colours():
-    env = tt.Environment((*tt.task_set("two-traps").transfers, tt.structural))
-    state, _ = jax.jit(env.reset)(jax.random.key(1))
-    tt.validate(state)
-    assert np.any(np.asarray(state.palette) != np.asarray(tt.base_state().palette))

@@ -26,7 +26,10 @@ class Replay(NamedTuple):
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, np.ndarray]:
     with np.load(RECORDING, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+        found = {name: arrays[name] for name in arrays.files}
+    assert (len(found["board"]), found["length"].sum()) == (EPISODES, TRANSITIONS)
+    assert list(found["object_names"]) == list(spec.OBJECT_NAMES)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -49,25 +52,19 @@ def starts(recorded) -> tt.State:
 def replay(recorded, starts) -> Replay:
     env = tt.make("TrapTube-v0")
 
+    def step(state, action):
+        state, timestep = env.step(state, action)
+        return state, Replay(state, timestep)
+
     def episode(state, actions):
-        return jax.lax.scan(lambda s, a: _pair(env.step(s, a)), state, actions)[1]
+        return jax.lax.scan(step, state, actions)[1]
 
     actions = jnp.asarray(recorded["action"], jnp.int32)
-    return jax.tree.map(np.asarray, Replay(*jax.jit(jax.vmap(episode))(starts, actions)))
-
-
-def _pair(result):
-    return result[0], result
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(episode))(starts, actions))
 
 
 def _within_episode(recorded) -> np.ndarray:
     return np.arange(50) < recorded["length"][:, None]
-
-
-def test_recording_is_complete(recorded):
-    assert recorded["board"].shape[0] == EPISODES
-    assert recorded["length"].sum() == TRANSITIONS
-    assert list(recorded["object_names"]) == list(spec.OBJECT_NAMES)
 
 
 def test_positions_rewards_and_flags(recorded, replay):

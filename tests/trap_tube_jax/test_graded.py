@@ -187,13 +187,6 @@ def test_structural_goes_straight_from_the_centre():
     np.testing.assert_allclose(points, drawn / 4, atol=1e-6)
 
 
-def test_structural_leaves_agent_and_food_and_the_tubes_alike():
-    drawn = palettes(0.7)
-    np.testing.assert_array_equal(drawn[:, spec.TUBE1], drawn[:, spec.TUBE2])
-    for code in (spec.AGENT, spec.FOOD):
-        assert np.all(drawn[:, code] == BASE.palette[code])
-
-
 @pytest.mark.parametrize("transfer", [tt.graded_perceptual(0.3), tt.graded_structural(0.3)])
 def test_the_same_alone_in_a_batch_and_in_an_environment(transfer):
     env, keys = tt.Environment((transfer,)), jax.random.split(jax.random.key(6), 64)

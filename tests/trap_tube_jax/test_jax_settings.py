@@ -70,14 +70,3 @@ def test_the_same_episodes(expected, settings):
             stack.enter_context(context(value))
         played = play()
     assert_same(played, expected)
-
-
-def test_keys_of_another_kind_reset_and_step():
-    with jax.default_prng_impl("rbg"):
-        vector = tt.VectorEnvironment(tt.Environment((tt.structural,), max_steps=2))
-        keys = jax.random.split(jax.random.key(0), 3)
-        state, first = jax.jit(vector.reset)(keys)
-        state, _ = jax.jit(vector.step)(state, jnp.zeros((3, 2), jnp.int32))
-        _, timestep = jax.jit(vector.step)(state, jnp.zeros((3, 2), jnp.int32))
-    assert timestep.truncated.all()
-    assert np.any(timestep.observation != first.observation, axis=(1, 2, 3)).all()

@@ -20,21 +20,17 @@ def cells(picture, size=CELL):
     return np.asarray(picture).reshape(12, size, 12, size, 3).swapaxes(1, 2)
 
 
-def test_one_pixel_per_cell_is_the_observation():
-    state = tt.base_state()
-    np.testing.assert_array_equal(tt.render(state, 1, grasp=0), tt.observe(state))
-
-
 @pytest.mark.parametrize(
-    ("features", "channels"), [(1, [0, 0, 0]), (2, [0, 1, None]), (5, [0, 1, 2])]
+    ("features", "channels"),
+    [(1, [0, 0, 0]), (2, [0, 1, None]), (3, [0, 1, 2]), (5, [0, 1, 2])],
 )
-def test_feature_channels_become_rgb(features, channels):
+def test_one_pixel_per_cell_is_the_observation_in_rgb(features, channels):
     palette = np.arange(8 * features, dtype=np.uint8).reshape(8, features) + 50
     state = tt.base_state(features).replace(palette=palette)
     observation = np.asarray(tt.observe(state))
     zeros = np.zeros((12, 12), np.uint8)
     expected = np.stack([zeros if c is None else observation[..., c] for c in channels], -1)
-    np.testing.assert_array_equal(tt.render(state, 1), expected)
+    np.testing.assert_array_equal(tt.render(state, 1, grasp=0), expected)
 
 
 @pytest.mark.parametrize("size", [3, 7])
@@ -126,7 +122,7 @@ def test_render_refuses_other_cell_sizes(size):
         tt.render(tt.base_state(), size)
 
 
-def test_episode_frames_show_every_state_and_grasp():
+def test_episode_frames_show_every_state_and_grasp_and_padding_moves_nothing():
     state = tt.base_state()
     frames = rendering.episode_frames(state, np.array([[0, 0], [0, 3]]), 8)
     assert frames.shape == (3, 96, 96, 3)
@@ -136,6 +132,8 @@ def test_episode_frames_show_every_state_and_grasp():
     after = moved.replace(agent=moved.agent.at[1].add(1), tool=moved.tool.at[1].add(1))
     np.testing.assert_array_equal(frames[2], tt.render(after, 8))
     assert len(rendering.episode_frames(state, [], 8)) == 1
+    padding = rendering.episode_frames(state, [[-1, -1]] * 2, 8)
+    np.testing.assert_array_equal(padding, np.stack([tt.render(state, 8)] * 3))
 
 
 @pytest.mark.parametrize(
@@ -148,12 +146,6 @@ def test_episode_frames_show_every_state_and_grasp():
 )
 def test_episode_frames_refuse_other_actions(actions, message):
     assert_refused(["action", message], rendering.episode_frames, tt.base_state(), actions)
-
-
-def test_the_padding_of_a_plan_is_drawn_as_a_step_that_moves_nothing():
-    state = tt.base_state()
-    frames = rendering.episode_frames(state, [[-1, -1]] * 2, 8)
-    np.testing.assert_array_equal(frames, np.stack([tt.render(state, 8)] * 3))
 
 
 def test_gif_holds_the_frames(tmp_path):

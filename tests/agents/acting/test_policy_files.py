@@ -8,7 +8,7 @@ import safetensors.numpy
 
 from agents.acting.policy_files import load_policy, save_policy
 from agents.arrays import to_arrays
-from easy import assert_same
+from easy import assert_same, enable_x64
 from tiny_policy import CONFIG, random_policy
 
 POLICY = random_policy()
@@ -22,6 +22,8 @@ def test_a_stored_policy_is_the_same(tmp_path):
     loaded = load_policy(path)
     assert loaded._replace(params=None) == POLICY._replace(params=None)
     assert_same(loaded.params, POLICY.params)
+    with enable_x64(True):
+        assert_same(load_policy(path).params, POLICY.params)
     assert list(tmp_path.iterdir()) == [path]
 
 

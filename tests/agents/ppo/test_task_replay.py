@@ -16,18 +16,6 @@ def replay() -> TaskReplay:
     return TaskReplay.untried(jax.random.key(0), LISTS, CAPACITY)
 
 
-def test_failed_tasks_are_added_to_the_next_list_in_the_oldest_places(replay):
-    keys = jax.random.split(jax.random.key(1), 6)
-    new = bits(keys)
-    failed = jnp.array([True, False, True, True, True, True])
-    # Three new tasks, two of the first list, one of the last.
-    after = replay.remember(keys, failed, (2, 1))
-    once, twice = bits(replay.keys)
-    np.testing.assert_array_equal(bits(after.keys[0]), [new[0], new[2], *once[2:]])
-    np.testing.assert_array_equal(bits(after.keys[1]), [new[3], new[4], *twice[2:]])
-    np.testing.assert_array_equal(after.next, [2, 2])
-
-
 def test_places_are_filled_in_turn(replay):
     keys = jax.random.split(jax.random.key(1), 6)
     last = bits(keys[5])

@@ -32,8 +32,3 @@ def test_sets_of_few_layouts(name):
     layout = layout_numbers(name, evaluation_tasks(name, 64))
     number = {"base": 1, "st": 1, "sy": 5, "stsy": 5}.get(name)
     assert (None if layout is None else len(set(layout.tolist()))) == number
-
-
-def test_the_number_of_tasks_is_checked():
-    with pytest.raises(ValueError, match="must be an integer >= 1, got 0"):
-        evaluation_tasks("p", 0)
