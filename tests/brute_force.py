@@ -28,7 +28,7 @@ class Level(NamedTuple):
 class Graph(NamedTuple):
     """All places i64[n, 3] that can be reached, the start first, and fewest steps between them.
 
-    The successors i64[n, 16] are indices of places, -1 for a solved place, which has none. A
+    The successors i32[n, 16] are indices of places, -1 for a solved place, which has none. A
     distance f64[n] is infinite where there is no way.
     """
 
@@ -61,9 +61,10 @@ def graph(state) -> Graph:
     goals = np.unique(following[solved], axis=0)
     places = np.concatenate([found, goals])
     index = {place: number for number, place in enumerate(map(tuple, places.tolist()))}
-    successors = np.full((len(places), 16), -1)
+    successors = np.full((len(places), 16), -1, np.int32)  # SciPy 1.14 takes no wider indices
     successors[: len(found)] = [[index[tuple(to)] for to in row] for row in following.tolist()]
-    edges = np.repeat(np.arange(len(found)), 16), successors[: len(found)].ravel()
+    starts = np.repeat(np.arange(len(found), dtype=np.int32), 16)
+    edges = starts, successors[: len(found)].ravel()
     matrix = csr_array((np.ones(len(edges[0])), edges), (len(places), len(places)))
     from_start = dijkstra(matrix, unweighted=True, indices=0)
     to_goal = np.full(len(places), np.inf)
