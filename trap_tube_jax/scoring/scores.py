@@ -123,7 +123,7 @@ class Score:
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """The scores of an agent under the benchmark's protocol. Printed, they are a Markdown table.
+    """The scores of an agent by the benchmark's protocol; a Markdown table in ASCII if printed.
 
     Attributes:
       protocol: version of the fixed tasks.
@@ -164,8 +164,8 @@ def _cells(score: Score) -> list[str]:
         str(score.tasks),
         str(score.solved),
         f"{score.percent:.1f}",
-        "–" if interval is None else f"{interval[0]:.1f}–{interval[1]:.1f}",
-        "–" if score.layouts is None else str(score.layouts),
+        "-" if interval is None else f"{interval[0]:.1f}-{interval[1]:.1f}",
+        "-" if score.layouts is None else str(score.layouts),
         _number(score.mean_steps, ".1f"),
         _number(found and found.percent_of_solvable, ".1f"),
         _number(found and found.mean, ".3f"),
@@ -173,7 +173,7 @@ def _cells(score: Score) -> list[str]:
 
 
 def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)
+    return "-" if value is None else format(value, form)
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

@@ -190,6 +190,7 @@ def test_scores_are_records(scores):
     assert [each["set"] for each in values["sets"]] == ["near", "base"]
     assert {"tasks", "solved", "percent", "interval"} <= values["sets"][0].keys()
     lines = str(scores).splitlines()
+    assert str(scores).isascii(), "any terminal shows it"
     assert lines[0].startswith("| set ")
     assert re.search(rf" {scores['near'].solved} \| +{scores['near'].percent:.1f} \|", lines[2])
     assert " 0 of 1 |" in lines[3]
