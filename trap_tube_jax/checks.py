@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 LARGEST_SEED = 2**32 - 1  # `jax.random.key` drops what is beyond
+MOST_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
 
 
 def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None = None) -> int:

@@ -41,14 +41,14 @@ def save_gallery(
     Args:
       path: the file to write.
       ids: the task sets, at least one; the paper's eight if absent.
-      tasks: most tasks per set, at least 2: the first distinct ones of 64 draws.
+      tasks: most tasks per set, 2 to 64: the first distinct ones of 64 draws.
       seed: seed of the tasks, 0 to 2**32 - 1.
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
       ImportError: matplotlib is not installed.
     """
-    tasks, seed = check_integer("tasks", tasks, 2), check_seed(seed)
+    tasks, seed = check_integer("tasks", tasks, 2, DRAWS), check_seed(seed)
     if isinstance(ids, str) or not ids:
         raise ValueError(f"ids must name at least one task set, as in ('base', 'p'), got {ids!r}")
     entries = [task_set(name) for name in ids]
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     add = parser.add_argument
     add("--output", type=pathlib.Path, default=".", help="folder of gallery.png")
-    add("--tasks", type=int, default=4, help="distinct tasks per set, at least 2")
+    add("--tasks", type=int, default=4, help="distinct tasks per set, 2 to 64")
     add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1")
     options = parser.parse_args(arguments)
     with plain_errors():

@@ -39,6 +39,7 @@ from agents.runs.loggers import open_loggers
 from agents.runs.metrics import Row, append_rows, is_last, read_rows, rewind_rows
 from agents.runs.provenance import note_provenance
 from agents.runs.stopping import Stopped, StopSignals
+from trap_tube_jax.checks import MOST_TASKS, check_integer
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
@@ -75,11 +76,13 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number that is too small or an unknown set."""
-        smallest = {"checkpoint_every": 1, "keep": 1, "evaluate_every": 0, "reported": 1}
+        smallest = {"checkpoint_every": 1, "keep": 1, "evaluate_every": 0}
         for name, low in smallest.items():
             value = getattr(self, name)
             if value is not None and value < low:
                 raise ValueError(f"{name} must be >= {low}, got {value}")
+        if self.reported is not None:
+            check_integer("reported", self.reported, maximum=MOST_TASKS)
         for name in self.sets or ():
             tt.task_set(name)
 

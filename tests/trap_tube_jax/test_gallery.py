@@ -35,7 +35,7 @@ def test_the_gallery_shows_distinct_tasks_of_the_seed_and_a_legend(tmp_path, mon
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tasks": 1}, "tasks must be an integer >= 2, got 1"),
+        ({"tasks": 1}, "tasks must be an integer >= 2 and <= 64, got 1"),
         ({"seed": 2**32}, "seed must be an integer >= 0 and <= 4294967295, got 4294967296"),
         ({"ids": ()}, "at least one task set"),
         ({"ids": "base"}, r"at least one task set, as in \('base', 'p'\), got 'base'"),

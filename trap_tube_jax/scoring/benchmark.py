@@ -85,7 +85,7 @@ def score(
     Args:
       policy: an object with the functions of `Policy`, such as `agents.load` returns.
       sets: ids or short names; the paper's eight if absent.
-      tasks: tasks per set, at least 1. A set without transfers has one.
+      tasks: tasks per set, 1 to 1,000,000. A set without transfers has one.
       seed: seed of the policy's draws, 0 to 2**32 - 1.
       optimality: number of tasks per set, the first ones, to compare with shortest plans.
       num_features: N, feature channels of the observation; see `make`.

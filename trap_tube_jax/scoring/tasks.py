@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.checks import check_integer
+from trap_tube_jax.checks import MOST_TASKS, check_integer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
 from trap_tube_jax.state import State
@@ -45,7 +45,7 @@ def evaluation_tasks(
 
     Args:
       name: the set's id or short name.
-      num_tasks: at least 1.
+      num_tasks: 1 to 1,000,000.
       num_features: N, feature channels; see `make`.
       purpose: `test` for tasks that are reported, `validation` for tasks that stop training and
         select parameters.
@@ -63,9 +63,9 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     `jax_threefry_partitionable`, JAX's default, whatever the setting is here.
 
     Raises:
-      ValueError: `num_tasks` is below 1, or `purpose` is unknown.
+      ValueError: `num_tasks` is not from 1 to 1,000,000, or `purpose` is unknown.
     """
-    check_integer("the number of evaluation tasks", num_tasks)
+    check_integer("the number of evaluation tasks", num_tasks, maximum=MOST_TASKS)
     count = num_tasks if env.transfers else 1
     # Transfers are compiled one by one: the sets share them, so eight sets take three
     # compilations, and a transfer has the same bits in each.

@@ -187,6 +187,7 @@ def test_what_memory_cannot_hold_is_refused_before_it_is_asked_for(tmp_path):
         ({"keep": 0}, "keep must be >= 1, got 0"),
         ({"checkpoint_every": 0}, "checkpoint_every must be >= 1, got 0"),
         ({"evaluate_every": -1}, "evaluate_every must be >= 0, got -1"),
+        ({"reported": 10**9}, "reported must be an integer >= 1 and <= 1000000, got 1000000000"),
         ({"sets": ("q",)}, "unknown task set 'q'"),
     ],
 )

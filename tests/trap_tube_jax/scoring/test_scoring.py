@@ -259,6 +259,7 @@ def test_refusals(near):
         ("sy", {}, ["sets must name task sets", "base, p", "'sy'"]),
         ((), {}, ["sets must name", "()"]),
         (["sy"], {"tasks": 0}, [">= 1", "0"]),
+        (["sy"], {"tasks": 10**9}, ["evaluation tasks must be", "<= 1000000", "1000000000"]),
         (["sy"], {"optimality": -1}, ["optimality", ">= 0", "-1"]),
         *(
             (["sy"], {"seed": seed}, ["seed", ">= 0 and <= 4294967295", repr(seed)])

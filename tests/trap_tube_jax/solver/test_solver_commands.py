@@ -78,6 +78,7 @@ def test_command_line_draws_distances(tmp_path, capsys):
         (["--show", "p", "--distances", "p"], "not allowed with argument --show"),
         (["--show", "nowhere"], "unknown task set 'nowhere'"),
         (["--tasks", "0"], "tasks must be an integer >= 1"),
+        (["--tasks", "1000000000"], "<= 1000000, got 1000000000"),
         (["--seed", str(2**32)], "seed must be an integer >= 0 and <= 4294967295"),
         (["--show", "base", "--seed", "-1"], "seed must be an integer >= 0"),
         (["--sets"], "--sets: expected at least one argument"),
