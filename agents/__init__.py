@@ -42,13 +42,11 @@ def load(
     """
     from agents.runs import loading  # noqa: PLC0415  training needs no files
 
-    found = loading.load_policies(source, iteration, imports)
-    name = found[0].name if seed is None else f"{loading.SEED}{seed}"
-    by_name = {policy.name: policy for policy in found}
-    if name not in by_name:
-        seeds = [n.removeprefix(loading.SEED) for n in by_name if n.startswith(loading.SEED)]
-        raise ValueError(f"{source} has no seed {seed}; allowed: {', '.join(seeds) or 'none'}")
-    return by_name[name]._replace(greedy=greedy)
+    found = {each.name: each for each in loading.load_policies(source, iteration, imports)}
+    name = next(iter(found)) if seed is None else f"seed {seed}"
+    if name not in found:
+        raise ValueError(f"{source} has no seed {seed}; it holds {', '.join(found)}")
+    return found[name]._replace(greedy=greedy)
 
 
 def save(path: str | Path, policy: Policy) -> None:

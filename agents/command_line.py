@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import functools
 import inspect
 import re
 import types
@@ -28,92 +29,76 @@ def parse(cls: type[Options], arguments: Sequence[str] | None, prog: str) -> Opt
 
     Raises:
       SystemExit: the command line is invalid, or asks for help.
-    """
-    parser = make_parser(cls, prog)
-    add_options(parser, cls)
-    return build(cls, parser.parse_args(arguments))
-
-
-def make_parser(cls: type, prog: str) -> argparse.ArgumentParser:
-    """Returns a parser without options, described by the docstring of `cls`."""
-    return argparse.ArgumentParser(
-        prog=prog,
-        usage=f"{prog} [options]",
-        description=(inspect.getdoc(cls) or "").partition("\n\nAttributes:")[0],
-        formatter_class=_Formatter,
-        allow_abbrev=False,
-    )
-
-
-class _Formatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str):
-        super().__init__(prog, max_help_position=32)
-
-
-def add_options(
-    parser: argparse.ArgumentParser, cls: type, defaults: Any = None, skip: Sequence[str] = ()
-) -> None:
-    """Adds an option for each field of a dataclass.
-
-    Args:
-      parser: the parser.
-      cls: the dataclass.
-      defaults: an instance with other defaults than the fields have.
-      skip: fields without an option.
-    """
-    documents, kinds = _documents(cls), get_type_hints(cls)
-    groups = {group.title: group for group in parser._action_groups}
-    for field in dataclasses.fields(cls):
-        if field.name in skip:
-            continue
-        title = field.metadata.get("group")
-        if title is not None and title not in groups:
-            groups[title] = parser.add_argument_group(title)
-        target = parser if title is None else groups[title]
-        text = documents.get(field.name, "").replace("%", "%%")
-        if field.default is dataclasses.MISSING:
-            target.add_argument(field.name, help=text, **_values(kinds[field.name]))
-            continue
-        default = field.default if defaults is None else getattr(defaults, field.name)
-        shown = _text(default)
-        target.add_argument(
-            f"--{field.name.replace('_', '-')}",
-            *field.metadata.get("flags", ()),
-            dest=field.name,
-            default=list(default) if field.metadata.get("append") else default,
-            help=f"{text} [{shown}]" if shown else text,
-            **_action(field, kinds[field.name]),
-        )
-
-
-def build(cls: type[Options], namespace: argparse.Namespace, **given: Any) -> Options:
-    """Builds a dataclass from parsed options, and from `given` values for skipped fields.
-
-    Raises:
       ValueError: a value is not allowed.
     """
-    names = [field.name for field in dataclasses.fields(cls) if field.name not in given]  # pyright: ignore[reportArgumentType]
-    values = {name: getattr(namespace, name) for name in names}
-    as_tuples = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return cls(**as_tuples, **given)
+    return parse_all([cls], arguments, prog)[0]
 
 
-def _documents(cls: type) -> dict[str, str]:
-    """Returns the first sentence about each attribute in the docstrings of `cls` and its bases."""
-    text = "\n".join(inspect.getdoc(each) or "" for each in reversed(cls.__mro__[:-1]))
-    entries = re.findall(r"^ {2}(\w+): (.+(?:\n {4}.+)*)", text, re.M)
-    sentences = {name: re.sub(r"\s+", " ", entry) for name, entry in entries}
-    return {
-        name: re.split(r"(?<=\w)[.:;] ", entry)[0].rstrip(".") for name, entry in sentences.items()
-    }
+def parse_all(
+    declared: Sequence[Any], arguments: Sequence[str] | None, prog: str, *, partly: bool = False
+) -> list[Any]:
+    """Reads a command line into several dataclasses.
+
+    Args:
+      declared: dataclasses, or instances whose values are the defaults. The docstring of the first
+        describes the command.
+      arguments: those of the process if None.
+      prog: the command.
+      partly: passes over options of none of them, and over --help.
+
+    Raises:
+      SystemExit: the command line is invalid, or asks for help.
+      ValueError: a value is not allowed.
+    """
+    parser = argparse.ArgumentParser(
+        prog=prog,
+        usage=f"{prog} [options]",
+        description=(inspect.getdoc(declared[0]) or "").partition("\n\nAttributes:")[0],
+        formatter_class=functools.partial(
+            argparse.RawDescriptionHelpFormatter, max_help_position=32
+        ),
+        allow_abbrev=False,
+        add_help=not partly,
+    )
+    groups: dict[Any, Any] = {None: parser}
+    for each in declared:
+        documents, kinds = _documents(_class(each)), get_type_hints(_class(each))
+        for field in dataclasses.fields(each):
+            group = field.metadata.get("group")
+            if group not in groups:
+                groups[group] = parser.add_argument_group(group)
+            text = documents[field.name].replace("%", "%%")
+            _add(groups[group], field, getattr(each, field.name, None), text, kinds[field.name])
+    found = vars(parser.parse_known_args(arguments)[0] if partly else parser.parse_args(arguments))
+    values = {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
+    return [
+        _class(each)(**{field.name: values[field.name] for field in dataclasses.fields(each)})
+        for each in declared
+    ]
 
 
-def _action(field: dataclasses.Field, kind: Any) -> dict[str, Any]:
-    if kind is bool:
-        return {"action": argparse.BooleanOptionalAction}
+def _class(declared: Any) -> type:
+    return declared if isinstance(declared, type) else type(declared)
+
+
+def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: Any) -> None:
+    if field.default is dataclasses.MISSING:
+        group.add_argument(field.name, help=text, **_values(kind))
+        return
+    options = _values(kind)
     if field.metadata.get("append"):
-        return {"action": "append", "metavar": "NAME"}
-    return _values(kind)
+        options, default = {"action": "append", "metavar": "NAME"}, list(default)
+    shown = "on" if default is True else default
+    if isinstance(default, list | tuple):
+        shown = " ".join(map(str, default))
+    group.add_argument(
+        f"--{field.name.replace('_', '-')}",
+        *field.metadata.get("flags", ()),
+        dest=field.name,
+        default=default,
+        help=text if shown is None or shown is False or shown == "" else f"{text} [{shown}]",
+        **options,
+    )
 
 
 def _values(kind: Any) -> dict[str, Any]:
@@ -125,10 +110,16 @@ def _values(kind: Any) -> dict[str, Any]:
     if get_origin(kind) is tuple:
         inner, *rest = get_args(kind)
         return {**_values(inner), "nargs": "*" if rest == [...] else 1 + len(rest)}
+    if kind is bool:
+        return {"action": argparse.BooleanOptionalAction}
     return {"type": kind, "metavar": {int: "N", float: "X", str: "NAME"}.get(kind, "PATH")}
 
 
-def _text(default: Any) -> str:
-    if default is None or default == () or isinstance(default, bool):
-        return "on" if default is True else ""
-    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+def _documents(cls: type) -> dict[str, str]:
+    """Returns the first sentence about each attribute in the docstrings of `cls` and its bases."""
+    text = "\n".join(inspect.getdoc(each) or "" for each in reversed(cls.__mro__[:-1]))
+    entries = re.findall(r"^ {2}(\w+): (.+(?:\n {4}.+)*)", text, re.M)
+    sentences = {name: re.sub(r"\s+", " ", entry) for name, entry in entries}
+    return {
+        name: re.split(r"(?<=\w)[.:;] ", entry)[0].rstrip(".") for name, entry in sentences.items()
+    }

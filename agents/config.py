@@ -16,10 +16,13 @@ LARGEST = 2**31 - 1  # of an i32, in which training counts
 GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
 
-def _setting(group: str, default: Any, low: float | None = None, high: float = LARGEST) -> Any:
+def _setting(
+    group: str, default: Any, low: float | None = None, high: float = LARGEST, **metadata: Any
+) -> Any:
     """Declares a field of `Config`: its group, default and, for numbers, inclusive limits."""
     limits = None if low is None else (low, high)
-    return dataclasses.field(default=default, metadata={"group": group, "limits": limits})
+    metadata = {"group": group, "limits": limits, **metadata}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 _task, _length, _ppo, _curiosity, _replay, _network = (partial(_setting, name) for name in GROUPS)
@@ -85,7 +88,7 @@ class Config:
         through the order of float32 sums.
     """
 
-    env_id: str = _task("TrapTube-v0")
+    env_id: str = _task("TrapTube-v0", flags=("--env",))
     num_features: int = _task(3, 1, 256)
     max_steps: int | None = _task(None, 1, 10_000)
 

@@ -4,13 +4,14 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
+
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.command_line import option, parse
 from agents.runs import compilation
-from agents.runs.evaluator import evaluation_rows
 from agents.runs.loading import load_policies
-from agents.runs.metrics import write_rows
+from agents.runs.metrics import evaluation_rows
 from agents.runs.report import save_first_solved
 from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
@@ -76,7 +77,7 @@ def evaluate(options: Options) -> None:
             for policy, own in zip(policies, scores, strict=True)
             for row in evaluation_rows(own, policy, 0, "test")
         ]
-        write_rows(options.output, rows)
+        pd.DataFrame(rows).to_csv(options.output, index=False)
         notes.append(f"results: {options.output}")
     if options.gif is not None:
         options.gif.parent.mkdir(parents=True, exist_ok=True)

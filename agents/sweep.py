@@ -10,9 +10,9 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from agents.command_line import add_options, build, make_parser
+from agents.command_line import parse_all
 from agents.experiments import report
-from agents.experiments.grids import Grid, Options
+from agents.experiments.grids import Grid
 from agents.experiments.workers import ProcessPerCall, log_of, make_executor, train_logged
 from agents.runs.display import say
 from agents.runs.folder import Run, RunFolder
@@ -44,11 +44,7 @@ def main(
     arguments, grid = sys.argv[1:] if arguments is None else list(arguments), grid or Grid()
     console = Console()
     with plain_errors():
-        parser = make_parser(Options, program)
-        add_options(parser, Options, grid.options)
-        add_options(parser, RunOptions, grid.run)
-        found = parser.parse_args(arguments)
-        options, how = build(Options, found), build(RunOptions, found)
+        options, how = parse_all([grid.options, grid.run], arguments, program)
         jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
         runs = grid.runs(name, options)
         root = next(iter(runs)).parent

@@ -1,16 +1,14 @@
 """Training from the command line: python -m agents.train --help."""
 
-import argparse
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+import jax
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.command_line import add_options, build, make_parser, option
+from agents.command_line import option, parse_all
 from agents.config import Config
 from agents.parallel import processes
 from agents.parallel.devices import become_devices
@@ -36,7 +34,6 @@ class Options:
 
     Attributes:
       preset: named settings to start from: fast, best or paper.
-      env: task set to train on, by id or short name.
       seed: the first seed.
       seeds: number of seeds to train side by side.
       name: the run's folder within --out; <preset>-<task set>-<seed> if absent.
@@ -44,60 +41,47 @@ class Options:
       resume: folder of a run to continue; its settings become the defaults, and only
         --iterations, --max-transitions and --stop-when-solved may change.
       imports: module to import first. It may register curiosities, encoders and task sets.
+      distributed: trains with the other processes of a job of Slurm, Open MPI, Kubernetes or a
+        Cloud TPU, or else of HOST:PORT PROCESSES NUMBER.
     """
 
     preset: str = option("fast", "run")
-    env: str | None = option(None, "run", flags=("--env-id",))
     seed: int = option(0, "run")
     seeds: int = option(1, "run")
     name: str | None = option(None, "run")
     out: Path = option(Path("runs"), "run")
     resume: Path | None = option(None, "run")
     imports: tuple[str, ...] = option((), "run", append=True, flags=("--import",))
+    distributed: tuple[str, ...] | None = option(None, "devices and hosts")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if None."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
     with plain_errors():
         train(*parse(arguments))
 
 
-def parse(arguments: Sequence[str]) -> tuple[Options, Run, RunOptions, processes.Job]:
+def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     """Reads a command line and, with --resume, the stored run.
 
     Raises:
       ValueError: a value is not allowed, or contradicts the stored run.
     """
     # The preset, or the stored run, decides the defaults of all other options.
-    first, _ = _parser(Options(), Config.preset("fast")).parse_known_args(
-        [argument for argument in arguments if argument not in ("-h", "--help")]
-    )
+    (first,) = parse_all([Options], arguments, PROGRAM, partly=True)
     import_modules(first.imports)
-    own: dict[str, Any] = {} if first.env is None else {"env_id": tt.task_set(first.env).id}
-    defaults, config = Options(), Config.preset(first.preset, **own)
+    defaults, config = Options(), Config.preset(first.preset)
     if first.resume is not None:
-        _, stored = RunFolder.open(first.resume, tuple(first.imports))
+        _, stored = RunFolder.open(first.resume)
         defaults = Options(preset=stored.preset, seed=stored.seed, seeds=stored.seeds)
-        config = dataclasses.replace(stored.config, **own)
-    found = _parser(defaults, config).parse_args(arguments)
-    options = build(Options, found)
-    config = build(Config, found, env_id=tt.task_set(config.env_id).id)
+        config = stored.config
+    options, config, how = parse_all([defaults, config, RunOptions], arguments, PROGRAM)
+    config = dataclasses.replace(config, env_id=tt.task_set(config.env_id).id)
     run = Run(config, options.preset, options.seed, options.seeds, imports=options.imports)
-    return options, run, build(RunOptions, found), build(processes.Job, found)
+    return options, run, how
 
 
-def _parser(options: Options, config: Config) -> argparse.ArgumentParser:
-    """Returns the parser with these defaults."""
-    parser = make_parser(Options, PROGRAM)
-    add_options(parser, Options, options)
-    add_options(parser, Config, config, skip=("env_id",))
-    add_options(parser, RunOptions)
-    add_options(parser, processes.Job)
-    return parser
-
-
-def train(options: Options, run: Run, how: RunOptions, job: processes.Job) -> None:
+def train(options: Options, run: Run, how: RunOptions) -> None:
     """Trains a run, or continues it, and prints its results.
 
     Raises:
@@ -105,12 +89,12 @@ def train(options: Options, run: Run, how: RunOptions, job: processes.Job) -> No
       ValueError: the run cannot be trained or continued.
       OSError: a file cannot be written.
     """
-    become_devices(how.devices)
-    job.join()
-    console = Console(quiet=not processes.is_first())
     folder = RunFolder(run_path(options, run))
     if options.resume is None:
-        processes.on_first(folder.check_free)
+        folder.check_free()
+    become_devices(how.devices)
+    processes.join(options.distributed)
+    console = Console(quiet=jax.process_index() > 0)
     compilation.enable_cache()
     again = f"Continue with: {display.resume_command(folder)}"
     try:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.experiments import tables
-from agents.experiments.tables import Frame
+from agents.runs.metrics import Frame
 from trap_tube_jax.scoring.tasks import label
 
 WIDTH = 8.3  # inches, as in a page 830 pixels wide

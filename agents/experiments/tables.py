@@ -10,10 +10,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from agents.runs.metrics import Frame
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 from trap_tube_jax.tables import markdown_table
-
-Frame = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
 
 # Table 1: trials solved, episodes to solve.
 PAPER_SOLVED = {

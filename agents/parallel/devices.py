@@ -1,9 +1,9 @@
 """Several devices for one run: a mesh of seeds × episodes.
 
-Along `seeds` the devices train different seeds and exchange nothing. Along `episodes` they share a
-seed: each device plays its own episodes and differentiates its own part of every minibatch, and
-the gradients are averaged. States [S, ...] are split along `seeds` and replicated along `episodes`,
-so a checkpoint fits any number of devices.
+Along `seeds` the devices train different seeds. Along `episodes` they share a seed: each plays its
+own episodes and differentiates its own part of every minibatch, and the gradients are averaged.
+States [S, ...] are split along `seeds` and replicated along `episodes`, so a checkpoint fits any
+number of devices.
 
     learner = make_train(config, axis=placement.axis)
     iterate = jax.jit(placement.shard(jax.vmap(learner.iterate)), donate_argnums=0)
@@ -50,9 +50,7 @@ class EpisodeAxis:
 
     def part(self, x: jax.Array) -> jax.Array:
         """Returns this device's rows i, i + size, i + 2 size, ... of `x` [B, ...]."""
-        if self.size == 1:
-            return x
-        return x.reshape(-1, self.size)[:, jax.lax.axis_index(EPISODES)]
+        return x if self.size == 1 else x.reshape(-1, self.size)[:, jax.lax.axis_index(EPISODES)]
 
     def gather(self, x: jax.Array) -> jax.Array:
         """Returns the rows [B] of all devices; inverts `part`."""
@@ -60,9 +58,7 @@ class EpisodeAxis:
 
     def own_key(self, key: jax.Array) -> jax.Array:
         """Derives this device's PRNG key."""
-        if self.size == 1:
-            return key
-        return jax.random.fold_in(key, jax.lax.axis_index(EPISODES))
+        return key if self.size == 1 else jax.random.fold_in(key, jax.lax.axis_index(EPISODES))
 
 
 ONE_DEVICE = EpisodeAxis()
@@ -84,9 +80,9 @@ class Placement:
           ValueError: the devices do not exist, or do not divide the minibatches.
         """
         processes, available = jax.process_count(), jax.device_count()
-        counts = [available] if processes > 1 else range(1, available + 1)
+        counts = range(1, available + 1) if processes == 1 else [available]
         allowed = [n for n in counts if config.minibatch_size % (n // math.gcd(n, seeds)) == 0]
-        devices = devices if devices is not None else 1 if processes == 1 else available
+        devices = counts[0] if devices is None else devices
         if devices not in allowed:
             raise ValueError(
                 f"{devices} of {available} {jax.default_backend()} devices in {processes} "
@@ -126,8 +122,8 @@ class Placement:
         """Copies arrays [S, ...] to one device of this process; all processes must call it."""
         if self.mesh is None:
             return states
-        replicate = jax.jit(_same, out_shardings=NamedSharding(self.mesh, PartitionSpec()))
-        return jax.tree.map(lambda x: x.addressable_data(0), replicate(states))
+        copies = jax.device_put(states, NamedSharding(self.mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: x.addressable_data(0), copies)
 
     def __str__(self) -> str:
         """Names the devices, as in "4 gpu devices of 2 process(es)"."""
@@ -135,7 +131,3 @@ class Placement:
         if self.mesh is None:
             return platform
         return f"{self.mesh.size} {platform} devices of {jax.process_count()} process(es)"
-
-
-def _same(tree: Tree) -> Tree:
-    return tree

@@ -7,8 +7,7 @@ best-pstsy  the preset `best` on {P, St, Sy}: the median of five seeds
 
 from pathlib import Path
 
-from agents.acting.policy import Policy
-from agents.acting.policy_files import SUFFIX, load_policy
+from agents.acting.policy_files import SUFFIX
 
 FOLDER = Path(__file__).parent
 
@@ -16,14 +15,3 @@ FOLDER = Path(__file__).parent
 def names() -> tuple[str, ...]:
     """Returns the names of the shipped agents."""
     return tuple(sorted(path.name.removesuffix(SUFFIX) for path in FOLDER.glob(f"*{SUFFIX}")))
-
-
-def load_shipped(name: str) -> Policy:
-    """Returns a shipped agent.
-
-    Raises:
-      ValueError: unknown name; the message lists the known ones.
-    """
-    if name not in names():
-        raise ValueError(f"unknown agent {name!r}; allowed: {', '.join(names())}")
-    return load_policy(FOLDER / f"{name}{SUFFIX}")

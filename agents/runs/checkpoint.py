@@ -39,15 +39,7 @@ def save(folder: Path, iteration: int, state: Any, record: dict[str, Any], *, ke
         state=ocp.args.StandardSave(arrays), record=ocp.args.JsonSave(record)
     )
     try:
-        # A plain Checkpointer waits in vain for the other processes of a job.
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep,
-            create=False,
-            cleanup_tmp_directories=True,
-            enable_async_checkpointing=False,
-            multiprocessing_options=_this_process_alone(),
-        )
-        with ocp.CheckpointManager(folder.absolute(), options=options) as manager:
+        with _manager(folder, keep) as manager:
             manager.save(iteration, args=items, force=True)
     except Exception as error:  # Orbax passes on what its many back ends raise
         raise OSError(f"cannot write checkpoint {iteration}: {_first_line(error)}") from error
@@ -74,19 +66,12 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
     if chosen not in known:
         allowed = ", ".join(map(str, known))
         raise ValueError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
+    items = ocp.args.Composite(state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore())
     try:
         with tempfile.TemporaryDirectory() as copy:  # which no writer deletes
-            shutil.copytree(folder / str(chosen), copy, dirs_exist_ok=True)
-            items = ocp.args.Composite(
-                state=ocp.args.StandardRestore(), record=ocp.args.JsonRestore()
-            )
-            options = _this_process_alone()
-            handler = ocp.CompositeCheckpointHandler(
-                state=ocp.StandardCheckpointHandler(multiprocessing_options=options),
-                record=ocp.JsonCheckpointHandler(multiprocessing_options=options),
-            )
-            with ocp.Checkpointer(handler, multiprocessing_options=options) as checkpointer:
-                restored = checkpointer.restore(Path(copy), args=items)
+            shutil.copytree(folder / str(chosen), Path(copy, str(chosen)))
+            with _manager(Path(copy)) as manager:
+                restored = manager.restore(chosen, args=items)
         arrays, record = restored["state"], restored["record"]
         if digest(arrays) == record["digest"]:
             return arrays, record
@@ -112,14 +97,22 @@ def digest(arrays: Arrays) -> str:
     return total.hexdigest()
 
 
-def _this_process_alone() -> ocp.options.MultiprocessingOptions:
-    """Tells Orbax to wait for no other process: one of them reads and writes."""
-    if not jax.distributed.is_initialized():
-        return ocp.options.MultiprocessingOptions()
-    own = jax.process_index()
-    return ocp.options.MultiprocessingOptions(
-        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+def _manager(folder: Path, keep: int | None = None) -> ocp.CheckpointManager:
+    """Opens a folder of checkpoints for this process, which waits for no other of its job."""
+    alone = ocp.options.MultiprocessingOptions()
+    if jax.process_count() > 1:
+        own = jax.process_index()
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+        )
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=keep,
+        create=False,
+        cleanup_tmp_directories=True,
+        enable_async_checkpointing=False,
+        multiprocessing_options=alone,
     )
+    return ocp.CheckpointManager(folder.absolute(), options=options)
 
 
 def _first_line(error: Exception) -> str:

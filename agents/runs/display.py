@@ -62,23 +62,22 @@ def say(console: Console, text: str) -> None:
 
 def summary(folder: RunFolder, run: Run, scores: Mapping[int, Sequence[Score]]) -> list[str]:
     """Returns the facts that a run ends with, one a line; scores as `train_run` returns them."""
-    lines = [f"Report with curves and episodes to step through: {folder.page}"]
-    own, config = tt.task_set(run.config.env_id), run.config
-    if scores:
-        each = [score for seed in scores.values() for score in seed]
-        percent = statistics.fmean(score.percent for score in each if score.set == own.short)
-        others = [score.percent for score in each if score.set != own.short]
-        mean = statistics.fmean(others) if others else 0.0
-        lines.insert(0, f"Solves {percent:.1f} % of {own.label}, {mean:.1f} % of other sets.")
-    threshold, solved = config.stop_when_solved or 1.0, {}
-    for row in read_rows(folder.metrics):
-        if row["evaluation"] >= threshold:
-            solved.setdefault(row["seed"], row["episodes"])
-    if solved:
-        count = f" by {len(solved)} of {run.seeds} seeds" if run.seeds > 1 else ""
-        mean = statistics.fmean(solved.values())
-        lines.insert(0, f"First solved {own.label} after {mean:,.0f} episodes{count}.")
-    if config.stop_when_solved and len(solved) == run.seeds:
+    own, config, lines = tt.task_set(run.config.env_id), run.config, []
+    rows = read_rows(folder.metrics)
+    solving = rows[rows["evaluation"] >= (config.stop_when_solved or 1.0)]
+    episodes = solving.groupby("seed")["episodes"].min()
+    if len(episodes):
+        count = f" by {len(episodes)} of {run.seeds} seeds" if run.seeds > 1 else ""
+        lines.append(f"First solved {own.label} after {episodes.mean():,.0f} episodes{count}.")
+    each = [score for seed in scores.values() for score in seed]
+    parts = {
+        own.label: [score.percent for score in each if score.set == own.short],
+        "other sets": [score.percent for score in each if score.set != own.short],
+    }
+    means = [f"{statistics.fmean(own):.1f} % of {name}" for name, own in parts.items() if own]
+    lines += [f"Solves {', '.join(means)}."] if means else []
+    lines.append(f"Report with curves and episodes to step through: {folder.page}")
+    if config.stop_when_solved and len(episodes) == run.seeds:
         lines.append("Next, learn all transfers: python -m agents.train --preset best")
     elif not config.lr_decay_fraction and not config.intrinsic_coef_init:
         lines.append(f"Train longer: {resume_command(folder)} --iterations {2 * config.iterations}")

@@ -51,8 +51,6 @@ class Run:
             value = getattr(self, name)
             if type(value) is not int or not low <= value <= high:
                 raise ValueError(f"{name} must be an integer in [{low}, {high}], got {value!r}")
-        if self.seed_range[-1] > MAX_SEED:
-            raise ValueError(f"seeds must be at most {MAX_SEED}, got {self.seed_range[-1]}")
         if not self.algorithm:
             curiosity = self.config.curiosity
             name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"
@@ -69,11 +67,7 @@ class Run:
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
-        """Inverts `to_dict`.
-
-        Raises:
-          ValueError: a value is missing, unknown or not allowed.
-        """
+        """Inverts `to_dict`; ValueError names a value that is missing, unknown or not allowed."""
         names = sorted(field.name for field in dataclasses.fields(cls))
         if not isinstance(values, dict) or sorted(values) != names:
             raise ValueError(f"expected a table of {', '.join(names)}")
@@ -83,11 +77,7 @@ class Run:
         return cls(**{**values, "config": config, "imports": tuple(values["imports"])})
 
     def check_continues(self, before: "Run") -> None:
-        """Checks that resuming `before` with these settings trains as this run alone would have.
-
-        Raises:
-          ValueError: a setting differs that has shaped the training so far.
-        """
+        """Raises ValueError unless resuming `before` trains as this run alone would have."""
         old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
         scheduled = old["lr_decay_fraction"] > 0 or old["intrinsic_coef_init"] > 0
         free = {*EXTENDABLE, "config", "imports"} - ({"iterations"} if scheduled else set())
@@ -134,9 +124,7 @@ class RunFolder:
     def lock(self) -> Iterator[None]:
         """Makes this process the folder's only writer; makes the folder if missing.
 
-        Raises:
-          ValueError: another process writes to it.
-          OSError: the folder cannot be made.
+        Raises ValueError if another process writes to it, OSError if it cannot be made.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         lock, holder = filelock.FileLock(self.path / ".lock", timeout=0), self.path / ".writer"
@@ -156,11 +144,8 @@ class RunFolder:
     def opened_for(self, run: Run) -> Iterator[None]:
         """Locks the folder for training a new run or continuing the stored one.
 
-        A new folder in which nothing was saved is removed at the end.
-
-        Raises:
-          ValueError: the folder is taken, or `run` does not continue the stored run.
-          OSError: the folder cannot be made.
+        A new folder in which nothing was saved is removed at the end. Raises the errors of `lock`,
+        `check_free` and `Run.check_continues`.
         """
         with self.lock():
             if self.config.is_file():
@@ -176,11 +161,7 @@ class RunFolder:
                     shutil.rmtree(self.path, ignore_errors=True)
 
     def check_free(self) -> None:
-        """Checks that a new run can be created here.
-
-        Raises:
-          ValueError: the folder holds something already, or Orbax could not restore from it.
-        """
+        """Raises ValueError unless a new run can be created here."""
         if "[" in str(self.path.absolute()):  # Orbax would take it for a pattern
             raise ValueError(f"the path of a run must not contain '[', got {self.path.absolute()}")
         if self.config.is_file():

@@ -15,8 +15,6 @@ from agents.runs import checkpoint
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, runs_next_to
 from trap_tube_jax.imports import import_modules
 
-SEED = "seed "  # prefix of the names of a run's policies
-
 
 def load_policies(
     source: str | Path, iteration: int | None = None, imports: tuple[str, ...] = ()
@@ -32,24 +30,19 @@ def load_policies(
     Raises:
       ValueError: there is no such policy, or it cannot be read.
     """
-    import_modules(imports)
     path = Path(source)
-    if (path / CONFIG_FILE).is_file():
-        return load_run(path, iteration, imports)
-    if path.is_file() or str(source) in pretrained.names():
+    if not path.exists() and str(source) in pretrained.names():
+        path = pretrained.FOLDER / f"{source}{policy_files.SUFFIX}"
+    if path.is_file():
+        import_modules(imports)
         if iteration is not None:
             raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
-        if path.is_file():
-            return [policy_files.load_policy(path)]
-        return [pretrained.load_shipped(str(source))]
-    raise ValueError(
-        f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
-        f"shipped agents: {', '.join(pretrained.names())}"
-    )
-
-
-def load_run(path: Path, iteration: int | None, imports: tuple[str, ...]) -> list[Policy]:
-    """Loads the policies of a run from one of its checkpoints; see `load_policies`."""
+        return [policy_files.load_policy(path)]
+    if not (path / CONFIG_FILE).is_file():
+        raise ValueError(
+            f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
+            f"shipped agents: {', '.join(pretrained.names())}"
+        )
     folder, run = RunFolder.open(path, imports)
     arrays, _ = checkpoint.load(folder.checkpoints, iteration)
     keys = jax.random.split(jax.random.key(0), run.seeds)
@@ -68,7 +61,7 @@ def policies(run: Run, params: Any, iterations: np.ndarray) -> list[Policy]:
     params = {part: params[part] for part in PARTS}
     return [
         Policy(
-            f"{SEED}{seed}",
+            f"seed {seed}",
             run.config,
             jax.tree.map(lambda x, index=index: x[index], params),
             int(iterations[index]),

@@ -9,8 +9,6 @@ from agents.runs.folder import Run
 from agents.runs.metrics import Row
 from trap_tube_jax.imports import needs_extra
 
-Log = Callable[[dict[str, float], int], Any]  # takes values by name, and the iteration
-
 
 @contextlib.contextmanager
 def open_loggers(
@@ -25,7 +23,7 @@ def open_loggers(
       ImportError: a library is missing; the message names its extra.
     """
     with contextlib.ExitStack() as stack:
-        logs: list[Log] = []
+        logs: list[Callable[[dict[str, float], int], Any]] = []
         if tensorboard:
             with needs_extra("logging"):
                 from tensorboard.summary import Writer  # noqa: PLC0415  # pyright: ignore
@@ -45,10 +43,9 @@ def open_loggers(
             logs.append(logged.log)
 
         def log(rows: Sequence[Row]) -> None:
-            prefixes = [f"seed{row['seed']}/" if run.seeds > 1 else "" for row in rows]
             values = {
-                prefix + name: value
-                for prefix, row in zip(prefixes, rows, strict=True)
+                f"seed{row['seed']}/{name}" if run.seeds > 1 else name: value
+                for row in rows
                 for name, value in row.items()
                 if name not in ("seed", "iteration")
             }

@@ -1,15 +1,20 @@
 """CSV files that a run appends to."""
 
 import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
+from agents.acting.policy import Policy
 from agents.config import Config
 from agents.files import write_text
+from trap_tube_jax.scoring.scores import Score
+from trap_tube_jax.scoring.tasks import Purpose
 
 Row = Mapping[str, Any]
+Frame = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
 
 
 def append_rows(path: Path, rows: Sequence[Row]) -> None:
@@ -28,39 +33,54 @@ def append_rows(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows(rows)
 
 
-def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Writes one or more rows of the same columns to a CSV file, atomically."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
+def read_rows(path: Path) -> Frame:
+    """Reads a CSV file of a run; one without rows if it is missing or empty."""
+    if not path.exists() or not path.stat().st_size:
+        return pd.DataFrame(columns=["seed", "iteration", "purpose", "evaluation", "episodes"])
+    return pd.read_csv(path)
 
 
-def read_rows(path: Path) -> list[Row]:
-    """Reads the rows of a CSV file, numbers parsed; none if it is missing.
-
-    A torn last line, which a killed process leaves, is dropped.
+def rewind_rows(path: Path, iteration: int) -> None:
+    """Deletes the rows after an iteration, and a torn line that a killed process left.
 
     Raises:
       ValueError: the file has no column `iteration`.
     """
     text = path.read_text(encoding="utf-8") if path.exists() else ""
-    reader = csv.DictReader(line for line in text.splitlines(True) if line.endswith("\n"))
-    if text and "iteration" not in (reader.fieldnames or ()):
+    header, *lines = text.splitlines(keepends=True) or [""]
+    names = header.rstrip().split(",")
+    if text and "iteration" not in names:
         raise ValueError(f"{path} has no header with a column 'iteration'; delete or restore it")
-    whole = [row for row in reader if None not in row and None not in row.values()]
-    return [{name: _parse(value) for name, value in row.items()} for row in whole]
-
-
-def rewind_rows(path: Path, iteration: int) -> list[Row]:
-    """Deletes the rows after an iteration from a CSV file; returns the others."""
-    rows = [row for row in read_rows(path) if row["iteration"] <= iteration]
-    if rows:
-        write_rows(path, rows)
+    whole = [line for line in lines if line.endswith("\n") and line.count(",") == len(names) - 1]
+    kept = [line for line in whole if int(line.split(",")[names.index("iteration")]) <= iteration]
+    if kept:
+        write_text(path, header + "".join(kept))
     else:
         path.unlink(missing_ok=True)
-    return rows
+
+
+def evaluation_rows(
+    scores: Sequence[Score], policy: Policy, seed: int, purpose: Purpose
+) -> list[Row]:
+    """Returns a row of `evaluations.csv` for each score of a policy.
+
+    `solved` counts tasks. Where a set has few layouts, `layouts` of `layouts_total` are solved in
+    more than half of their draws. `length` is the mean number of steps of solved episodes.
+    """
+    return [
+        {
+            "seed": seed,
+            "iteration": policy.iteration,
+            "purpose": purpose,
+            "task_set": score.set,
+            "tasks": score.tasks,
+            "solved": score.solved,
+            "layouts": score.layouts.solved if score.layouts else "",
+            "layouts_total": score.layouts.total if score.layouts else "",
+            "length": "" if score.mean_steps is None else round(score.mean_steps, 4),
+        }
+        for score in scores
+    ]
 
 
 def is_last(row: Row, config: Config) -> bool:
@@ -70,13 +90,4 @@ def is_last(row: Row, config: Config) -> bool:
     if 0 < config.stop_when_solved <= row["evaluation"]:
         return True
     limit = config.max_transitions
-    return limit is not None and int(row["transitions"]) + config.longest_iteration > limit
-
-
-def _parse(text: str) -> Any:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+    return limit is not None and row["transitions"] + config.longest_iteration > limit

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import pandas as pd
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, Evaluator
@@ -23,12 +24,13 @@ from agents.acting.rollout import rollout
 from agents.files import write_text
 from agents.ppo.learner import Learner, TrainState
 from agents.runs.folder import Run, RunFolder
-from agents.runs.metrics import Row, read_rows
+from agents.runs.metrics import Frame, read_rows
 from trap_tube_jax import solver
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES, NO_DIRECTION
 from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import label
+from trap_tube_jax.solver.search import take
 from trap_tube_jax.state import State
 
 CELL_SIZE = 16  # pixels of the page's boards
@@ -71,60 +73,46 @@ def write(
     folder.animation.unlink(missing_ok=True)
     own = tt.task_set(run.config.env_id).short
     save_first_solved(folder.animation, evaluator, played.values(), own)
-    scores = {f"seed {seed}": evaluator.scores(outcome) for seed, outcome in played.items()}
     episodes, pictures = _episodes(learner, state, evaluator, played[run.seed])
     data = json.dumps({"episodes": episodes, "pictures": pictures})
     settings = {"preset": run.preset, "seeds": run.seeds, **run.config.to_dict()}
+    values = [(name, str(value)) for name, value in settings.items()]
+    scores = [_scores(f"seed {seed}", evaluator.scores(each)) for seed, each in played.items()]
     page = string.Template(PAGE.read_text(encoding="utf-8")).substitute(
         title=html.escape(folder.path.name),
-        scores="\n".join(_score_table(name, each) for name, each in scores.items()),
+        scores="\n".join(scores),
         curves=base64.b64encode(folder.curves.read_bytes()).decode(),
-        settings=_table(("setting", "value"), settings.items()),
+        settings=_table(pd.DataFrame(values, columns=["setting", "value"])),
         data=data.replace("</", "<\\/"),
     )
     write_text(folder.page, page)
 
 
-def save_curves(rows: Sequence[Row], path: Path, title: str) -> None:
+def save_curves(rows: Frame, path: Path, title: str) -> None:
     """Draws learning curves over episodes as PNG, a line per seed; gaps where not finite."""
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
 
+    rows = rows.replace([math.inf, -math.inf], math.nan)
     panels = [
         (name, unit, found)
         for name, unit, metrics in PANELS
-        if (found := [metric for metric in metrics if any(row.get(metric) for row in rows)])
+        if (found := [metric for metric in metrics if metric in rows and rows[metric].any()])
     ]
-    height = math.ceil(len(panels) / 2)
-    figure = Figure(figsize=(10, 2.6 * height + 0.5), layout="constrained")
+    figure = Figure(figsize=(10, 2.6 * math.ceil(len(panels) / 2) + 0.5), layout="constrained")
     figure.suptitle(title)
-    axes = figure.subplots(height, 2, sharex=True, squeeze=False).flat
-    for axis, (name, unit, metrics) in zip(axes, panels, strict=False):
+    for place, (name, unit, metrics) in enumerate(panels, 1):
+        axis = figure.add_subplot(math.ceil(len(panels) / 2), 2, place)
+        axis.set(ylabel=unit, xlabel="episodes")
         axis.set_title(name, loc="left")
-        axis.set_ylabel(unit)
-        axis.set_xlabel("episodes")
         axis.grid(alpha=0.3)
         for color, metric in zip(COLORS, metrics, strict=False):
-            _draw(axis, rows, metric, color)
+            values = rows.pivot_table(metric, "episodes", "seed", dropna=False)
+            marker = "." if len(values) < 20 else None
+            lines = axis.plot(values.index, values, color=color, linewidth=1.2, marker=marker)
+            lines[0].set_label(metric.replace("_", " "))
         if len(metrics) > 1:
             axis.legend(fontsize="small")
-    for axis in list(axes)[len(panels) :]:
-        axis.remove()
     figure.savefig(path, format="png", dpi=100)
-
-
-def _draw(axis: Any, rows: Sequence[Row], metric: str, color: str) -> None:
-    """Draws a metric over episodes, a line per seed."""
-    for number, seed in enumerate(sorted({row["seed"] for row in rows})):
-        own = [row for row in rows if row["seed"] == seed]
-        values = np.array([row[metric] for row in own], float)
-        axis.plot(
-            [row["episodes"] for row in own],
-            np.where(np.isfinite(values), values, np.nan),
-            color=color,
-            linewidth=1.2,
-            marker="." if len(own) < 20 else None,
-            label=metric.replace("_", " ") if number == 0 else None,
-        )
 
 
 def save_first_solved(
@@ -140,34 +128,29 @@ def save_first_solved(
             if np.any(outcome.solved):
                 index = int(np.argmax(outcome.solved))
                 actions = np.asarray(outcome.action[index, : outcome.length[index]])
-                state = jax.tree.map(lambda x, i=index: x[i], evaluator.tasks[name])
+                state = take(evaluator.tasks[name], index)
                 save_gif(episode_frames(state, actions, GIF_CELL_SIZE), path, fps=4)
                 return name
     return None
 
 
-def _score_table(name: str, scores: Sequence[Score]) -> str:
-    heads = (name, "tasks", "solved %", "95 % interval", "layouts", "steps")
+def _scores(name: str, scores: Sequence[Score]) -> str:
     rows = [
-        (
-            score.label,
-            score.tasks,
-            f"{score.percent:.1f}",
-            "–" if score.interval is None else "{:.1f}–{:.1f}".format(*score.interval),
-            score.layouts or "–",
-            "–" if score.mean_steps is None else f"{score.mean_steps:.1f}",
-        )
+        {
+            name: score.label,
+            "tasks": score.tasks,
+            "solved %": f"{score.percent:.1f}",
+            "95 % interval": "{:.1f}–{:.1f}".format(*score.interval) if score.interval else "–",
+            "layouts": score.layouts or "–",
+            "steps": "–" if score.mean_steps is None else f"{score.mean_steps:.1f}",
+        }
         for score in scores
     ]
-    return _table(heads, rows)
+    return _table(pd.DataFrame(rows))
 
 
-def _table(heads: Sequence[Any], rows: Iterable[Sequence[Any]]) -> str:
-    def line(cells: Sequence[Any], tag: str) -> str:
-        inner = "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for cell in cells)
-        return f"<tr>{inner}</tr>"
-
-    return "\n".join(["<table>", line(heads, "th"), *(line(row, "td") for row in rows), "</table>"])
+def _table(rows: Frame) -> str:
+    return rows.to_html(index=False, border=0)
 
 
 def _episodes(
@@ -185,7 +168,7 @@ def _episodes(
         for solved in (True, False)
         if len(found := np.flatnonzero(np.asarray(outcome.solved) == solved))
     ]
-    states = [jax.tree.map(lambda x, i=i: x[i], evaluator.tasks[name]) for name, i in shown]
+    states = [take(evaluator.tasks[name], index) for name, index in shown]
     tasks = jax.tree.map(lambda *x: np.stack(x), *states)
     plans = solver.solve_batch(tasks).actions
     rewards = np.asarray(_intrinsic_reward(learner, state, tasks, max(evaluator.limits.values())))
@@ -229,9 +212,8 @@ def _intrinsic_reward(
 def _replay(state: State, actions: np.ndarray, pictures: dict[bytes, int]) -> dict[str, Any]:
     """Replays actions i32[T, 2], padded with -1, and adds their boards to `pictures`.
 
-    Returns:
-      `frames`, the number of the picture before each step and after the last; `actions`, those of
-      each step in words.
+    Returns `frames`, the number of the picture before each step and after the last, and `actions`,
+    those of each step in words.
     """
     taken = actions[(actions >= 0).all(axis=1)]
     frames = episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]

@@ -9,6 +9,7 @@ import pandas as pd
 
 from agents.files import read_json
 from agents.runs.folder import CONFIG_FILE, RunFolder
+from agents.runs.metrics import read_rows
 
 Paths = str | Path | Iterable[str | Path]
 
@@ -32,12 +33,11 @@ def results(paths: Paths) -> pd.DataFrame:
     for folder in find_runs(paths):
         values = read_json(folder.config)  # plain values: no name in it is looked up or imported
         machines = read_json(folder.provenance) if folder.provenance.exists() else []
-        table = _table(folder, folder.evaluations, values)
-        table.insert(2, "preset", values["preset"])
-        table.insert(3, "commit", machines[-1]["commit"] if machines else None)
+        commit = machines[-1]["commit"] if machines else None
+        table = _table(folder, folder.evaluations, preset=values["preset"], commit=commit)
         settings = values["config"].items()
         tables.append(table.assign(**{k: str(v) if type(v) is list else v for k, v in settings}))
-    return pd.concat(tables, ignore_index=True)
+    return _join(tables)
 
 
 def metrics(paths: Paths) -> pd.DataFrame:
@@ -45,8 +45,7 @@ def metrics(paths: Paths) -> pd.DataFrame:
 
     Columns: run, algorithm, and those of `metrics.csv`. Arguments and errors as in `results`.
     """
-    tables = [_table(run, run.metrics, read_json(run.config)) for run in find_runs(paths)]
-    return pd.concat(tables, ignore_index=True)
+    return _join([_table(folder, folder.metrics) for folder in find_runs(paths)])
 
 
 def find_runs(paths: Paths) -> list[RunFolder]:
@@ -65,9 +64,12 @@ def find_runs(paths: Paths) -> list[RunFolder]:
     return found
 
 
-def _table(folder: RunFolder, path: Path, values: dict[str, Any]) -> pd.DataFrame:
-    is_empty = not path.exists() or not path.stat().st_size
-    table = pd.DataFrame({"seed": [], "iteration": []}) if is_empty else pd.read_csv(path)
-    table.insert(0, "run", str(folder.path))
-    table.insert(1, "algorithm", values["algorithm"])
-    return table
+def _table(folder: RunFolder, path: Path, **about: Any) -> pd.DataFrame:
+    rows, algorithm = read_rows(path), read_json(folder.config)["algorithm"]
+    first = {"run": str(folder.path), "algorithm": algorithm, **about}
+    return rows.assign(**first)[[*first, *rows]]
+
+
+def _join(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    known = [table for table in tables if len(table)]  # an empty one has no types
+    return pd.concat(known or tables, ignore_index=True)

@@ -4,7 +4,6 @@
 saving, then evaluation. No thread runs JAX in the background.
 """
 
-import contextlib
 import dataclasses
 import functools
 import os
@@ -22,26 +21,34 @@ from rich.console import Console
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets
 from agents.acting.policy import Policy
-from agents.acting.policy_files import load_policy
+from agents.acting.policy_files import load_policy, save_policy
 from agents.arrays import from_arrays, is_key, key_data
 from agents.command_line import option
 from agents.networks.agent import num_parameters
 from agents.parallel import processes
 from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
-from agents.ppo.memory import memory_estimate
 from agents.runs import checkpoint, report
 from agents.runs.display import ProgressLine, say
-from agents.runs.evaluator import PeriodicEvaluator, evaluation_rows
 from agents.runs.folder import Run, RunFolder
 from agents.runs.loading import policies
 from agents.runs.loggers import open_loggers
-from agents.runs.metrics import Row, append_rows, is_last, read_rows, rewind_rows
+from agents.runs.metrics import (
+    Frame,
+    Row,
+    append_rows,
+    evaluation_rows,
+    is_last,
+    read_rows,
+    rewind_rows,
+)
 from agents.runs.provenance import note_provenance
 from agents.runs.stopping import Stopped, StopSignals
 from trap_tube_jax.checks import MOST_TASKS, check_integer
+from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
+from trap_tube_jax.solver.search import take
 
 Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
 
@@ -117,15 +124,14 @@ def train_run(
     """
     options, console = options or RunOptions(), console or Console(quiet=True)
     folder = RunFolder(path)
-    check_memory(run)
-    with contextlib.ExitStack() as stack:
-        processes.on_first(lambda: stack.enter_context(folder.opened_for(run)))
-        written = folder
-        if not processes.is_first():  # only the first process's files are kept
-            written = RunFolder(Path(stack.enter_context(tempfile.TemporaryDirectory())))
-        session = Session(run, options, console, folder.checkpoints, written, stop_file)
+    if jax.process_index() > 0:  # of several processes the first one's files are kept
+        with tempfile.TemporaryDirectory() as copy:
+            Session(run, options, console, folder, RunFolder(Path(copy)), stop_file).train()
+        return {}
+    with folder.opened_for(run):
+        session = Session(run, options, console, folder, folder, stop_file)
         session.train()
-        return session.finish() if processes.is_first() else {}
+        return session.finish()
 
 
 class Session:
@@ -136,15 +142,11 @@ class Session:
         run: Run,
         options: RunOptions,
         console: Console,
-        stored: Path,
+        stored: RunFolder,
         folder: RunFolder,
-        stop_file: Path | None = None,
+        stop_file: Path | None,
     ):
-        """Builds the learner and restores the newest checkpoint in `stored`.
-
-        Raises:
-          ValueError: the settings cannot be trained with, or the checkpoint cannot be continued.
-        """
+        """Builds the learner and restores the newest checkpoint of `stored`; writes to `folder`."""
         self.run, self.options, self.console = run, options, console
         self.folder, self.stop_file = folder, stop_file
         self.placement = Placement.of(options.devices, run.config, run.seeds)
@@ -152,20 +154,19 @@ class Session:
         self.sets = options.sets or own_and_paper_sets(run.config)
         keys = jax.vmap(jax.random.key)(np.array(run.seed_range, np.uint32))
         init = jax.jit(jax.vmap(self.learner.init))
-        state, record = restore(stored, run, jax.eval_shape(init, keys))
-        self.iteration: int = record["iteration"]
-        self.seconds: float = record["seconds"]
-        self.compile_seconds: float = record["compile_seconds"]
-        self._last = {int(row["seed"]): row for row in record["last"]}
+        shapes = jax.eval_shape(init, keys)
+        check_memory(run, self.learner, shapes)
+        state, self.iteration, self._last = restore(stored.checkpoints, run, shapes)
+        self.seconds = max((row["seconds"] for row in self._last.values()), default=0.0)
         self.state = self.placement.put(init(keys) if state is None else state)
-        if len(rewind_rows(folder.metrics, self.iteration)) < self.iteration:
-            say(
-                self.console,
-                f"{folder.metrics} has lost rows; learning curves lack these iterations.",
-            )
-        evaluated, self._evaluator = rewind_rows(folder.evaluations, self.iteration), None
+        for path in (folder.metrics, folder.evaluations):
+            rewind_rows(path, self.iteration)
+        if read_rows(folder.metrics)["iteration"].nunique() < self.iteration:
+            say(console, f"{folder.metrics} has lost rows; learning curves lack these iterations.")
+        self._validate = None
         if options.evaluate_every:
-            self._evaluator = PeriodicEvaluator(folder, run, self.sets, evaluated)
+            tasks = run.config.eval_episodes
+            self._validate = Evaluator.of_sets(run.config, self.sets, tasks, "validation")
         folder.note(run)  # it may have other limits than before
 
     @property
@@ -176,12 +177,7 @@ class Session:
         return ~np.array(over)
 
     def train(self) -> None:
-        """Trains until every seed has reached a limit.
-
-        Raises:
-          Stopped: on request; everything is saved.
-          ValueError: a loss or a parameter is not finite; the last checkpoint stays.
-        """
+        """Trains until every seed has reached a limit."""
         if not self.active.any():
             return
         note_provenance(self.folder.provenance, str(self.placement))
@@ -192,10 +188,8 @@ class Session:
             f"{self.run.config.curiosity}, seed {', '.join(map(str, self.run.seed_range))}, "
             f"{count:,} parameters, on {self.placement}. Compiling ...",
         )
-        started = time.perf_counter()
         advance = self.placement.shard(make_advance(self.learner))
         advance = jax.jit(advance, donate_argnums=0).lower(self.state, self.active).compile()
-        self.compile_seconds += time.perf_counter() - started
         stop = StopSignals(
             lambda: say(self.console, "Finishing this iteration; Ctrl-C again stops now."),
             self.stop_file,
@@ -219,10 +213,10 @@ class Session:
         """Evaluates the final policies, or the best ones; writes and returns the results."""
         shown = self._policies()
         for seed in shown:
-            if self._evaluator and self.folder.best(seed).is_file():
+            if self._validate and self.folder.best(seed).is_file():
                 shown[seed] = load_policy(self.folder.best(seed))
-        rows = read_rows(self.folder.evaluations)
-        known = {(row["seed"], row["iteration"]) for row in rows if row["purpose"] == "test"}
+        rows = read_rows(self.folder.evaluations).query("purpose == 'test'")
+        known = set(zip(rows["seed"], rows["iteration"], strict=True))
         missing = [seed for seed in shown if (seed, shown[seed].iteration) not in known]
         if not missing and (self.folder.page.exists() or not self.options.report):
             return {}
@@ -235,12 +229,12 @@ class Session:
             rows = evaluation_rows(scores[seed], shown[seed], seed, "test")
             append_rows(self.folder.evaluations, rows)
         if self.options.report:
-            first = jax.tree.map(lambda x: x[0], self.placement.local(self.state))
+            first = take(self.placement.local(self.state), 0)
             report.write(self.folder, self.run, self.learner, first, evaluator, played)
         return scores
 
     def _iterate(self, advance: Advance) -> list[Row]:
-        """Advances the active seeds by one iteration; returns and logs their rows of metrics."""
+        """Advances the active seeds by one iteration; returns and writes their rows of metrics."""
         active, started = self.active, time.perf_counter()
         self.state, metrics = advance(self.state, active)
         host = jax.tree.map(np.asarray, self.placement.local(metrics))
@@ -252,8 +246,8 @@ class Session:
                 f"training diverged in iteration {self.iteration}: a loss or a parameter is not "
                 f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
             )
-        rows: list[Row] = [
-            {
+        rows: dict[int, Row] = {
+            seed: {
                 "seed": seed,
                 "iteration": self.iteration,
                 **{name: host[name][index].item() for name in sorted(host)},
@@ -262,23 +256,24 @@ class Session:
             }
             for index, seed in enumerate(self.run.seed_range)
             if active[index]
-        ]
-        append_rows(self.folder.metrics, rows)
-        self._last |= {int(row["seed"]): row for row in rows}
-        self._evaluate(active)
-        return rows
+        }
+        append_rows(self.folder.metrics, list(rows.values()))
+        self._last |= rows
+        if self._validate:
+            due = self.iteration % self.options.evaluate_every == 0
+            self._evaluate(self._validate, active if due else active & ~self.active)
+        return list(rows.values())
 
-    def _evaluate(self, active: np.ndarray) -> None:
-        """Evaluates on all sets the seeds that trained, where that is due or they are done."""
-        if self._evaluator is None:
-            return
-        due = self.iteration % self.options.evaluate_every == 0
-        chosen = active if due else active & ~self.active
+    def _evaluate(self, evaluator: Evaluator, chosen: np.ndarray) -> None:
+        """Evaluates the chosen seeds, bool[S]; saves a policy that is the best of its seed."""
         found = self._policies() if chosen.any() else {}
-        for seed, is_chosen in zip(self.run.seed_range, chosen, strict=True):
-            if is_chosen:
-                rows = self._evaluator.evaluate(seed, found[seed])
-                append_rows(self.folder.evaluations, rows)
+        own = tt.task_set(self.run.config.env_id).short
+        for seed in np.array(self.run.seed_range)[chosen].tolist():
+            policy, path = found[seed], self.folder.evaluations
+            scores = evaluator.scores(evaluator(policy.params))
+            append_rows(path, evaluation_rows(scores, policy, seed, "validation"))
+            if best_iteration(read_rows(path), seed, own) == self.iteration:
+                save_policy(self.folder.best(seed), policy)
 
     def _policies(self) -> dict[int, Policy]:
         """Returns the present policy of each seed."""
@@ -287,24 +282,20 @@ class Session:
         return dict(zip(self.run.seed_range, found, strict=True))
 
     def _save(self) -> None:
-        record = {
-            "run": self.run.to_dict(),
-            "seconds": self.seconds,
-            "compile_seconds": self.compile_seconds,
-            "last": list(self._last.values()),
-        }
+        record = {"run": self.run.to_dict(), "last": list(self._last.values())}
         state, keep = self.placement.local(self.state), self.options.keep
         checkpoint.save(self.folder.checkpoints, self.iteration, state, record, keep=keep)
 
 
-def restore(folder: Path, run: Run, shapes: TrainState) -> tuple[TrainState | None, dict[str, Any]]:
-    """Returns the state and the record of the newest checkpoint; None and zeros if there is none.
+def restore(
+    folder: Path, run: Run, shapes: TrainState
+) -> tuple[TrainState | None, int, dict[int, Row]]:
+    """Returns the newest checkpoint's state and iteration, and the last row of each seed.
 
-    Raises:
-      ValueError: the checkpoint is unusable, or of other settings.
+    Without a checkpoint these are None, 0 and no row; one of other settings raises ValueError.
     """
     if not checkpoint.iterations(folder):
-        return None, {"iteration": 0, "seconds": 0.0, "compile_seconds": 0.0, "last": []}
+        return None, 0, {}
     arrays, record = checkpoint.load(folder)
     done = record["iteration"]
     try:
@@ -322,7 +313,19 @@ def restore(folder: Path, run: Run, shapes: TrainState) -> tuple[TrainState | No
         raise ValueError(
             f"iterations must be at least {done}, which are done, got {run.config.iterations}"
         )
-    return state, record
+    return state, done, {row["seed"]: row for row in record["last"]}
+
+
+def best_iteration(rows: Frame, seed: int, own: str) -> int:
+    """Returns when a seed first solved its highest mean fraction of the validation tasks.
+
+    The mean is over task sets; base, a single task, counts only if it is the training set `own`.
+    """
+    rows = rows[(rows["purpose"] == "validation") & (rows["seed"] == seed)]
+    ranked = rows if own == "base" else rows[rows["task_set"] != "base"]
+    ranked = ranked if len(ranked) else rows
+    solved = ranked["solved"] / ranked["tasks"]
+    return int(solved.groupby(ranked["iteration"]).mean().idxmax())
 
 
 def make_advance(learner: Learner) -> Advance:
@@ -347,7 +350,7 @@ def make_advance(learner: Learner) -> Advance:
 
     def advance(states: TrainState, active: Any) -> tuple[TrainState, dict[str, jax.Array]]:
         if len(active) == 1:  # a run whose only seed is not active is over
-            after, metrics = one_seed(jax.tree.map(lambda x: x[0], states))
+            after, metrics = one_seed(take(states, 0))
             return jax.tree.map(lambda x: x[None], (after, metrics))
         after, metrics = jax.vmap(one_seed)(states)
         return jax.tree.map(functools.partial(_where, active), after, states), metrics
@@ -361,17 +364,15 @@ def _where(chosen: Any, new: jax.Array, old: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(data, impl=jax.random.key_impl(new)) if is_key(new) else data
 
 
-def check_memory(run: Run) -> None:
-    """Refuses a run whose arrays would not fit in this machine's memory.
-
-    Raises:
-      ValueError: they would not; the message names both sizes.
-    """
-    need = run.seeds * memory_estimate(run.config)
+def check_memory(run: Run, learner: Learner, states: TrainState) -> None:
+    """Raises ValueError if a run's states [S, ...] and boards alone would not fit in memory."""
+    episodes = run.config.episodes_per_iteration
+    boards = run.seeds * episodes * learner.env.max_steps * BOARD_SIZE**2 * run.config.num_features
+    need = boards + sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(states))
     have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if need > have:
         raise ValueError(
-            f"the run needs about {need / 1e9:.1f} GB of memory, this machine has "
+            f"the run needs at least {need / 1e9:.1f} GB of memory, this machine has "
             f"{have / 1e9:.1f} GB: lower --seeds ({run.seeds}) or --episodes-per-iteration "
-            f"({run.config.episodes_per_iteration})"
+            f"({episodes})"
         )

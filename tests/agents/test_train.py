@@ -209,9 +209,8 @@ def test_help_documents_every_setting(capsys, monkeypatch):
     assert len(output.splitlines()) <= 100
     text = " ".join(output.split())
     for field in dataclasses.fields(Config):
-        if field.name != "env_id":
-            assert f"--{field.name.replace('_', '-')}" in text
-    assert "half-width of the interval of probability ratios" in text
+        assert f"--{field.name.replace('_', '-')}" in text
+    assert "global norm of clipped gradients" in text
 
 
 def test_the_cache_has_a_folder_with_and_without_a_home(monkeypatch, tmp_path):

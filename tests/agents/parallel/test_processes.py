@@ -6,7 +6,6 @@ import socket
 
 import pytest
 
-from agents.parallel import processes
 from agents.runs import checkpoint
 from agents.runs.metrics import read_rows
 from agents.train import main
@@ -26,7 +25,7 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
         address = f"127.0.0.1:{free.getsockname()[1]}"
     command = [*options(), "--iterations", 100_000, "--checkpoint-every", 1, "--keep", 1]
     command += ["--out", tmp_path, "--name", "joint"]
-    command += ["--coordinator", address, "--processes", 2, "--process-id"]
+    command += ["--distributed", address, 2]
     first, second = (start("agents.train", *command, number) for number in range(2))
     assert first.stdout is not None
     while not re.match("iteration 2:", line := first.stdout.readline()):
@@ -39,8 +38,8 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
 
     folder = tmp_path / "joint"
     (iteration,) = checkpoint.iterations(folder / "checkpoints")
-    episodes = [row["episodes"] for row in read_rows(folder / "metrics.csv")]
-    assert episodes == [8 * done for done in range(1, iteration + 1)]
+    episodes = read_rows(folder / "metrics.csv")["episodes"]
+    assert episodes.tolist() == [8 * done for done in range(1, iteration + 1)]
 
     alone = start("agents.train", "--resume", folder, "--iterations", iteration + 1)
     _, errors = alone.communicate()
@@ -53,19 +52,9 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
     [
         ("--devices 2", "2 of 1 cpu devices in 1 process(es) cannot share"),
         ("--devices 0", "allowed: 1"),
-        ("--coordinator a:1", "else --coordinator HOST:PORT, --processes and --process-id"),
-        ("--process-id 0", "cannot join the other processes"),
+        ("--distributed", "cannot join the other processes"),
+        ("--distributed a:1", "else --distributed HOST:PORT PROCESSES NUMBER"),
     ],
 )
 def test_impossible_devices_and_processes_are_refused(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, main, *arguments.split(), "--out", tmp_path)
-
-
-def test_a_single_process_is_the_first_and_agrees_with_itself():
-    called = []
-    processes.on_first(lambda: called.append(True))
-    assert called == [True]
-    assert processes.is_first()
-    assert [processes.agree(number) for number in (None, 3)] == [None, 3]
-    with pytest.raises(ZeroDivisionError):
-        processes.on_first(lambda: 1 // 0)

@@ -22,7 +22,6 @@ from agents.curiosity import Curiosity
 from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
-from agents.ppo.memory import memory_estimate
 from agents.registry import curiosities
 from easy import rows
 from small_runs import SETTINGS
@@ -282,11 +281,3 @@ def test_devices_average_floats_only(with_curiosity):
 def test_settings_that_cannot_be_trained_with_are_refused(settings, env, message):
     with pytest.raises(ValueError, match=message):
         make_train(Config(**settings), env)
-
-
-def test_the_memory_of_the_presets_is_estimated():
-    """Within a factor of three of XLA's own figures, in MB."""
-    for name, found in (("paper", 180.6), ("fast", 25.7), ("best", 45.3)):
-        assert found / 3 < memory_estimate(Config.preset(name)) / 1e6 < 3 * found
-    many = Config(iterations=1, episodes_per_iteration=1_000_000, minibatch_size=1_000_000)
-    assert memory_estimate(many) > 1e11

@@ -26,7 +26,6 @@ def test_a_run_is_the_same_after_json():
         ({"seed": 1.0}, ["seed must be an integer", "1.0"]),
         ({"seeds": 0}, ["seeds must be an integer in [1, ", "0"]),
         ({"seeds": 10**9}, ["seeds must be an integer", "1000000000"]),
-        ({"seed": 2**31 - 1, "seeds": 2}, ["seeds must be at most 2147483647", "2147483648"]),
     ],
 )
 def test_impossible_runs_are_refused(values, words):

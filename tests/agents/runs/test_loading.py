@@ -41,11 +41,11 @@ def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path):
 @pytest.mark.parametrize(
     ("source", "options", "message"),
     [
-        (None, {"seed": 5}, "mine has no seed 5; allowed: 3, 4"),
+        (None, {"seed": 5}, "mine has no seed 5; it holds seed 3, seed 4"),
         (None, {"iteration": 5}, "no checkpoint 5; allowed: 6"),
         ("none", {}, "none is neither a run, a file nor a shipped agent; .* shipped agents: best"),
         ("fast-base", {"iteration": 5}, "iteration is for runs, which fast-base is not"),
-        ("fast-base", {"seed": 0}, "fast-base has no seed 0; allowed: none"),
+        ("fast-base", {"seed": 0}, "fast-base has no seed 0; it holds fast-base"),
     ],
 )
 def test_unknown_sources_seeds_and_iterations_are_refused(run_path, source, options, message):

@@ -19,17 +19,14 @@ def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
     before = path.read_text()
     with path.open("a") as file:
         file.write("0,2,1")  # a kill in mid-write
-    assert [entry["iteration"] for entry in read_rows(path)] == [1, 2, 3]
-    kept = rewind_rows(path, 2)
-    assert [(entry["iteration"], entry["loss"], entry["length"]) for entry in kept] == [
-        (1, float(np.float32(1 / 3)), ""),
-        (2, float(np.float32(1 / 3)), ""),
-    ]
+    rewind_rows(path, 2)
+    assert path.read_text() == "".join(before.splitlines(keepends=True)[:3])
     append_rows(path, [row(3, loss=float(np.float32(1 / 3)), length="")])
     assert path.read_text() == before
-    assert rewind_rows(path, 0) == []
+    rewind_rows(path, 0)
+    assert read_rows(path).empty
     append_rows(path, [row(1)])
-    assert read_rows(path) == [row(1)], "begun again with its header"
+    assert read_rows(path).to_dict("records") == [row(1)], "begun again with its header"
 
 
 def test_files_without_folder_header_or_column_are_refused(tmp_path):

@@ -66,7 +66,7 @@ def page(played, tmp_path_factory):
 
 
 def test_a_page_needs_no_network_and_holds_the_settings(page):
-    text = page[0].page.read_text()
+    text = re.sub(r">\s+<", "><", page[0].page.read_text())
     assert "<h1>&lt;mine&gt;</h1>" in text
     assert "<td>hidden</td><td>4</td>" in text
     assert "<td>{P}</td><td>2</td>" in text
@@ -176,7 +176,7 @@ def score(name, solved):
 def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
     run, folder = Run(small_config(iterations=7, **settings)), RunFolder(tmp_path)
     solved = [row(2, evaluation=1.0, episodes=episodes)] if episodes else []
-    rows = [row(1), *solved, row(3, evaluation=1.0)] if solved else [row(1)]
+    rows = [row(1), *solved, row(3, evaluation=1.0, episodes=9999)] if solved else [row(1)]
     append_rows(folder.metrics, rows)
     scores = {0: [score("base", 10), score("p", 5), score("st", 0)]}
     lines = display.summary(folder, run, scores)
