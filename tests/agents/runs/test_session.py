@@ -96,7 +96,7 @@ def _raise(error):
 
 
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
-    monkeypatch.setattr(session, "Evaluator", None)
+    monkeypatch.setattr(session, "make_advance", None)
     before = (copy / "evaluations.csv").read_bytes()
     assert train_run(copy, small_run(), TRACKED) == {}
     assert (copy / "evaluations.csv").read_bytes() == before
