@@ -15,6 +15,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     # cache left by another version of the code must not decide what is tested.
     os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="trap_tube_jax-tests-")
     atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
+    os.environ["MPLCONFIGDIR"] = os.environ["XDG_CACHE_HOME"]  # no warning of a read-only home
 
 SETTINGS = {
     # Where the command lines keep theirs.

@@ -1,33 +1,36 @@
 """JAX's persistent compilation cache for the command lines."""
 
 import os
-import tempfile
 from pathlib import Path
 
 import jax
 
 
 def enable_cache() -> None:
-    """Keeps compiled programs from one process to the next, in `cache_folder()`.
+    """Keeps compiled programs from one process to the next, in `cache_folder()` if there is one.
 
     JAX's own settings take precedence: `JAX_COMPILATION_CACHE_DIR` names another folder,
     `JAX_ENABLE_COMPILATION_CACHE=0` compiles everything anew.
     """
-    if jax.config.values["jax_compilation_cache_dir"] is not None:
+    folder = cache_folder()
+    if jax.config.values["jax_compilation_cache_dir"] is not None or folder is None:
         return
-    jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+    jax.config.update("jax_compilation_cache_dir", str(folder))
     # By default JAX keeps only what took over a second; a run compiles many smaller programs.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def cache_folder() -> Path:
-    """Returns the cache's folder: in $XDG_CACHE_HOME, ~/.cache, or the temporary folder.
+def cache_folder() -> Path | None:
+    """Makes and returns the cache's folder, in $XDG_CACHE_HOME or ~/.cache.
 
-    The last one serves users without a home, as in some containers.
+    Returns None where there is no home or none that can be written, as in some containers. A
+    folder that other users can write, such as /tmp, would let them choose what runs.
     """
     base = os.environ.get("XDG_CACHE_HOME")
     try:
         parent = Path(base) if base else Path.home() / ".cache"
-    except RuntimeError:  # neither HOME nor an entry in the user database
-        parent = Path(tempfile.gettempdir()) / f"cache-{os.getuid()}"
-    return parent / "trap_tube_jax" / "jax"
+        folder = parent / "trap_tube_jax" / "jax"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # RuntimeError: neither HOME nor an entry in the user database
+        return None
+    return folder if os.access(folder, os.W_OK) else None

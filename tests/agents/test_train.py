@@ -213,15 +213,19 @@ def test_help_documents_every_setting(capsys, monkeypatch):
     assert "global norm of clipped gradients" in text
 
 
-def test_the_cache_has_a_folder_with_and_without_a_home(monkeypatch, tmp_path):
+def test_the_cache_has_a_folder_in_a_home_that_can_be_written_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert compilation.cache_folder() == tmp_path / "trap_tube_jax" / "jax"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert compilation.cache_folder() == tmp_path / ".cache" / "trap_tube_jax" / "jax"
+    monkeypatch.setattr(os, "access", lambda folder, mode: False)
+    assert compilation.cache_folder() is None
+    monkeypatch.setenv("HOME", "/proc/self")
+    assert compilation.cache_folder() is None
 
     def no_home():
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(compilation.Path, "home", no_home)
-    assert str(os.getuid()) in str(compilation.cache_folder())
+    assert compilation.cache_folder() is None
