@@ -17,6 +17,7 @@ from rich.console import Console
 from agents.parallel.devices import become_devices
 from agents.runs.compilation import enable_cache
 from agents.runs.folder import Run
+from agents.runs.provenance import cores
 from agents.runs.session import RunOptions, train_run
 from agents.runs.stopping import Stopped
 from trap_tube_jax.imports import import_modules
@@ -32,7 +33,7 @@ class ProcessPerCall(ThreadPoolExecutor):
         return super().submit(self._call, function, *args, **kwargs)
 
     def _call(self, *call: Any, **kwargs: Any) -> Any:
-        threads = max(1, _cores() // self._max_workers)
+        threads = max(1, cores() // self._max_workers)
         with ProcessPoolExecutor(1, SPAWN, _begin, (threads,)) as pool:
             return pool.submit(*call, **kwargs).result()
 
@@ -55,7 +56,7 @@ def make_executor(processes: int | None, cluster: str | None) -> Iterator[Execut
         return
     if processes is None:
         with ProcessPoolExecutor(1, SPAWN) as pool:  # this process leaves GPUs to the runs
-            processes = _cores() if pool.submit(jax.default_backend).result() == "cpu" else 1
+            processes = cores() if pool.submit(jax.default_backend).result() == "cpu" else 1
     with ProcessPerCall(processes) as executor:
         yield executor
 
@@ -94,8 +95,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _cores() -> int:
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1

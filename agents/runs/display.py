@@ -3,7 +3,6 @@
 import shlex
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -14,15 +13,14 @@ from agents.runs.metrics import Row, read_rows
 from trap_tube_jax.scoring.scores import Score
 
 
-class ProgressLine:
+class ProgressLine(Progress):
     """Shows training: one line that changes on a terminal, else a line per iteration.
 
     A context manager. Nothing is drawn in the background.
     """
 
     def __init__(self, console: Console, iterations: int):
-        self._console = console
-        self._progress = Progress(
+        super().__init__(
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
             TextColumn("{task.description}", markup=False),
@@ -31,16 +29,9 @@ class ProgressLine:
             auto_refresh=False,
             disable=not console.is_terminal,
         )
-        self._task = self._progress.add_task("", total=iterations)
+        self.add_task("", total=iterations)
 
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def update(self, rows: Sequence[Row]) -> None:
+    def show(self, rows: Sequence[Row]) -> None:
         """Shows an iteration, given its rows of metrics; numbers are means over seeds."""
         mean = {name: statistics.fmean(row[name] for row in rows) for name in rows[0]}
         text = (
@@ -49,10 +40,10 @@ class ProgressLine:
             f"{len(rows) * mean['transitions_per_second']:,.0f} steps/s"
         )
         done = int(mean["iteration"])
-        if self._console.is_terminal:
-            self._progress.update(self._task, completed=done, description=text, refresh=True)
+        if self.console.is_terminal:
+            self.update(self.task_ids[0], completed=done, description=text, refresh=True)
         else:
-            say(self._console, f"iteration {done}: {text}")
+            say(self.console, f"iteration {done}: {text}")
 
 
 def say(console: Console, text: str) -> None:

@@ -4,6 +4,7 @@ import importlib.metadata
 import os
 import pathlib
 import platform
+import re
 import subprocess
 from typing import Any
 
@@ -19,10 +20,9 @@ CODE = ("agents/*.py", "benchmarks/*.py", "trap_tube_jax/*.py", "pyproject.toml"
 
 def provenance() -> dict[str, Any]:
     """Returns hardware, versions and commit as plain values."""
-    affinity = getattr(os, "sched_getaffinity", None)
     return {
         "processor": _processor(),
-        "cores": len(affinity(0)) if affinity else os.cpu_count(),
+        "cores": cores(),
         "device": jax.devices()[0].device_kind,
         "platform": platform.platform(),
         "python": platform.python_version(),
@@ -53,13 +53,16 @@ def commit() -> str | None:
         return None
 
 
+def cores() -> int:
+    """Returns the number of cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def _processor() -> str:
-    try:
-        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
+    info = pathlib.Path("/proc/cpuinfo")
+    names = re.search(r"^model name\s*: (.+)$", info.read_text() if info.exists() else "", re.M)
+    return names[1] if names else platform.processor()
 
 
 def _git(*arguments: str) -> str:

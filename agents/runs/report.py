@@ -20,13 +20,11 @@ import pandas as pd
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, Evaluator
-from agents.acting.rollout import rollout
 from agents.files import write_text
-from agents.ppo.learner import Learner, TrainState
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import Frame, read_rows
 from trap_tube_jax import solver
-from trap_tube_jax.objects import BOARD_SIZE, DIRECTION_NAMES, NO_DIRECTION
+from trap_tube_jax.objects import DIRECTION_NAMES, NO_DIRECTION
 from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import label
@@ -51,21 +49,12 @@ PANELS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 Played = Mapping[str, Evaluation]
 
 
-def write(
-    folder: RunFolder,
-    run: Run,
-    learner: Learner,
-    state: TrainState,
-    evaluator: Evaluator,
-    played: Mapping[int, Played],
-) -> None:
+def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Mapping[int, Played]) -> None:
     """Writes learning curves, the GIF of a solved episode and the page.
 
     Args:
       folder: the run's files.
       run: the run.
-      learner: its learner.
-      state: the final state of the first seed, for the intrinsic reward of the page's episodes.
       evaluator: the evaluator of `played`.
       played: the outcomes of every seed.
     """
@@ -73,8 +62,7 @@ def write(
     folder.animation.unlink(missing_ok=True)
     own = tt.task_set(run.config.env_id).short
     save_first_solved(folder.animation, evaluator, played.values(), own)
-    episodes, pictures = _episodes(learner, state, evaluator, played[run.seed])
-    data = json.dumps({"episodes": episodes, "pictures": pictures})
+    episodes = json.dumps(_episodes(evaluator, played[run.seed]))
     settings = {"preset": run.preset, "seeds": run.seeds, **run.config.to_dict()}
     values = [(name, str(value)) for name, value in settings.items()]
     scores = [_scores(f"seed {seed}", evaluator.scores(each)) for seed, each in played.items()]
@@ -83,7 +71,7 @@ def write(
         scores="\n".join(scores),
         curves=base64.b64encode(folder.curves.read_bytes()).decode(),
         settings=_table(pd.DataFrame(values, columns=["setting", "value"])),
-        data=data.replace("</", "<\\/"),
+        episodes=episodes.replace("</", "<\\/"),
     )
     write_text(folder.page, page)
 
@@ -153,14 +141,11 @@ def _table(rows: Frame) -> str:
     return rows.to_html(index=False, border=0)
 
 
-def _episodes(
-    learner: Learner, state: TrainState, evaluator: Evaluator, played: Played
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Returns the first solved and the first unsolved episode of each set, and their pictures.
+def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
+    """Returns the first solved and the first unsolved episode of each set.
 
-    Episodes hold `title`, `solved`, the replays `agent` and `plan` (see `_replay`), and of each
-    step the network's `values` and the `rewards`, intrinsic and unscaled. Pictures are PNG in
-    base64; replays refer to them by number.
+    They hold `title`, `solved`, the replays `agent` and `plan` (see `_replay`), and `values`, the
+    network's of each step.
     """
     shown = [
         (name, int(found[0]))
@@ -169,56 +154,38 @@ def _episodes(
         if len(found := np.flatnonzero(np.asarray(outcome.solved) == solved))
     ]
     states = [take(evaluator.tasks[name], index) for name, index in shown]
-    tasks = jax.tree.map(lambda *x: np.stack(x), *states)
-    plans = solver.solve_batch(tasks).actions
-    rewards = np.asarray(_intrinsic_reward(learner, state, tasks, max(evaluator.limits.values())))
-    episodes: list[dict[str, Any]] = []
-    pictures: dict[bytes, int] = {}
-    for number, (name, index) in enumerate(shown):
+    plans = solver.solve_batch(jax.tree.map(lambda *x: np.stack(x), *states)).actions
+    episodes = []
+    for state, shortest, (name, index) in zip(states, plans, shown, strict=True):
         outcome = played[name]
         solved, length = bool(outcome.solved[index]), int(outcome.length[index])
         # Padded to one length, so that all replays share a compiled program.
-        longest = max(outcome.action.shape[1], plans.shape[1])
+        longest = max(outcome.action.shape[1], len(shortest))
         actions, plan = np.full((2, longest, 2), NO_DIRECTION)
         actions[:length] = outcome.action[index, :length]
-        plan[: plans.shape[1]] = plans[number]
+        plan[: len(shortest)] = shortest
         episodes.append(
             {
                 "title": f"{label(name)}, task {index}: {'' if solved else 'not '}solved",
                 "solved": solved,
-                "agent": _replay(states[number], actions, pictures),
-                "plan": _replay(states[number], plan, pictures),
+                "agent": _replay(state, actions),
+                "plan": _replay(state, plan),
                 "values": [_finite(x) for x in outcome.value[index, :length]],
-                "rewards": [_finite(x) for x in rewards[:length, number]],
             }
         )
-    return episodes, [base64.b64encode(_png(pixels)).decode() for pixels in pictures]
+    return episodes
 
 
-def _intrinsic_reward(
-    learner: Learner, state: TrainState, tasks: State, max_steps: int
-) -> jax.Array:
-    """Plays tasks greedily; returns the intrinsic reward f32[T, M] of these episodes alone."""
-    env = tt.Environment(base=tt.base_state(learner.config.num_features), max_steps=max_steps)
+def _replay(state: State, actions: np.ndarray) -> dict[str, Any]:
+    """Replays actions i32[T, 2], padded with -1.
 
-    @jax.jit
-    def compute(state: TrainState, tasks: State) -> jax.Array:
-        trajectory = rollout(learner.agent, state.params, env, tasks, key=None)
-        return learner.intrinsic_reward(state, trajectory)[0]
-
-    return compute(state, tasks)
-
-
-def _replay(state: State, actions: np.ndarray, pictures: dict[bytes, int]) -> dict[str, Any]:
-    """Replays actions i32[T, 2], padded with -1, and adds their boards to `pictures`.
-
-    Returns `frames`, the number of the picture before each step and after the last, and `actions`,
-    those of each step in words.
+    Returns `frames`, the board before each step and after the last as PNG in base64, and
+    `actions`, those of each step in words.
     """
     taken = actions[(actions >= 0).all(axis=1)]
     frames = episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]
     return {
-        "frames": [pictures.setdefault(frame.tobytes(), len(pictures)) for frame in frames],
+        "frames": list(map(_png, frames)),
         "actions": [
             f"grasp {DIRECTION_NAMES[grasp]}, move {DIRECTION_NAMES[move]}"
             for grasp, move in taken.tolist()
@@ -226,12 +193,12 @@ def _replay(state: State, actions: np.ndarray, pictures: dict[bytes, int]) -> di
     }
 
 
-def _png(pixels: bytes) -> bytes:
+def _png(pixels: np.ndarray) -> str:
     from PIL import Image  # noqa: PLC0415  slow to import
 
-    side, file = BOARD_SIZE * CELL_SIZE, io.BytesIO()
-    Image.frombytes("RGB", (side, side), pixels).quantize(32).save(file, "png")
-    return file.getvalue()
+    file = io.BytesIO()
+    Image.fromarray(pixels).quantize(32).save(file, "png")
+    return base64.b64encode(file.getvalue()).decode()
 
 
 def _finite(x: Any) -> float | None:

@@ -200,7 +200,7 @@ class Session:
             while self.active.any():
                 rows = self._iterate(advance)
                 log(rows)
-                progress.update(rows)
+                progress.show(rows)
                 # A signal may reach any process: all have to agree on it.
                 request = processes.agree(stop.request())
                 due = self.iteration % self.options.checkpoint_every == 0
@@ -229,8 +229,7 @@ class Session:
             rows = evaluation_rows(scores[seed], shown[seed], seed, "test")
             append_rows(self.folder.evaluations, rows)
         if self.options.report:
-            first = take(self.placement.local(self.state), 0)
-            report.write(self.folder, self.run, self.learner, first, evaluator, played)
+            report.write(self.folder, self.run, evaluator, played)
         return scores
 
     def _iterate(self, advance: Advance) -> list[Row]:

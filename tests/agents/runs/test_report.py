@@ -17,12 +17,12 @@ from PIL import Image
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents import make_train
 from agents.acting.evaluation import Evaluator
 from agents.runs import display, report
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import append_rows
 from small_runs import small_config
+from tiny_policy import random_params
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
@@ -42,25 +42,23 @@ def row(iteration, **values):
 
 @pytest.fixture(scope="module")
 def played():
-    """An untrained policy on base, {P} and a set of known outcome, and what trained it."""
+    """An untrained policy's evaluator on base, {P} and a set of known outcome, and outcomes."""
     base = tt.base_state()
     near = [base.replace(food=jnp.array(cell, jnp.int32)) for cell in FOOD_CELLS]
     tasks = {name: evaluation_tasks(name, 2) for name in ("base", "p")}
     tasks["mine"] = jax.tree.map(lambda *x: jnp.stack(x), *near)
-    learner = make_train(CONFIG)
-    state = jax.jit(learner.init)(jax.random.key(0))
     evaluator = Evaluator(CONFIG, tasks)
-    return learner, state, evaluator, evaluator(state.params)
+    return evaluator, evaluator(random_params(CONFIG))
 
 
 @pytest.fixture(scope="module")
 def page(played, tmp_path_factory):
-    """The folder of a report, and the data that the page's script reads."""
-    learner, state, evaluator, outcome = played
+    """The folder of a report, and the episodes that the page's script reads."""
+    evaluator, outcome = played
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "<mine>")
     folder.path.mkdir()
     append_rows(folder.metrics, [row(1), row(2, policy_loss=0.5)])
-    report.write(folder, Run(CONFIG, "fast"), learner, state, evaluator, {0: outcome})
+    report.write(folder, Run(CONFIG, "fast"), evaluator, {0: outcome})
     start, end = '<script type="application/json" id="data">', "</script>"
     return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
 
@@ -75,9 +73,9 @@ def test_a_page_needs_no_network_and_holds_the_settings(page):
 
 
 def test_a_page_shows_solved_and_unsolved_episodes(played, page):
-    outcome, data = played[3]["mine"], page[1]
+    outcome = played[1]["mine"]
     solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
-    mine = [each for each in data["episodes"] if each["title"].startswith("mine")]
+    mine = [each for each in page[1] if each["title"].startswith("mine")]
     assert [each["title"] for each in mine] == [
         f"mine, task {solved}: solved",
         f"mine, task {unsolved}: not solved",
@@ -85,41 +83,31 @@ def test_a_page_shows_solved_and_unsolved_episodes(played, page):
     for index, each in zip((solved, unsolved), mine, strict=True):
         length = outcome.length[index]
         assert len(each["agent"]["frames"]) == length + 1
-        assert len(each["agent"]["actions"]) == len(each["rewards"]) == length
+        assert len(each["agent"]["actions"]) == length
         np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
-        for number in each["agent"]["frames"]:
-            with Image.open(io.BytesIO(base64.b64decode(data["pictures"][number]))) as picture:
+        for frame in each["agent"]["frames"]:
+            with Image.open(io.BytesIO(base64.b64decode(frame))) as picture:
                 assert picture.size == (192, 192)
 
 
 def test_a_page_shows_shortest_plans(played, page):
     """From the same board as the episode, and with as many steps as are needed."""
-    for each in page[1]["episodes"]:
+    for each in page[1]:
         name, _, number = each["title"].partition(":")[0].partition(", task ")
         steps = {"base": 11, "mine": 1}.get(name)
         plan = each["plan"]
         assert len(plan["frames"]) == len(plan["actions"]) + 1
         if steps is not None:
             assert len(plan["actions"]) == steps
-        tasks = played[2].tasks[{"{P}": "p"}.get(name, name)]
+        tasks = played[0].tasks[{"{P}": "p"}.get(name, name)]
         state = jax.tree.map(lambda x, i=int(number): x[i], tasks)
         first = DIRECTION_NAMES.index(plan["actions"][0].split()[1].rstrip(","))
-        shown = report._png(np.asarray(tt.render(state, 16, grasp=first)).tobytes())
-        assert page[1]["pictures"][plan["frames"][0]] == base64.b64encode(shown).decode()
-
-
-def test_the_intrinsic_reward_is_that_of_the_shown_episodes_alone(played):
-    """Counts: two equal episodes halve the squared bonus of one."""
-    learner, state, evaluator, _ = played
-    one = jax.tree.map(lambda x: x[:1], evaluator.tasks["base"])
-    two = jax.tree.map(lambda x: jnp.concatenate([x, x]), one)
-    alone, both = (report._intrinsic_reward(learner, state, x, 6) for x in (one, two))
-    np.testing.assert_allclose(both[:, 0] * 2**0.5, alone[:, 0], rtol=1e-6)
-    assert alone.sum() > 0
+        shown = np.asarray(tt.render(state, 16, grasp=first))
+        assert plan["frames"][0] == report._png(shown)
 
 
 def test_a_solved_episode_becomes_a_gif(played, tmp_path):
-    _, _, evaluator, outcome = played
+    evaluator, outcome = played
     path = tmp_path / "solved.gif"
     assert report.save_first_solved(path, evaluator, [outcome], prefer="base") == "mine"
     with Image.open(path) as picture:
@@ -141,7 +129,7 @@ def test_a_browser_shows_a_page(page, tmp_path):
     options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}"]
     command = [str(BROWSER), *options, "--dump-dom", page[0].page.as_uri()]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    for each in page[1]["episodes"]:
+    for each in page[1]:
         assert f">{html.escape(each['title'])}</option>" in shown
     assert re.search(r'<img id="board" [^>]*src="data:image/png', shown)
     assert "The agent: step 0 of " in shown
@@ -154,7 +142,7 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
     with display.ProgressLine(console, 5) as progress:
         for iteration in (1, 2):
             rows = [row(iteration), row(iteration, seed=1, success=0.75)]
-            progress.update(rows)
+            progress.show(rows)
     text = file.getvalue()
     assert "16 episodes, 50.0% solved, 50.0% greedily, 12,000 steps/s" in text
     assert ("iteration 2: " in text) != is_terminal
