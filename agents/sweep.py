@@ -17,7 +17,7 @@ from agents.experiments.workers import ProcessPerCall, log_of, make_executor, tr
 from agents.runs.display import say
 from agents.runs.folder import Run, RunFolder
 from agents.runs.session import RunOptions
-from agents.runs.stopping import Stopped, StopSignals, exit_code
+from agents.runs.stopping import Stopped, exit_code, stop_signals
 from trap_tube_jax.command_line import plain_errors
 
 LINES = 5  # of a failed run's log that are shown
@@ -80,19 +80,19 @@ def launch(
     """
     stop_file = next(iter(runs)).parent / ".stop"
 
-    def request() -> None:
+    def ask() -> None:
         stop_file.touch()
         say(console, "Finishing the current iterations; Ctrl-C again stops now.")
 
     stop_file.unlink(missing_ok=True)
     calls: dict[Future, Path] = {}
     failed: list[Path] = []
-    with StopSignals(request) as stop:
+    with stop_signals(ask) as request:
         try:
             for path, run in runs.items():
                 calls[executor.submit(train_logged, path, run, options, stop_file)] = path
             for count, call in enumerate(as_completed(calls), 1):
-                if stop.received and isinstance(executor, ProcessPerCall):
+                if request() and isinstance(executor, ProcessPerCall):
                     for each in calls:  # of Dask this would also forget running ones
                         each.cancel()
                 if call.cancelled():
@@ -110,8 +110,8 @@ def launch(
                 process.kill()
             raise
     stop_file.unlink(missing_ok=True)
-    if stop.received:
-        raise Stopped(stop.received)
+    if number := request():
+        raise Stopped(number)
     return failed
 
 

@@ -72,7 +72,7 @@ def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     import_modules(first.imports)
     defaults, config = Options(), Config.preset(first.preset)
     if first.resume is not None:
-        _, stored = RunFolder.open(first.resume)
+        stored = RunFolder(first.resume).read(first.imports)
         defaults = Options(preset=stored.preset, seed=stored.seed, seeds=stored.seeds)
         config = stored.config
     options, config, how = parse_all([defaults, config, RunOptions], arguments, PROGRAM)

@@ -91,7 +91,7 @@ class Grid:
                 path = root / f"{point}-seed{seed}"
                 check_name(path.name)
                 if RunFolder(path).config.is_file():
-                    run.check_continues(RunFolder.open(path)[1])
+                    run.check_continues(RunFolder(path).read())
                 else:
                     RunFolder(path).check_free()
                 runs[path] = run

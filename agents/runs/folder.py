@@ -69,10 +69,8 @@ class Run:
     def from_dict(cls, values: Any) -> Self:
         """Inverts `to_dict`; ValueError names a value that is missing, unknown or not allowed."""
         names = sorted(field.name for field in dataclasses.fields(cls))
-        if not isinstance(values, dict) or sorted(values) != names:
-            raise ValueError(f"expected a table of {', '.join(names)}")
-        if not isinstance(values["config"], dict):
-            raise ValueError("config must be a table of settings")
+        if sorted(values) != names or not isinstance(values["config"], dict):
+            raise ValueError(f"expected a table of {', '.join(names)}, config a table of settings")
         config = Config.from_dict(values["config"])
         return cls(**{**values, "config": config, "imports": tuple(values["imports"])})
 
@@ -149,7 +147,7 @@ class RunFolder:
         """
         with self.lock():
             if self.config.is_file():
-                run.check_continues(self.open(self.path)[1])
+                run.check_continues(self.read())
                 yield
                 return
             self.check_free()
@@ -177,31 +175,29 @@ class RunFolder:
         """Writes the settings of a run and the version of this package."""
         write_json(self.config, {"version": __version__, **run.to_dict()})
 
-    @classmethod
-    def open(cls, path: Path, imports: tuple[str, ...] = ()) -> tuple[Self, Run]:
-        """Opens the folder of an existing run and reads its settings.
+    def read(self, imports: tuple[str, ...] = ()) -> Run:
+        """Returns the stored run.
 
         Args:
-          path: the folder.
           imports: modules to import first, which register names of the settings.
 
         Raises:
           ValueError: there is no run, or its settings cannot be read.
         """
         import_modules(imports)
-        folder = cls(path)
-        if not folder.config.is_file():
-            raise ValueError(f"{path} holds no run; {runs_next_to(path)}")
-        values = read_json(folder.config)
-        version = values.pop("version", "unknown") if isinstance(values, dict) else "unknown"
+        if not self.config.is_file():
+            raise ValueError(f"{self.path} holds no run; {runs_next_to(self.path)}")
+        values = read_json(self.config)
+        if not isinstance(values, dict):
+            raise ValueError(f"{self.config} must be a table of settings")
+        version, needs = values.pop("version", "unknown"), values.get("imports") or ()
         try:
-            return folder, Run.from_dict(values)
+            return Run.from_dict(values)
         except (ValueError, TypeError) as error:
-            needs = values.get("imports") if isinstance(values, dict) else None
-            missing = [name for name in needs or () if name not in imports]
-            hint = f"; it was trained with --import {' --import '.join(missing)}" if missing else ""
+            missing = "".join(f" --import {name}" for name in needs if name not in imports)
+            hint = f"; it was trained with{missing}" if missing else ""
             raise ValueError(
-                f"{folder.config}, written by version {version}, cannot be read: {error}{hint}"
+                f"{self.config}, written by version {version}, cannot be read: {error}{hint}"
             ) from error
 
 

@@ -43,7 +43,8 @@ def load_policies(
             f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
             f"shipped agents: {', '.join(pretrained.names())}"
         )
-    folder, run = RunFolder.open(path, imports)
+    folder = RunFolder(path)
+    run = folder.read(imports)
     arrays, _ = checkpoint.load(folder.checkpoints, iteration)
     keys = jax.random.split(jax.random.key(0), run.seeds)
     expected = {"params": jax.eval_shape(jax.vmap(Agent(run.config).init), keys)}

@@ -43,7 +43,7 @@ from agents.runs.metrics import (
     rewind_rows,
 )
 from agents.runs.provenance import note_provenance
-from agents.runs.stopping import Stopped, StopSignals
+from agents.runs.stopping import Stopped, stop_signals
 from trap_tube_jax.checks import MOST_TASKS, check_integer
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.scoring.scores import Score
@@ -83,11 +83,9 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number that is too small or an unknown set."""
-        smallest = {"checkpoint_every": 1, "keep": 1, "evaluate_every": 0}
-        for name, low in smallest.items():
-            value = getattr(self, name)
-            if value is not None and value < low:
-                raise ValueError(f"{name} must be >= {low}, got {value}")
+        check_integer("checkpoint_every", self.checkpoint_every)
+        check_integer("keep", self.keep)
+        check_integer("evaluate_every", self.evaluate_every, minimum=0)
         if self.reported is not None:
             check_integer("reported", self.reported, maximum=MOST_TASKS)
         for name in self.sets or ():
@@ -190,24 +188,26 @@ class Session:
         )
         advance = self.placement.shard(make_advance(self.learner))
         advance = jax.jit(advance, donate_argnums=0).lower(self.state, self.active).compile()
-        stop = StopSignals(
-            lambda: say(self.console, "Finishing this iteration; Ctrl-C again stops now."),
-            self.stop_file,
-        )
-        progress = ProgressLine(self.console, self.run.config.iterations)
         chosen = {"tensorboard": self.options.tensorboard, "wandb": self.options.wandb}
-        with stop, open_loggers(self.folder.path, self.run, **chosen) as log, progress:
+        asked = functools.partial(
+            say, self.console, "Finishing this iteration; Ctrl-C again stops now."
+        )
+        with (
+            stop_signals(asked, self.stop_file) as request,
+            open_loggers(self.folder.path, self.run, **chosen) as log,
+            ProgressLine(self.console, self.run.config.iterations) as progress,
+        ):
             while self.active.any():
                 rows = self._iterate(advance)
                 log(rows)
                 progress.show(rows)
                 # A signal may reach any process: all have to agree on it.
-                request = processes.agree(stop.request())
+                number = processes.agree(request())
                 due = self.iteration % self.options.checkpoint_every == 0
-                if due or request or not self.active.any():
+                if due or number or not self.active.any():
                     self._save()
-                if request:
-                    raise Stopped(request)
+                if number:
+                    raise Stopped(number)
 
     def finish(self) -> dict[int, list[Score]]:
         """Evaluates the final policies, or the best ones; writes and returns the results."""

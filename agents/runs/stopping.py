@@ -1,10 +1,11 @@
 """Stopping a run by Ctrl-C or SIGTERM."""
 
+import contextlib
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 
 class Stopped(Exception):  # noqa: N818  not an error
@@ -24,40 +25,32 @@ def exit_code(stopped: Stopped | KeyboardInterrupt) -> int:
     return 128 + (stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT)
 
 
-class StopSignals:
+@contextlib.contextmanager
+def stop_signals(
+    on_request: Callable[[], None], file: Path | None = None
+) -> Iterator[Callable[[], int | None]]:
     """Turns the first Ctrl-C or SIGTERM into a request and the second into KeyboardInterrupt.
 
-    A context manager. In a thread other than the main one, which receives no signals, nothing
-    changes.
-
-    Attributes:
-      received: number of the first signal, or None.
+    Yields a function that returns the number of the first signal, SIGTERM's if `file` exists, or
+    None. A thread other than the main one receives no signals.
     """
+    received: list[int] = []
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self, on_request: Callable[[], None] = lambda: None, file: Path | None = None):
-        self.received: int | None = None
-        self._on_request, self._file = on_request, file
-        self._previous: dict[int, Any] = {}
-
-    def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._previous = {n: signal.signal(n, self._handle) for n in self.SIGNALS}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def request(self) -> int | None:
-        """Returns the number of the first signal; SIGTERM's if `file` exists; else None."""
-        asked = self._file is not None and self._file.exists()
-        return self.received or (int(signal.SIGTERM) if asked else None)
-
-    def _handle(self, number: int, frame: Any) -> None:
-        del frame
-        if self.received is not None:
+    def handle(number: int, _: Any) -> None:
+        if received:
             raise KeyboardInterrupt
-        self.received = number
-        self._on_request()
+        received.append(number)
+        on_request()
+
+    def request() -> int | None:
+        asked = file is not None and file.exists()
+        return received[0] if received else int(signal.SIGTERM) if asked else None
+
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if is_main else ()
+    previous = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield request
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

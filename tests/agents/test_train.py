@@ -142,7 +142,7 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--epochs 2147483648", "epochs must be an integer in [1, 10000], got 2147483648"),
         ("--seeds 100000", "seeds must be an integer in [1, 65536], got 100000"),
         ("--seed -1", "seed must be an integer in [0, 2147483647], got -1"),
-        ("--keep 0", "keep must be >= 1, got 0"),
+        ("--keep 0", "keep must be an integer >= 1, got 0"),
         ("--name a/b", "name must be a folder's name without a path, got 'a/b'"),
         ("--resume no/such", "no/such holds no run; runs in no: none"),
         ("--import no_such_module", "cannot import 'no_such_module'"),

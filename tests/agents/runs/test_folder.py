@@ -54,10 +54,10 @@ def test_a_folder_holds_one_run(tmp_path):
     folder, run = RunFolder(tmp_path / "x"), Run(Config(hidden=8))
     with folder.opened_for(run):
         folder.metrics.touch()
-    assert RunFolder.open(tmp_path / "x")[1] == run
+    assert RunFolder(tmp_path / "x").read() == run
     assert_refused(["holds a run", "--resume"], RunFolder(tmp_path / "x").check_free)
     assert_refused(["must not contain '['"], RunFolder(tmp_path / "[1]" / "x").check_free)
-    assert_refused(["none holds no run; runs in", "x"], RunFolder.open, tmp_path / "none")
+    assert_refused(["none holds no run; runs in", "x"], RunFolder(tmp_path / "none").read)
 
 
 def test_a_new_folder_without_results_is_removed_and_no_other(tmp_path):
@@ -90,7 +90,7 @@ def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
     values["config"]["curiosity"] = "evil-curiosity"
     write_json(tmp_path / "x" / "config.json", values)
     assert_refused(
-        ["unknown curiosity 'evil-curiosity'", "--import evil"], RunFolder.open, tmp_path / "x"
+        ["unknown curiosity 'evil-curiosity'", "--import evil"], RunFolder(tmp_path / "x").read
     )
 
 
@@ -99,7 +99,7 @@ def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
 )
 def test_damaged_settings_are_named(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
-    assert_refused([str(tmp_path / "config.json")], RunFolder.open, tmp_path)
+    assert_refused([str(tmp_path / "config.json")], RunFolder(tmp_path).read)
 
 
 def test_files_are_written_whole_or_not_at_all(tmp_path):

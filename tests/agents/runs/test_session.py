@@ -105,7 +105,7 @@ def test_a_finished_run_returns_at_once(copy, monkeypatch):
 def test_a_finished_run_is_extended(copy):
     train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
     assert final_state(copy)[0] == ITERATIONS + 1
-    assert RunFolder.open(copy)[1].config.iterations == ITERATIONS + 1
+    assert RunFolder(copy).read().config.iterations == ITERATIONS + 1
     tested = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
     assert len(tested) in (2, 4)  # as the best parameters are the old ones or new ones
     with pytest.raises(ValueError, match="iterations must be at least 7, which are done, got 6"):
@@ -184,9 +184,9 @@ def test_what_memory_cannot_hold_is_refused_before_it_is_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"keep": 0}, "keep must be >= 1, got 0"),
-        ({"checkpoint_every": 0}, "checkpoint_every must be >= 1, got 0"),
-        ({"evaluate_every": -1}, "evaluate_every must be >= 0, got -1"),
+        ({"keep": 0}, "keep must be an integer >= 1, got 0"),
+        ({"checkpoint_every": 0}, "checkpoint_every must be an integer >= 1, got 0"),
+        ({"evaluate_every": -1}, "evaluate_every must be an integer >= 0, got -1"),
         ({"reported": 10**9}, "reported must be an integer >= 1 and <= 1000000, got 1000000000"),
         ({"sets": ("q",)}, "unknown task set 'q'"),
     ],
