@@ -1,9 +1,6 @@
-"""Several devices for one run: a mesh of seeds × episodes.
+"""Several devices for one run: a mesh of seeds × episodes, as README.md describes it.
 
-Along `seeds` the devices train different seeds. Along `episodes` they share a seed: each plays its
-own episodes and differentiates its own part of every minibatch, and the gradients are averaged.
-States [S, ...] are split along `seeds` and replicated along `episodes`, so a checkpoint fits any
-number of devices.
+States [S, ...] are split along `seeds` and replicated along `episodes`.
 
     learner = make_train(config, axis=placement.axis)
     iterate = jax.jit(placement.shard(jax.vmap(learner.iterate)), donate_argnums=0)
@@ -72,9 +69,7 @@ class Placement:
 
     @classmethod
     def of(cls, devices: int | None, config: Config, seeds: int) -> Self:
-        """Places seeds trained side by side on a number of devices over all processes.
-
-        None is one device, or all of several processes.
+        """Places seeds on a number of devices; None is one, or all of several processes.
 
         Raises:
           ValueError: the devices do not exist, or do not divide the minibatches.
@@ -122,8 +117,9 @@ class Placement:
         """Copies arrays [S, ...] to one device of this process; all processes must call it."""
         if self.mesh is None:
             return states
-        copies = jax.device_put(states, NamedSharding(self.mesh, PartitionSpec()))
-        return jax.tree.map(lambda x: x.addressable_data(0), copies)
+        # `device_put` does not take keys of several processes.
+        replicate = jax.jit(_same, out_shardings=NamedSharding(self.mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: x.addressable_data(0), replicate(states))
 
     def __str__(self) -> str:
         """Names the devices, as in "4 gpu devices of 2 process(es)"."""
@@ -131,3 +127,7 @@ class Placement:
         if self.mesh is None:
             return platform
         return f"{self.mesh.size} {platform} devices of {jax.process_count()} process(es)"
+
+
+def _same(tree: Tree) -> Tree:
+    return tree

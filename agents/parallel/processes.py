@@ -16,7 +16,7 @@ def join(distributed: Sequence[str] | None) -> None:
         the first process, the number of processes, and the number of this one from 0.
 
     Raises:
-      ValueError: the job is not described, or the other processes are not found.
+      ValueError: the other processes are not found.
     """
     if distributed is None:
         return

@@ -25,10 +25,7 @@ def save(folder: Path, iteration: int, state: Any, record: dict[str, Any], *, ke
     """Saves a pytree of arrays and keys with a record of plain values.
 
     Returns once both are on disk, and the `keep` newest checkpoints alone are left. A checkpoint
-    of this iteration is kept as it is.
-
-    Raises:
-      OSError: the checkpoint cannot be written.
+    of this iteration is kept as it is. Whatever prevents writing raises OSError.
     """
     folder.mkdir(exist_ok=True)
     if iteration in iterations(folder):
@@ -54,10 +51,8 @@ def iterations(folder: Path) -> list[int]:
 def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, Any]]:
     """Reads the arrays of a checkpoint, the newest if `iteration` is None, and its record.
 
-    A writer may delete a checkpoint meanwhile; the next newest is then read.
-
-    Raises:
-      ValueError: there is none, or it is damaged; the message says what to do.
+    A writer may delete a checkpoint meanwhile; the next newest is then read. A ValueError says what
+    to do if there is none, or it is damaged.
     """
     known = iterations(folder)
     if not known:

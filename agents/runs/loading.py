@@ -14,6 +14,7 @@ from agents.networks.agent import PARTS, Agent
 from agents.runs import checkpoint
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, runs_next_to
 from trap_tube_jax.imports import import_modules
+from trap_tube_jax.solver.search import take
 
 
 def load_policies(
@@ -54,18 +55,13 @@ def load_policies(
         params = from_arrays(stored, expected)["params"]
     except ValueError as error:
         raise ValueError(f"{folder.checkpoints} does not fit this version: {error}") from error
-    return policies(run, params, arrays["iteration"])
+    return list(policies(run, params, arrays["iteration"]).values())
 
 
-def policies(run: Run, params: Any, iterations: np.ndarray) -> list[Policy]:
-    """Splits parameters [S, ...] of a run, trained i32[S] iterations, into a policy per seed."""
+def policies(run: Run, params: Any, iterations: np.ndarray) -> dict[int, Policy]:
+    """Returns policies by seed, given parameters [S, ...] that were trained i32[S] iterations."""
     params = {part: params[part] for part in PARTS}
-    return [
-        Policy(
-            f"seed {seed}",
-            run.config,
-            jax.tree.map(lambda x, index=index: x[index], params),
-            int(iterations[index]),
-        )
+    return {
+        seed: Policy(f"seed {seed}", run.config, take(params, index), int(iterations[index]))
         for index, seed in enumerate(run.seed_range)
-    ]
+    }

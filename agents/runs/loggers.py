@@ -14,13 +14,10 @@ from trap_tube_jax.imports import needs_extra
 def open_loggers(
     folder: Path, run: Run, *, tensorboard: bool, wandb: bool
 ) -> Iterator[Callable[[Sequence[Row]], None]]:
-    """Opens the loggers asked for; yields a function that logs the rows of an iteration.
+    """Opens the loggers asked for, in a run's folder; yields a function that logs rows.
 
-    Both write into the run's folder. Names are those of `metrics.csv`; a run of several seeds
-    puts `seed<n>/` in front.
-
-    Raises:
-      ImportError: a library is missing; the message names its extra.
+    Names are those of `metrics.csv`; a run of several seeds puts `seed<n>/` in front. A missing
+    library raises an ImportError that names its extra.
     """
     with contextlib.ExitStack() as stack:
         logs: list[Callable[[dict[str, float], int], Any]] = []

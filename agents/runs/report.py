@@ -50,14 +50,7 @@ Played = Mapping[str, Evaluation]
 
 
 def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Mapping[int, Played]) -> None:
-    """Writes learning curves, the GIF of a solved episode and the page.
-
-    Args:
-      folder: the run's files.
-      run: the run.
-      evaluator: the evaluator of `played`.
-      played: the outcomes of every seed.
-    """
+    """Writes curves, GIF and page of a run, given each seed's outcomes of an evaluator."""
     save_curves(read_rows(folder.metrics), folder.curves, folder.path.name)
     folder.animation.unlink(missing_ok=True)
     own = tt.task_set(run.config.env_id).short

@@ -49,11 +49,7 @@ def metrics(paths: Paths) -> pd.DataFrame:
 
 
 def find_runs(paths: Paths) -> list[RunFolder]:
-    """Returns the runs in folders, sorted by path.
-
-    Raises:
-      ValueError: a folder holds no run.
-    """
+    """Returns the runs in folders, sorted by path; ValueError for a folder without."""
     found: list[RunFolder] = []
     for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
         walk = os.walk(path)  # unlike `rglob`, passes over folders that a writer deletes

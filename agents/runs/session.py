@@ -277,8 +277,7 @@ class Session:
     def _policies(self) -> dict[int, Policy]:
         """Returns the present policy of each seed."""
         state = self.placement.local(self.state)
-        found = policies(self.run, state.params, np.asarray(state.iteration))
-        return dict(zip(self.run.seed_range, found, strict=True))
+        return policies(self.run, state.params, np.asarray(state.iteration))
 
     def _save(self) -> None:
         record = {"run": self.run.to_dict(), "last": list(self._last.values())}
