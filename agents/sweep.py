@@ -3,8 +3,8 @@
 import multiprocessing
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor, Future, as_completed
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 
 import jax
@@ -91,7 +91,7 @@ def launch(
         try:
             for path, run in runs.items():
                 calls[executor.submit(train_logged, path, run, options, stop_file)] = path
-            for count, call in enumerate(as_completed(calls), 1):
+            for count, call in enumerate(_ended(calls), 1):
                 if request() and isinstance(executor, ProcessPerCall):
                     for each in calls:  # of Dask this would also forget running ones
                         each.cancel()
@@ -113,6 +113,17 @@ def launch(
     if number := request():
         raise Stopped(number)
     return failed
+
+
+def _ended(calls: Iterable[Future]) -> Iterator[Future]:
+    """Yields calls as they end.
+
+    A wait without a limit, as of `as_completed`, would miss a signal that arrives just before it.
+    """
+    pending = set(calls)
+    while pending:
+        ended, pending = wait(pending, timeout=1, return_when=FIRST_COMPLETED)
+        yield from ended
 
 
 def _outcome(call: Future) -> str:
