@@ -32,14 +32,15 @@ def load_policies(
       ValueError: there is no such policy, or it cannot be read.
     """
     path = Path(source)
-    if not path.exists() and str(source) in pretrained.names():
+    is_run = (path / CONFIG_FILE).is_file()
+    if not is_run and not path.is_file() and str(source) in pretrained.names():
         path = pretrained.FOLDER / f"{source}{policy_files.SUFFIX}"
     if path.is_file():
         import_modules(imports)
         if iteration is not None:
             raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
         return [policy_files.load_policy(path)]
-    if not (path / CONFIG_FILE).is_file():
+    if not is_run:
         raise ValueError(
             f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
             f"shipped agents: {', '.join(pretrained.names())}"

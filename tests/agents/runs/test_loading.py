@@ -28,13 +28,15 @@ def run_path(tmp_path_factory) -> Path:
     return path
 
 
-def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path):
+def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path, monkeypatch):
     first, second = agents.load(str(run_path)), agents.load(run_path, seed=4, greedy=False)
     assert (first.name, first.iteration, first.greedy) == ("seed 3", 6, True)
     assert (second.name, second.iteration, second.greedy) == ("seed 4", 6, False)
     assert_same(second.params, random_params(seed=4))
     agents.save(tmp_path / "x.safetensors", first)
     assert_same(agents.load(tmp_path / "x.safetensors").params, first.params)
+    (tmp_path / "fast-base").mkdir()  # a folder that holds no run hides no shipped agent
+    monkeypatch.chdir(tmp_path)
     assert agents.load("fast-base").config.env_id == "TrapTube-v0"
 
 
