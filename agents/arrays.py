@@ -1,15 +1,25 @@
-"""Pytrees as flat tables of named NumPy arrays, the form in which files hold them."""
+"""Pytrees as flat tables of named NumPy arrays, and safetensors files of such tables.
 
+Reading a file runs no code from it and allocates no more than its size.
+"""
+
+import json
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import safetensors
+import safetensors.numpy
+
+from agents.files import write_bytes
 
 Tree = TypeVar("Tree")
 Arrays = dict[str, np.ndarray]
 
 SEPARATOR = "/"
+SUFFIX = ".safetensors"
 
 
 def to_arrays(tree: Any) -> Arrays:
@@ -36,6 +46,32 @@ def from_arrays(arrays: Arrays, template: Tree) -> Tree:
     return structure.unflatten(
         [_to_leaf(name, arrays[name], leaf) for name, (_, leaf) in zip(names, leaves, strict=True)]
     )
+
+
+def write_arrays(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
+    """Writes arrays, and plain values about them as JSON in the header, atomically."""
+    # One entry, because safetensors writes several in any order.
+    write_bytes(path, safetensors.numpy.save(arrays, {"json": json.dumps(about)}))
+
+
+def read_arrays(path: Path) -> tuple[Arrays, dict[str, Any]]:
+    """Inverts `write_arrays`.
+
+    Raises:
+      ValueError: the file is damaged or of another kind.
+      OSError: the file cannot be opened.
+    """
+    with path.open("rb"):  # an OSError names the file, safetensors' own may not
+        pass
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            about = json.loads((file.metadata() or {})["json"])
+    except (safetensors.SafetensorError, KeyError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not a file of arrays of this package: {error}") from error
+    if not isinstance(about, dict):
+        raise ValueError(f"{path} is not a file of arrays of this package")
+    return arrays, about
 
 
 def is_key(x: Any) -> bool:

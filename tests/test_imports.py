@@ -42,7 +42,7 @@ LEARNING = {"registry", "config", "parallel", "networks", "acting", "curiosity",
 PACKAGES = ("trap_tube_jax", "agents", "benchmarks")  # a package never imports a later one
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
 # Libraries that neither importing the environment nor drawing text needs.
-HEAVY = {"PIL", "chex", "gymnasium", "gymnax", "matplotlib", "optax", "orbax", "pandas"}
+HEAVY = {"PIL", "chex", "gymnasium", "gymnax", "matplotlib", "optax", "pandas"}
 
 
 def module_name(path: pathlib.Path) -> str:

@@ -29,8 +29,7 @@ class TaskReplay(NamedTuple):
 
     @staticmethod
     def untried(key: jax.Array, lists: int, capacity: int) -> "TaskReplay":
-        """Returns lists of untried tasks; one list, unused, if `lists` is 0."""
-        lists = max(lists, 1)  # checkpoints hold no empty arrays
+        """Returns lists of untried tasks."""
         keys = jax.random.split(key, (lists, capacity))
         return TaskReplay(keys, jnp.zeros(lists, jnp.int32))
 

@@ -7,7 +7,7 @@ best-pstsy  the preset `best` on {P, St, Sy}: the median of five seeds
 
 from pathlib import Path
 
-from agents.acting.policy_files import SUFFIX
+from agents.arrays import SUFFIX
 
 FOLDER = Path(__file__).parent
 

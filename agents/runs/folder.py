@@ -97,7 +97,7 @@ class RunFolder:
       provenance: machines, versions and commits that trained it, JSON.
       metrics: a row per seed and iteration, CSV.
       evaluations: a row per seed, evaluated iteration and task set, CSV.
-      checkpoints: one folder per checkpoint, named by its iteration.
+      checkpoints: a file per checkpoint, named by its iteration.
       curves: learning curves, PNG.
       page: the report, HTML.
       animation: a solved episode, GIF.
@@ -160,8 +160,6 @@ class RunFolder:
 
     def check_free(self) -> None:
         """Raises ValueError unless a new run can be created here."""
-        if "[" in str(self.path.absolute()):  # Orbax would take it for a pattern
-            raise ValueError(f"the path of a run must not contain '[', got {self.path.absolute()}")
         if self.config.is_file():
             raise ValueError(
                 f"{self.path} holds a run; continue it with --resume {self.path}, or give "

@@ -9,7 +9,7 @@ import numpy as np
 from agents import pretrained
 from agents.acting import policy_files
 from agents.acting.policy import Policy
-from agents.arrays import from_arrays
+from agents.arrays import SUFFIX, from_arrays
 from agents.networks.agent import PARTS, Agent
 from agents.runs import checkpoint
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, runs_next_to
@@ -34,7 +34,7 @@ def load_policies(
     path = Path(source)
     is_run = (path / CONFIG_FILE).is_file()
     if not is_run and not path.is_file() and str(source) in pretrained.names():
-        path = pretrained.FOLDER / f"{source}{policy_files.SUFFIX}"
+        path = pretrained.FOLDER / f"{source}{SUFFIX}"
     if path.is_file():
         import_modules(imports)
         if iteration is not None:

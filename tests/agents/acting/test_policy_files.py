@@ -29,17 +29,17 @@ def test_a_stored_policy_is_the_same(tmp_path):
 
 def header(iteration: int | str = 1, **settings):
     values = {"config": {**CONFIG.to_dict(), **settings}, "iteration": iteration}
-    return {"policy": json.dumps(values)}
+    return {"json": json.dumps(values)}
 
 
 @pytest.mark.parametrize(
     ("stored", "changes", "message"),
     [
-        ({}, {}, "does not hold a policy of this version: 'policy'"),
         *(
-            ({"policy": text}, {}, "does not hold a policy of this version")
-            for text in ("{", "[]", '{"config": []}', "[" * 100_000)
+            (header, {}, "is not a file of arrays of this package")
+            for header in ({}, *({"json": text} for text in ("{", "[]", "[" * 100_000)))
         ),
+        ({"json": '{"config": []}'}, {}, "does not hold a policy of this version"),
         (header(iteration="x"), {}, "does not hold a policy of this version"),
         (header(clip=0.2), {}, "unknown setting 'clip'"),
         (header(hidden=5), {}, r"core/params/bias is float32\[2, 12\], not float32\[2, 15\]"),
@@ -69,7 +69,7 @@ def test_damaged_files_are_refused(damage, tmp_path):
     path = tmp_path / "mine.safetensors"
     save_policy(path, POLICY)
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match=r"mine\.safetensors is not a file of parameters"):
+    with pytest.raises(ValueError, match=r"mine\.safetensors is not a file of arrays"):
         load_policy(path)
 
 

@@ -56,7 +56,6 @@ def test_a_folder_holds_one_run(tmp_path):
         folder.metrics.touch()
     assert RunFolder(tmp_path / "x").read() == run
     assert_refused(["holds a run", "--resume"], RunFolder(tmp_path / "x").check_free)
-    assert_refused(["must not contain '['"], RunFolder(tmp_path / "[1]" / "x").check_free)
     assert_refused(["none holds no run; runs in", "x"], RunFolder(tmp_path / "none").read)
 
 
