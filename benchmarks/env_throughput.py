@@ -25,7 +25,7 @@ from trap_tube_jax.vector import VectorEnvironment
 DENSE_UNITS = 64
 ONE_HOT_LEVELS = 8
 
-PatternName = Literal["bytes", "sum", "mean", "dense", "one-hot", "last"]
+PatternName = Literal["bytes", "sum", "flat-sum", "mean", "dense", "one-hot", "last"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +63,9 @@ class Options(StepOptions):
 
     Attributes:
       patterns: uses of the observations: `bytes` folds every byte into an array of their size,
-        `sum` adds them in int32, `mean` averages in float32, `dense` casts to float32 and applies
-        a layer of 64 units, `one-hot` counts the values of a flattened one-hot of 8 levels, `last`
-        keeps the last observation alone.
+        `sum` adds them in int32, `flat-sum` flattens them first, `mean` averages in float32,
+        `dense` casts to float32 and applies a layer of 64 units, `one-hot` counts the values of a
+        flattened one-hot of 8 levels, `last` keeps the last observation alone.
       plain: measures `jax.vmap` of an `AutoReset` instead of a `VectorEnvironment`.
     """
 
@@ -159,6 +159,7 @@ def one_hot_counts(observations: jax.Array) -> jax.Array:
 PATTERNS: dict[PatternName, Pattern] = {
     "bytes": Pattern(bits, jnp.bitwise_xor),
     "sum": Pattern(lambda observations: observations.astype(jnp.int32).sum()),
+    "flat-sum": Pattern(lambda observations: flat(observations).astype(jnp.int32).sum()),
     "mean": Pattern(lambda observations: observations.astype(jnp.float32).mean()),
     "dense": Pattern(dense),
     "one-hot": Pattern(one_hot_counts),

@@ -4,7 +4,7 @@ Source: environment.md, "Board and objects" and "Base task".
 """
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import jax
 import numpy as np
@@ -26,6 +26,8 @@ from trap_tube_jax.objects import (
     TOOL,
     base_palette,
 )
+
+Record = TypeVar("Record")
 
 # Shape and dtype of every field of a state; None stands for N >= 1 features.
 _FIELDS: dict[str, tuple[tuple[int | None, ...], type]] = {
@@ -188,6 +190,11 @@ def base_state(num_features: int = 3) -> State:
         """,
         palette=base_palette(num_features),
     )
+
+
+def take(batch: Record, index: Any) -> Record:
+    """Indexes the first axis of a tree of arrays with an integer, a slice or integers."""
+    return jax.tree.map(lambda field: field[index], batch)
 
 
 def validate(state: State) -> State:

@@ -21,8 +21,7 @@ from trap_tube_jax.scoring.tasks import (
     label,
     layout_numbers,
 )
-from trap_tube_jax.solver.search import take
-from trap_tube_jax.state import State
+from trap_tube_jax.state import State, take
 
 
 class Evaluation(NamedTuple):

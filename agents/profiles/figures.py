@@ -10,7 +10,7 @@ from scipy.stats import binomtest
 from agents.experiments.figures import COLORS, WIDTH
 from agents.profiles.tasks import PARTS, Sampling
 from trap_tube_jax.rendering import render
-from trap_tube_jax.solver.search import take
+from trap_tube_jax.state import take
 
 MARKERS = "osD^vPX"
 PANELS = {  # part, and the label of its x axis

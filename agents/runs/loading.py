@@ -14,7 +14,7 @@ from agents.networks.agent import PARTS, Agent
 from agents.runs import checkpoint
 from agents.runs.folder import CONFIG_FILE, Run, RunFolder, runs_next_to
 from trap_tube_jax.imports import import_modules
-from trap_tube_jax.solver.search import take
+from trap_tube_jax.state import take
 
 
 def load_policies(

@@ -28,8 +28,7 @@ from trap_tube_jax.objects import DIRECTION_NAMES, NO_DIRECTION
 from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import label
-from trap_tube_jax.solver.search import take
-from trap_tube_jax.state import State
+from trap_tube_jax.state import State, take
 
 CELL_SIZE = 16  # pixels of the page's boards
 GIF_CELL_SIZE = 24

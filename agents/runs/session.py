@@ -48,7 +48,7 @@ from trap_tube_jax.checks import MOST_TASKS, check_integer
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
-from trap_tube_jax.solver.search import take
+from trap_tube_jax.state import take
 
 Advance = Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]
 

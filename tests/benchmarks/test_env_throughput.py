@@ -64,7 +64,7 @@ def test_patterns_compute_what_they_say():
     values = np.asarray(observations, np.int64)
     read = {name: np.asarray(pattern.read(observations)) for name, pattern in PATTERNS.items()}
     assert read["bytes"].tolist() == values.reshape(4, -1).tolist()
-    assert read["sum"] == values.sum()
+    assert read["sum"] == read["flat-sum"] == values.sum()
     np.testing.assert_allclose(read["mean"], values.mean(), rtol=1e-5)
     assert read["dense"].shape == (4, env_throughput.DENSE_UNITS)
     counts = [np.sum(values // 32 == level) for level in range(8)]

@@ -26,8 +26,8 @@ from trap_tube_jax.scoring.tasks import (
     evaluation_tasks,
     layout_numbers,
 )
-from trap_tube_jax.solver.search import solve_batch, take
-from trap_tube_jax.state import State
+from trap_tube_jax.solver.search import solve_batch
+from trap_tube_jax.state import State, take
 
 BLOCK = 1024  # tasks played at once, which bounds the memory
 

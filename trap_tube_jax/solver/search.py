@@ -6,7 +6,7 @@ Source: environment.md, "One step".
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +19,7 @@ from trap_tube_jax.environment import action_from_index
 from trap_tube_jax.geometry import cell_of
 from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, position_id
-from trap_tube_jax.state import State, validate
-
-Record = TypeVar("Record")
+from trap_tube_jax.state import State, take, validate
 
 # Frontiers are padded to one of few sizes, because each size compiles once.
 CHUNK_SIZES = (256, 1024, 4096)
@@ -122,11 +120,6 @@ _step = jax.jit(dynamics.step)
 def checked(state: State) -> State:
     """Returns a valid state as NumPy arrays; raises the errors of `solve`."""
     return validate(_to_host(state))
-
-
-def take(batch: Record, index: Any) -> Record:
-    """Indexes the first axis of a tree of arrays with an integer, a slice or integers."""
-    return jax.tree.map(lambda field: field[index], batch)
 
 
 def levels(state: State) -> Iterator[Level]:

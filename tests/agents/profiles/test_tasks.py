@@ -8,7 +8,7 @@ import pytest
 import trap_tube_jax as tt
 from agents.profiles.tasks import PARTS, Sampling, layout_kinds
 from trap_tube_jax.controls import trap_exchanged
-from trap_tube_jax.solver.search import take
+from trap_tube_jax.state import take
 
 LAYOUT = ("board", "agent", "tool", "tool_extent", "food")
 STRENGTH_PARTS = ("structural", "perceptual", "both")

@@ -12,7 +12,8 @@ from refusal import assert_refused
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver import pictures
-from trap_tube_jax.solver.search import checked, levels, replay, take
+from trap_tube_jax.solver.search import checked, levels, replay
+from trap_tube_jax.state import take
 from trap_tube_jax.transfers import swap_with_tool
 
 NUM_ROOMS = 30
