@@ -1,6 +1,7 @@
 """CSV files that a run appends to."""
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,28 +36,33 @@ def append_rows(path: Path, rows: Sequence[Row]) -> None:
 
 def read_rows(path: Path) -> Frame:
     """Reads a CSV file of a run; one without rows if it is missing or empty."""
-    if not path.exists() or not path.stat().st_size:
+    lines = _whole_lines(path)
+    if not lines:
         return pd.DataFrame(columns=["seed", "iteration", "purpose", "evaluation", "episodes"])
-    return pd.read_csv(path)
+    return pd.read_csv(io.StringIO("".join(lines)))
 
 
 def rewind_rows(path: Path, iteration: int) -> None:
-    """Deletes the rows after an iteration, and a torn line that a killed process left.
+    """Deletes the rows after an iteration.
 
     Raises:
       ValueError: the file has no column `iteration`.
     """
-    text = path.read_text(encoding="utf-8") if path.exists() else ""
-    header, *lines = text.splitlines(keepends=True) or [""]
+    header, *lines = _whole_lines(path) or [""]
     names = header.rstrip().split(",")
-    if text and "iteration" not in names:
+    if header and "iteration" not in names:
         raise ValueError(f"{path} has no header with a column 'iteration'; delete or restore it")
-    whole = [line for line in lines if line.endswith("\n") and line.count(",") == len(names) - 1]
-    kept = [line for line in whole if int(line.split(",")[names.index("iteration")]) <= iteration]
+    kept = [line for line in lines if int(line.split(",")[names.index("iteration")]) <= iteration]
     if kept:
         write_text(path, header + "".join(kept))
     else:
         path.unlink(missing_ok=True)
+
+
+def _whole_lines(path: Path) -> list[str]:
+    """Returns the lines of a file without a last one that a killed process wrote in part."""
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    return text[: text.rfind("\n") + 1].splitlines(keepends=True)
 
 
 def evaluation_rows(

@@ -19,6 +19,7 @@ def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
     before = path.read_text()
     with path.open("a") as file:
         file.write("0,2,1")  # a kill in mid-write
+    assert list(read_rows(path)["iteration"]) == [1, 2, 3]
     rewind_rows(path, 2)
     assert path.read_text() == "".join(before.splitlines(keepends=True)[:3])
     append_rows(path, [row(3, loss=float(np.float32(1 / 3)), length="")])
