@@ -37,7 +37,7 @@ def tables(results: Frame, curves: Frame, about: Mapping[str, Any]) -> dict[str,
     """Returns the tables by their headings.
 
     Args:
-      results: rows of `agents.results`; records also have a column `optimality`.
+      results: rows of `agents.results`.
       curves: rows of metrics, with the columns of `report.CURVES`.
       about: `train_set`, which decides the paper's table to compare with, and `threshold`, the
         share of its validation tasks that counts as solved.
@@ -47,8 +47,6 @@ def tables(results: Frame, curves: Frame, about: Mapping[str, Any]) -> dict[str,
     if len(tested):
         found["Test tasks solved, %"] = success_table(tested, train_set == "pstsy")
         found["Test tasks solved by seed, %"] = seeds_table(tested)
-    if "optimality" in tested:
-        found["Shortest plan / steps taken, where solved"] = optimality_table(tested)
     return found
 
 
@@ -111,13 +109,6 @@ def seeds_table(tested: Frame) -> Frame:
     table["iteration"] = chosen.map("{:,}".format)
     table.index = [f"{name}, seed {seed}" for name, seed in table.index]
     return table
-
-
-def optimality_table(tested: Frame) -> Frame:
-    """Returns mean optimality of test tasks: a row per set, a column per algorithm."""
-    known = tested.dropna(subset="optimality").groupby(["task_set", "algorithm"], sort=False)
-    texts = known["optimality"].apply(lambda each: mean_text(each.to_numpy(), ".3f", high=1))
-    return texts.unstack().fillna(NOTHING).rename(index=label)
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:
