@@ -15,7 +15,7 @@ def assert_refused(words: list[str], function: Any, *args: Any, **kwargs: Any) -
 
 
 def refused(capsys: pytest.CaptureFixture[str], command: Any, *arguments: Any) -> str:
-    """What a command line says that it refuses, without the frames that it draws."""
+    """Returns the message of a command line that refuses its arguments, without box characters."""
     with pytest.raises(SystemExit) as exit_info:
         command([str(argument) for argument in arguments])
     assert exit_info.value.code == 2

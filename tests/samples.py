@@ -32,7 +32,7 @@ def flat(cells: np.ndarray) -> np.ndarray:
 
 
 def tally(shape: tuple[int, ...], *indices: np.ndarray) -> np.ndarray:
-    """How often each tuple of indices occurs."""
+    """Counts how often each tuple of indices occurs."""
     places = np.ravel_multi_index(indices, shape)
     return np.bincount(places, minlength=int(np.prod(shape))).reshape(shape)
 

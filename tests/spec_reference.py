@@ -51,7 +51,7 @@ class Layouts(NamedTuple):
     extent: np.ndarray
 
     def static_object(self, cell: Cell) -> np.ndarray:
-        """What the static layer holds there, `OFF_BOARD` in the frame around the board."""
+        """Returns the object of the static layer, `OFF_BOARD` around the board."""
         frame = [(0, 0)] * (self.board.ndim - 2) + [(1, 1), (1, 1)]
         framed = np.pad(self.board, frame, constant_values=OFF_BOARD)
         which = () if self.board.ndim == 2 else (np.arange(len(self.board)),)
@@ -66,7 +66,7 @@ class Layouts(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """What moved by one cell in one step, and whether the task is solved after it."""
+    """Flags of one step: things that moved by one cell, and success."""
 
     food: np.ndarray
     tool: np.ndarray
@@ -215,7 +215,7 @@ def flat(cell: tuple[int, int]) -> int:
 
 
 class Looks(NamedTuple):
-    """What the symbolic transfer changes."""
+    """The fields of a state that the symbolic transfer changes."""
 
     board: np.ndarray
     palette: np.ndarray

@@ -1,4 +1,4 @@
-"""What the tests of the adapters share: an easy task, and room for other people's code."""
+"""Shares an easy task among the tests of the adapters, and makes room for other people's code."""
 
 import jax
 import pytest

@@ -27,7 +27,7 @@ def table() -> dict[str, list[tuple[str, str]]]:
 
 
 def oracle(state: tt.State) -> tuple[str, str]:
-    """What the table says of a layout."""
+    """Returns a layout's entries of the table: plan length and direction of the push."""
     plan = tt.solve(state)
     foods = [np.asarray(at.food) for at in replay(state, plan)]
     moves = [tuple((b - a).tolist()) for a, b in itertools.pairwise(foods)]

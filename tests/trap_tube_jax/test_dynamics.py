@@ -18,7 +18,7 @@ ALL_ACTIONS = [(grasp, move) for grasp in range(4) for move in range(4)]
 
 
 def _moved(before: jax.Array, after: jax.Array, by: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whether the cell moved by `by`, and whether that or nothing is what it did."""
+    """Returns whether the cell moved by `by`, and whether it moved so or not at all."""
     stayed = (before[0] == after[0]) & (before[1] == after[1])
     moved = (before[0] + by[0] == after[0]) & (before[1] + by[1] == after[1])
     return moved, stayed | moved

@@ -95,7 +95,7 @@ def test_observations(recorded, starts, replay):
 
 
 def test_states_past_the_end_stay(recorded, replay):
-    """What follows the end of an episode changes nothing and pays nothing."""
+    """Steps after the end of an episode change nothing and pay nothing."""
     past = ~_within_episode(recorded)
     episode, _ = np.nonzero(past)
     last = recorded["length"][episode] - 1

@@ -1,4 +1,4 @@
-"""How many layouts {P} has, and how many of them a run of training meets."""
+"""Counts of layouts: those of {P}, and those that a training run meets."""
 
 import numpy as np
 import pytest

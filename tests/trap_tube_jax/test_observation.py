@@ -1,4 +1,4 @@
-"""What the agent sees, for any number of feature channels, and pictures for people."""
+"""Observations for agents, with any number of feature channels, and pictures for people."""
 
 import jax
 import jax.numpy as jnp

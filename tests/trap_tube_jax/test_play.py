@@ -137,7 +137,7 @@ def test_without_a_terminal_the_command_line_says_so(monkeypatch, capsys):
 
 
 def read_until(terminal, text):
-    """What the terminal shows up to and including `text`."""
+    """Reads the terminal up to and including `text`."""
     shown = ""
     while text not in shown:
         ready, _, _ = select.select([terminal], [], [], 120)
