@@ -5,9 +5,10 @@ every byte of every observation. The peers come with the extra `[bench]`. A peer
 imported or fails is skipped, and the reason is printed.
 """
 
+import dataclasses
 import importlib
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -88,18 +89,30 @@ def jumanji_snake() -> Subject:
     )
 
 
-PEERS: dict[str, Callable[[], Subject]] = {
-    "gymnax Breakout": gymnax_breakout,
-    "pgx Breakout": pgx_breakout,
-    "Navix DoorKey-8x8": navix_doorkey,
-    "XLand DoorKey-8x8": xland_doorkey,
-    "Jumanji Snake": jumanji_snake,
+PeerName = Literal["gymnax", "pgx", "navix", "xminigrid", "jumanji"]
+PEERS: dict[PeerName, Callable[[], Subject]] = {
+    "gymnax": gymnax_breakout,
+    "pgx": pgx_breakout,
+    "navix": navix_doorkey,
+    "xminigrid": xland_doorkey,
+    "jumanji": jumanji_snake,
 }
 INSTALL = " (pip install -e '.[bench]')"
 
 
-def measure(options: StepOptions) -> tuple[list[Throughput], dict[str, str]]:
-    """Measures the task sets and all peers; returns results, and reasons by skipped peer.
+@dataclasses.dataclass(frozen=True)
+class Options(StepOptions):
+    """Measures steps per second of the task sets and of other JAX gridworlds.
+
+    Attributes:
+      peers: the libraries to compare with.
+    """
+
+    peers: tuple[PeerName, ...] = tuple(PEERS)
+
+
+def measure(options: Options) -> tuple[list[Throughput], dict[str, str]]:
+    """Measures the task sets and the peers; returns results, and reasons by skipped peer.
 
     Raises:
       ValueError: a task set is unknown.
@@ -107,9 +120,9 @@ def measure(options: StepOptions) -> tuple[list[Throughput], dict[str, str]]:
     own = [env_throughput.task_set_subject(name) for name in options.sets]
     results = _measure(own, options)
     skipped = {}
-    for name, make_subject in PEERS.items():
+    for name in options.peers:
         try:
-            results += _measure([make_subject()], options)
+            results += _measure([PEERS[name]()], options)
         except Exception as error:  # a broken peer must not break the others
             first_line = next(iter(str(error).splitlines()), "")
             hint = INSTALL if isinstance(error, ImportError) else ""
@@ -117,7 +130,7 @@ def measure(options: StepOptions) -> tuple[list[Throughput], dict[str, str]]:
     return results, skipped
 
 
-def main(options: StepOptions) -> None:
+def main(options: Options) -> None:
     """Measures, prints a table and the skipped peers, and writes the record."""
     options.check()
     console = Console()
@@ -182,4 +195,4 @@ def _split(key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
 
 if __name__ == "__main__":
     with plain_errors():
-        main(parse(StepOptions, None, "python -m benchmarks.peers"))
+        main(parse(Options, None, "python -m benchmarks.peers"))

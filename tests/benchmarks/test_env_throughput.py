@@ -81,7 +81,8 @@ def test_peers_prints_time_and_size_of_a_step_and_skips_what_fails(timed, capsys
 
     monkeypatch.setattr(peers, "PEERS", {"absent": absent, "broken": broken})
     monkeypatch.setattr(harness, "machine", dict)
-    peers.main(StepOptions(sets=("base",), num_envs=(2,), num_steps=4, repeats=3))
+    size = {"num_envs": (2,), "num_steps": 4, "repeats": 3}
+    peers.main(peers.Options(sets=("base",), peers=("absent", "broken"), **size))
     *table, absent_line, broken_line = capsys.readouterr().out.splitlines()
     (cells,) = [line.strip("│").split("│") for line in table if "base" in line]
     assert [cell.strip() for cell in cells[4:6]] == ["250000.000", "432"]
