@@ -252,7 +252,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "intrinsic_coef": 2.0,
         "filters": (8, 16),
     },
-    # Learns {P, St, Sy}: replays failed tasks and encodes objects.
+    # Learns {P, St, Sy}: encodes objects, replays failed tasks and predicts motion.
     "best": {
         **PAYS_FOR_EFFECTS,
         "env_id": "pstsy",
@@ -260,10 +260,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "max_transitions": 25_600_000,
         "episodes_per_iteration": 512,
         "minibatch_size": 64,
+        "motion_coef": 0.5,
         "lr_decay_fraction": 0.45,
         "intrinsic_coef": 0.03,
         "intrinsic_coef_init": 3.0,
-        "intrinsic_anneal_fraction": 0.8,
+        "intrinsic_anneal_fraction": 0.5,
         "replay_fractions": (0.0625, 0.125, 0.75),
         "align_to_food": True,
         "encoder": "objects",

@@ -161,7 +161,7 @@ def test_stated_results_are_those_of_the_records():
     for name, (paper, _) in tables.PAPER_SUCCESS.items():
         rows[PROTOCOL].append(f"{cells(paper)} | ≤ 25,600,000 |")
         rows["README.md"] += [f"| {name} | {cells(paper)} |"] if "ICM" in name else []
-    for folder, own, shipped in (("exp2_best", best, 1), ("fast_base", fast, 7)):
+    for folder, own, shipped in (("exp2_best", best, 0), ("fast_base", fast, 7)):
         steps = rows_of(folder, "curves").groupby("seed")["transitions"].max()
         found = own.droplevel(0).drop(columns=tables.MEAN)
         for percent, taken in (
