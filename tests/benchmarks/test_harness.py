@@ -20,7 +20,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 MODULES = [env_throughput, peers, train_throughput, learner_peers]
 OPTIONS = {
     "env_throughput": env_throughput.Options,
-    "peers": env_throughput.StepOptions,
+    "peers": peers.Options,
     "train_throughput": train_throughput.Options,
     "learner_peers": learner_peers.Options,
 }

@@ -12,6 +12,7 @@ import pytest
 from agents.config import Config
 from agents.parallel.devices import ONE_DEVICE, Placement
 from paths import ROOT
+from settings import IS_THREEFRY
 
 
 @pytest.fixture
@@ -78,4 +79,5 @@ def test_two_devices_train_as_one():
     assert two["is_finite"] == [1, 1, 1]
     assert two["transitions"] == two["steps_played"] > 0
     assert two["gradient_gap"] < 1e-5  # of the mean of two halves and the whole
-    assert two["seeds_gap"] < 1e-5  # of a seed on each device and both on one
+    if IS_THREEFRY:  # draws of rbg keys depend on jax.vmap
+        assert two["seeds_gap"] < 1e-5  # of a seed on each device and both on one

@@ -33,7 +33,7 @@ BEST = Config.preset(
     replay_capacity=5,
     replay_fractions=(0.25, 0.25),
     max_transitions=None,
-    motion_coef=0.5,
+    intrinsic_anneal_fraction=0.8,
 )
 PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
 STEPS, EPISODES = 6, 8
