@@ -79,12 +79,12 @@ def test_peers_prints_time_and_size_of_a_step_and_skips_what_fails(timed, capsys
     def broken():
         raise ValueError("broken\nin two lines")
 
-    monkeypatch.setattr(peers, "PEERS", {"absent": absent, "broken": broken})
+    monkeypatch.setattr(peers, "PEERS", {"pgx": absent, "navix": broken})
     monkeypatch.setattr(harness, "machine", dict)
     size = {"num_envs": (2,), "num_steps": 4, "repeats": 3}
-    peers.main(peers.Options(sets=("base",), peers=("absent", "broken"), **size))
+    peers.main(peers.Options(sets=("base",), peers=("pgx", "navix"), **size))
     *table, absent_line, broken_line = capsys.readouterr().out.splitlines()
     (cells,) = [line.strip("│").split("│") for line in table if "base" in line]
     assert [cell.strip() for cell in cells[4:6]] == ["250000.000", "432"]
-    assert absent_line == "skipped absent: ImportError: no such package (pip install -e '.[bench]')"
-    assert broken_line == "skipped broken: ValueError: broken"
+    assert absent_line == "skipped pgx: ImportError: no such package (pip install -e '.[bench]')"
+    assert broken_line == "skipped navix: ValueError: broken"
