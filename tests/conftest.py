@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -61,3 +62,16 @@ def own_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
     from trap_tube_jax import registry  # noqa: PLC0415  after the settings above
 
     monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+
+
+@pytest.fixture
+def own_names(own_task_sets: None) -> Iterator[None]:
+    """Curiosities, encoders and task sets that a test registers are gone after it."""
+    from agents import registry  # noqa: PLC0415  after the settings above
+
+    kinds = (registry.curiosities, registry.encoders)
+    known = [set(kind) for kind in kinds]
+    yield
+    for kind, names in zip(kinds, known, strict=True):
+        for name in set(kind) - names:
+            del kind[name]

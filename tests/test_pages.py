@@ -15,7 +15,6 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from agents import registry
 from agents.experiments import tables
 from paths import ROOT
 from settings import HAS_DEFAULT_DRAWS
@@ -54,17 +53,7 @@ def blocks():
     return found
 
 
-@pytest.fixture
-def _own_names(own_task_sets):
-    kinds = (registry.curiosities, registry.encoders)
-    known = [set(kind) for kind in kinds]
-    yield
-    for kind, names in zip(kinds, known, strict=True):
-        for name in set(kind) - names:
-            del kind[name]
-
-
-@pytest.mark.usefixtures("_own_names")
+@pytest.mark.usefixtures("own_names")
 @pytest.mark.parametrize(("code", "output"), blocks())
 def test_a_block_runs_by_itself_and_prints_what_stands_under_it(
     code, output, capsys, tmp_path, monkeypatch

@@ -13,7 +13,7 @@ import pytest
 
 import agents
 import trap_tube_jax as tt
-from agents import make_train, registry
+from agents import make_train
 from agents.files import read_json
 from agents.train import main
 from paths import ROOT
@@ -32,16 +32,13 @@ SIZES = shlex.split(re.sub("--max-steps [0-9]+", "", " ".join(options())))
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch, own_task_sets):
+def here(tmp_path, monkeypatch, own_names):
     """A folder with the page's module, which is forgotten after the test."""
     (tmp_path / "my_module.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
     sys.modules.pop("my_module", None)
-    for kind in (registry.curiosities, registry.encoders):
-        for name in kind.own & set(kind):
-            del kind[name]
 
 
 def command(line, *arguments, folder):
