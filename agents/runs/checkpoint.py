@@ -13,9 +13,10 @@ from agents.arrays import SUFFIX, Arrays, read_arrays, to_arrays, write_arrays
 
 
 def save(folder: Path, iteration: int, state: Any, record: dict[str, Any], *, keep: int) -> None:
-    """Saves a pytree of arrays and keys with a record of plain values, as folder's only writer.
+    """Saves a pytree of arrays and keys with a record of plain values.
 
-    The `keep` newest checkpoints are left. One of this iteration is kept as it is.
+    Only one process may write to a folder. The `keep` newest checkpoints are left, and one of this
+    iteration is kept as it is.
 
     Raises:
       OSError: the file cannot be written.
