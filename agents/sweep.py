@@ -116,14 +116,14 @@ def launch(
 
 
 def _ended(calls: Iterable[Future]) -> Iterator[Future]:
-    """Yields calls as they end.
+    """Yields calls as they end, those that end together in their order.
 
     A wait without a limit, as of `as_completed`, would miss a signal that arrives just before it.
     """
     pending = set(calls)
     while pending:
         ended, pending = wait(pending, timeout=1, return_when=FIRST_COMPLETED)
-        yield from ended
+        yield from (call for call in calls if call in ended)
 
 
 def _outcome(call: Future) -> str:
