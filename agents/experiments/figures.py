@@ -67,15 +67,18 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
             values = table.loc[name, column].to_numpy()
             axis.barh(row, values.mean(), color=COLORS[5])
             axis.plot(values, [row] * len(values), "o", color=COLORS[0], alpha=0.7, markersize=4)
-        if column in tables.PAPER_SETS:
-            place = tables.PAPER_SETS.index(column)
-            for row, (means, sds) in enumerate(paper.values(), len(own)):
+        for row, (means, sds) in enumerate(paper.values(), len(own)):
+            if column in tables.PAPER_SETS:
+                place = tables.PAPER_SETS.index(column)
                 axis.barh(row, means[place], xerr=sds[place], color="#BBBBBB", error_kw={"lw": 1})
+            else:
+                axis.text(0, row, "not reported", va="center", fontsize="small")
         axis.set_xlim(-6, 106)
         axis.set_xticks([0, 50, 100])
     axes[0].set_yticks(range(len(names)), names)
     axes[0].set_ylim(len(names) - 0.5, -0.5)
-    figure.supxlabel("test tasks solved, %: mean, and a point per seed", fontsize=10)
+    what = "test tasks solved, %: mean, a point per seed"
+    figure.supxlabel(f"{what}; paper: mean ± SD" if paper else what, fontsize=10)
     return figure
 
 
