@@ -1,4 +1,4 @@
-"""Equality of environments, wrappers and states by what they hold."""
+"""Equality of environments, states and plans by what they hold."""
 
 from typing import Any
 

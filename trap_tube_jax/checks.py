@@ -1,13 +1,14 @@
 """Shared checks of arguments."""
 
 import re
+import reprlib
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-LARGEST_SEED = 2**32 - 1  # `jax.random.key` drops what is beyond
+LARGEST_SEED = 2**32 - 1  # `jax.random.key` keeps the low 32 bits only
 MOST_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
 
 
@@ -37,7 +38,8 @@ def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:
     except ValueError as error:
         raise ValueError(f"{name} must be a rectangular array of integers: {error}") from None
     if not jnp.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{name} must hold integers, got {described(array)}: {value!r}")
+        found = f"{described(array)}: {reprlib.repr(value)}"
+        raise ValueError(f"{name} must hold integers, got {found}")
     return array
 
 

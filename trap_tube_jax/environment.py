@@ -68,7 +68,7 @@ class Environment(ByValue):
 
     `reset` and `step` are pure and unbatched: jit, vmap and scan them. An environment holds no
     episode; everything that changes is in the `State`. Environments with equal transfers, base
-    state and step limit are equal.
+    state and step limit are equal. To shard a batch, use a mesh of `Auto` axes or `jax.shard_map`.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Environment(ByValue):
     ):
         """Checks the arguments, and tries every transfer of your own once.
 
-        A trial jits the transfer and applies it to the state that the ones before it return.
+        Each trial runs the transfer under jit, on the output of those before it.
 
         Args:
           transfers: functions (key, state) -> state, applied in order at every reset, each
@@ -101,9 +101,10 @@ class Environment(ByValue):
         self.base = base_state() if base is None else _check_base(base)
         self._draw = compose(*self.transfers)
         own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
-        state, key = self.base, jax.random.key(0)
-        for transfer in self.transfers[: own[-1] + 1 if own else 0]:
-            state = _try_transfer(transfer, jax.random.clone(key), state)
+        with jax.ensure_compile_time_eval():  # an environment may be made in traced code
+            state, key = self.base, jax.random.key(0)
+            for transfer in self.transfers[: own[-1] + 1 if own else 0]:
+                state = _try_transfer(transfer, jax.random.clone(key), state)
 
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """Draws a task.
@@ -117,7 +118,8 @@ class Environment(ByValue):
         Raises:
           ValueError: `key` is not one PRNG key.
         """
-        state = self._draw(key, self.base)
+        # A copy: without transfers the base would be returned, and the caller may donate it.
+        state = self._draw(key, jax.tree.map(jnp.copy, self.base))
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:
@@ -246,7 +248,7 @@ def _check_base(base: State) -> State:
 
 
 def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
-    """Returns the state that a transfer returns, if it is a valid one."""
+    """Returns the state that a transfer returns, if an episode may start from it."""
     name = transfer_name(transfer)
     try:
         drawn = jax.jit(compose(transfer))(key, state)
@@ -256,6 +258,12 @@ def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
             f"jax.jit; {type(error).__name__}: {error}"
         ) from error
     try:
-        return validate(drawn)
+        drawn = validate(drawn)
     except ValueError as error:
-        raise ValueError(f"transfer {name} returned a broken state: {error}") from error
+        raise ValueError(f"transfer {name} returned an invalid state: {error}") from error
+    if int(drawn.time) or drawn.palette.shape != state.palette.shape:
+        raise ValueError(
+            f"transfer {name} must keep time 0 and a palette of {described(state.palette)}, got "
+            f"time {int(drawn.time)} and {described(drawn.palette)}"
+        )
+    return drawn

@@ -1,8 +1,9 @@
 """The perceptual and the structural transfer at strengths from 0 to 1.
 
-A strength bounds the distance of the draws from the base task. Strength 0 changes nothing,
-strength 1 is the paper's transfer. Draws are nested: a layout, or a direction of a feature point,
-that is possible at one strength is possible at every higher one.
+A strength bounds the distance of the draws: of layouts from the base task's, of features from the
+state's own. At strength 0 these are drawn themselves; strength 1 is the paper's transfer. Draws
+are nested: a layout, or a direction of a feature point, that is possible at one strength is
+possible at every higher one.
 
 Source: graded.md; the paper, section "Structural", for interpolation on the sphere.
 """
@@ -196,7 +197,7 @@ def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
 
 
 def _check_strength(strength: Any) -> float:
-    is_number = isinstance(strength, int | float | np.integer | np.floating)
-    if isinstance(strength, bool) or not is_number or not 0 <= strength <= 1:
+    number = np.asarray(strength)
+    if number.ndim or number.dtype.kind not in "iuf" or not 0 <= number <= 1:
         raise ValueError(f"strength must be a number from 0 to 1, got {strength!r}")
-    return float(strength)
+    return float(number)

@@ -46,7 +46,7 @@ UP, DOWN, LEFT, RIGHT = range(4)
 DIRECTION_NAMES: Final = ("up", "down", "left", "right")
 DIRECTIONS: Final = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.int32)
 NUM_DIRECTIONS: Final = len(DIRECTION_NAMES)
-NO_DIRECTION: Final = -1  # as is any other number
+NO_DIRECTION: Final = -1  # any number outside 0 to 3 is no direction
 NUM_ACTIONS: Final = NUM_DIRECTIONS**2
 
 

@@ -48,22 +48,35 @@ def _raw_shape() -> tuple[int, ...]:
     return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0))).shape
 
 
-def loop_free(key: Any) -> jax.Array:
-    """Returns a key whose draws, of at most 32 bits each, are those of `key`, without loops.
+def threefry_key(key: Any) -> jax.Array:
+    """Returns one PRNG key, typed or raw, as a typed key whose draws do not depend on the batch.
 
-    A key of `rbg` or `unsafe_rbg` counts as the Threefry key in its first two words: its own draws
-    depend on the batch under `jax.vmap`, and would repeat tasks. A key of a foreign implementation
-    stays as it is. If `jax_threefry_partitionable` is off, draws are those of JAX, with loops.
+    A key of `rbg` or `unsafe_rbg` becomes the Threefry key in its first two words: under
+    `jax.vmap` its own draws depend on the batch, and would repeat tasks. Other keys stay.
 
     Raises:
       ValueError: `key` is not one PRNG key.
     """
     key = typed_key(key)
-    if str(jax.random.key_impl(key)) not in ("threefry2x32", "rbg", "unsafe_rbg"):
+    if str(jax.random.key_impl(key)) not in ("rbg", "unsafe_rbg"):
         return key
+    return jax.random.wrap_key_data(jax.random.key_data(key)[:2], impl="threefry2x32")
+
+
+def loop_free(key: Any) -> jax.Array:
+    """Returns a key whose draws, of at most 32 bits each, are those of `threefry_key(key)`.
+
+    They are computed without loops, unless `jax_threefry_partitionable` is off. A key of a foreign
+    implementation stays as it is.
+
+    Raises:
+      ValueError: `key` is not one PRNG key.
+    """
+    key = threefry_key(key)
     has_loops = not jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
-    impl = "threefry2x32" if has_loops else _LOOP_FREE
-    return jax.random.wrap_key_data(jax.random.key_data(key)[:2], impl=impl)
+    if has_loops or str(jax.random.key_impl(key)) != "threefry2x32":
+        return key
+    return jax.random.wrap_key_data(jax.random.key_data(key), impl=_LOOP_FREE)
 
 
 def fold_in(key: jax.Array, data: int) -> jax.Array:

@@ -131,8 +131,7 @@ def register(
 ) -> TaskSet:
     """Adds a task set to those that `make` knows, for this process.
 
-    A set of yours with the same id is replaced. Environments that exist already stay as they
-    are. `task_set(id)` returns the new entry, which differs from the old one.
+    Replaces a set of yours with the same id. Environments made before keep the old one.
 
     Args:
       id: name of the set, not one of the project's.

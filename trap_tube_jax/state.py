@@ -136,7 +136,7 @@ class State(ByValue, struct.PyTreeNode, eq=False):
         """
         codes = _parse_picture(rows)
         if (tool is None) != (tool_extent is None):
-            raise ValueError("tool and tool_extent are given together or not at all")
+            raise ValueError("give tool and tool_extent together, or neither")
         tool, drawn_extent = _place(codes, TOOL, tool, MAX_TOOL_LENGTH)
         return cls.create(
             board=np.where(codes < FOOD, codes, GROUND),
@@ -261,7 +261,7 @@ def check_state(state: Any) -> None:
             raise ValueError(
                 f"state.{name} must be {np.dtype(dtype).name}{_written(shape)}, got "
                 + described(field)
-                + ("; for a batch of states use jax.vmap" if is_batch else "")
+                + ("; this is a batch of states: use jax.vmap, or take one" if is_batch else "")
             )
 
 

@@ -1,7 +1,7 @@
 """The transfers: PRNG-driven maps from states to states, and their composition.
 
 A transfer is any pure function `(key, state) -> state`. The paper has three: `perceptual`
-resamples the layout, `structural` the features, and `symbolic` swaps the looks of the tool and
+resamples the layout, `structural` the features, and `symbolic` swaps the roles of the tool and
 another object.
 
 Source: paper, sections "Perceptual", "Structural" and "Symbolic"; environment.md, "Transfers".
@@ -199,7 +199,7 @@ def symbolic(key: jax.Array, state: State) -> State:
 
 
 def swap_with_tool(state: State, code: jax.Array) -> State:
-    """Swaps the looks of the tool and a given object.
+    """Swaps the roles of the tool and a given object.
 
     Args:
       state: one unbatched state.
@@ -227,10 +227,10 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
     board = jnp.where(old_tool, code, board)
     objects = np.arange(NUM_OBJECTS, dtype=np.uint8)
     partner = jnp.where(objects == TOOL, code, jnp.where(objects == code, TOOL, objects))
-    looks_of = jnp.where(swaps, partner, objects)
+    role = jnp.where(swaps, partner, objects)
     return state.replace(
         board=jnp.where(swaps, board, state.board),
-        palette=state.palette[looks_of],
+        palette=state.palette[role],
         tool=jnp.where(swaps, corner, state.tool),
         tool_extent=jnp.where(swaps, extent, state.tool_extent),
     )

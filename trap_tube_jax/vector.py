@@ -23,7 +23,7 @@ import numpy as np
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, check_own_state
+from trap_tube_jax.checks import check_integer, check_own_state, described
 from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.state import State, TimeStep
@@ -54,15 +54,14 @@ class VectorEnvironment:
     """B environments in lockstep, each starting its next episode when one ends.
 
     States, observations and everything else equal `jax.vmap` of `AutoReset(env)` for the same
-    keys and actions. Transfers of your own that draw with keys of JAX's `rbg` implementations are
-    an exception: such draws depend on the batch.
+    keys and actions.
 
     The environment is batched: jit and scan it, and do not vmap it over environments. A vmap over
     seeds works; each step then runs as many chunks as the seed with the most finished
     environments needs.
 
     Attributes:
-      env: an environment without auto-reset.
+      env: an environment without auto-reset; no subclass, whose methods a batch would not call.
       chunk_size: environments that start over at a time, at least 1. Small chunks waste less
         when few end together, and suit a CPU; large ones suit a GPU.
 
@@ -75,9 +74,13 @@ class VectorEnvironment:
     starts_over: ClassVar = True
 
     def __post_init__(self):
-        if not isinstance(self.env, Environment):
-            raise ValueError(f"env must be a trap_tube_jax.Environment, got {self.env!r}")
-        check_integer("chunk_size", self.chunk_size)
+        if type(self.env) is not Environment:
+            hint = "; jax.vmap(AutoReset(env).step) steps a subclass"
+            raise ValueError(
+                f"env must be a trap_tube_jax.Environment, got {self.env!r}"
+                + (hint if isinstance(self.env, Environment) else "")
+            )
+        object.__setattr__(self, "chunk_size", check_integer("chunk_size", self.chunk_size))
 
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Starts the first episodes, one for each of the keys [B], B >= 1.
@@ -149,13 +152,16 @@ class VectorEnvironment:
 
 
 def _check_keys(keys: Any) -> None:
-    is_typed = jnp.issubdtype(getattr(keys, "dtype", np.int32), jax.dtypes.prng_key)
-    shape = np.shape(keys)
-    if len(shape) != (1 if is_typed else 2) or shape[0] == 0:
-        raise ValueError(
-            f"expected PRNG keys [B] with B >= 1, got {type(keys).__name__} of shape {shape}; make "
-            "them with jax.random.split(jax.random.key(seed), B)"
-        )
+    found = type(keys).__name__
+    if isinstance(keys, jax.Array | np.ndarray):
+        is_typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
+        if keys.ndim == (1 if is_typed else 2) and len(keys):
+            return
+        found = described(keys)
+    raise ValueError(
+        f"expected an array of PRNG keys [B] with B >= 1, got {found}; make them with "
+        "jax.random.split(jax.random.key(seed), B)"
+    )
 
 
 def draw_static(state: State) -> jax.Array:

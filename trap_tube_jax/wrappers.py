@@ -1,6 +1,7 @@
 """Wrappers around an environment: pure, with the same `reset` and `step`.
 
-Wrappers are unbatched; `EpisodeStatistics` also wraps a `VectorEnvironment`.
+Wrappers are unbatched; `EpisodeStatistics` also wraps a `VectorEnvironment`. Specs are those of
+the wrapped `env`.
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ from flax import struct
 
 from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.checks import check_own_state
-from trap_tube_jax.prng import typed_key
+from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import TimeStep
 
 
@@ -36,7 +37,7 @@ class AutoResetState(ByValue, struct.PyTreeNode, eq=False):
 
     Attributes:
       inner: state of the wrapped environment.
-      key: typed PRNG key for the next episodes.
+      key: typed PRNG key for the next episodes; Threefry if the first one was of `rbg`.
     """
 
     inner: Any
@@ -81,13 +82,13 @@ class AutoReset:
             )
         if isinstance(self.env, EpisodeStatistics):
             raise ValueError(
-                "every episode would start with all counts at zero; allowed: "
-                "EpisodeStatistics(AutoReset(env))"
+                "AutoReset cannot wrap EpisodeStatistics, whose counts would start anew with every "
+                "episode; allowed: EpisodeStatistics(AutoReset(env))"
             )
 
     def reset(self, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
         """Starts the first episode. See `Environment.reset`."""
-        reset_key, next_key = jax.random.split(typed_key(key))
+        reset_key, next_key = jax.random.split(threefry_key(key))
         inner, timestep = self.env.reset(reset_key)
         first = auto_reset_timestep(timestep, timestep.observation, timestep.observation)
         return AutoResetState(inner, next_key), first

@@ -45,6 +45,7 @@ STATES = [
 TASK_SETS = (*tt.PAPER_TASK_SETS, *tt.CONTROL_TASK_SETS)
 PUBLIC = [*ENVIRONMENTS.values(), *TRANSFERS, *TASK_SETS, *itertools.chain(*STATES)]
 PUBLIC += [tt.base_state(), tt.make("base").observation_spec]
+PUBLIC += [tt.solve(EASY), tt.solve(tt.base_state()), tt.distances(EASY)]
 
 
 @pytest.mark.parametrize("duplicate", COPIES.values(), ids=COPIES)

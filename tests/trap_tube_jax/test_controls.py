@@ -20,7 +20,7 @@ DIRECTIONS = {(0, 1): "right", (0, -1): "left", (1, 0): "down", (-1, 0): "up"}
 def table() -> dict[str, list[tuple[str, str]]]:
     """Shortest plan and first push of every layout, by the short name of its set."""
     rows: dict[str, list[tuple[str, str]]] = {}
-    pattern = r"^\| ([a-z-]+) \| [^|]+ \| (\d+|none) \| (\w+) \|"
+    pattern = r"^\| ([a-z-]+)(?:, [a-z ]+)? \| [^|]+ \| (\d+|none) \| (\w+) \|"
     for name, length, push in re.findall(pattern, PAGE.read_text(), re.MULTILINE):
         rows.setdefault(name, []).append((length, push))
     return rows

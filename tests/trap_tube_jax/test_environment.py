@@ -144,9 +144,21 @@ def test_an_episode_ends_by_success_or_at_its_limit_and_stays_ended(state, actio
 
 
 def test_states_and_environments_may_be_made_within_a_traced_function():
-    """A layout written there is a constant."""
+    """A layout written there is a constant, and own transfers are tried there."""
     made = jax.jit(lambda: tt.Environment(base=tt.base_state()).base.replace(time=jnp.int32(7)))()
     assert made == tt.base_state().replace(time=jnp.int32(7))
+    key = jax.random.key(0)
+    state = jax.jit(lambda: tt.make("two-traps").reset(jax.random.clone(key))[0])()
+    assert state == tt.make("two-traps").reset(key)[0]
+
+
+def test_a_state_without_transfers_may_be_donated():
+    env = tt.make("base")
+    step = jax.jit(env.step, donate_argnums=0)
+    for _ in range(2):
+        state, _ = env.reset(jax.random.key(0))
+        state, _ = step(state, np.zeros(2, np.int32))
+        assert state.time == 1
 
 
 def test_own_transfers_apply_in_order_to_what_the_ones_before_return():
@@ -255,18 +267,23 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
     ({"transfers": None}, ["transfers", "(key, state) -> state", "None"]),
     ({"transfers": tt.symbolic}, ["transfers", "sequence", "symbolic"]),
     ({"transfers": ("symbolic",)}, ["(key, state) -> state", "'symbolic'"]),
-    ({"transfers": (no_state,)}, ["no_state", "broken", "State", "NoneType"]),
+    ({"transfers": (no_state,)}, ["no_state", "invalid", "State", "NoneType"]),
+    ({"transfers": (broken(time=np.int32(3)),)}, ["transfer must keep time 0", "got time 3"]),
+    (
+        {"transfers": (broken(palette=np.zeros((8, 4), np.uint8)),)},
+        ["must keep", "uint8[8, 3]", "uint8[8, 4]"],
+    ),
     ({"transfers": (one_argument,)}, ["one_argument", "a function (key, state) -> state"]),
     ({"transfers": (branching,)}, ["branching", "runs under jax.jit", "TracerBool"]),
     (
         {"transfers": (broken(agent=jnp.array((0, 0))), broken(food=jnp.array((0, 0))))},
-        ["broken", "share cell (0, 0)"],
+        ["invalid", "share cell (0, 0)"],
     ),
     (
         {"transfers": (broken(agent=jnp.zeros(2, jnp.float32)),)},
-        ["broken", "state.agent", "int32[2]", "float32[2]"],
+        ["invalid", "state.agent", "int32[2]", "float32[2]"],
     ),
-    ({"transfers": (broken(tool=jnp.array((12, 0))),)}, ["broken", "tool", "(12, 0)", "0 to 11"]),
+    ({"transfers": (broken(tool=jnp.array((12, 0))),)}, ["invalid", "tool", "(12, 0)", "0 to 11"]),
 ]
 
 

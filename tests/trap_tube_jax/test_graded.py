@@ -204,3 +204,9 @@ def test_the_same_alone_in_a_batch_and_in_an_environment(transfer):
 @pytest.mark.parametrize("strength", [-0.1, 1.01, float("nan"), "1", True, None])
 def test_other_strengths_are_refused(factory, strength):
     assert_refused(["strength", "from 0 to 1", repr(strength)], factory, strength)
+
+
+def test_a_strength_may_be_a_scalar_of_any_kind():
+    half = tt.graded_perceptual(0.5)
+    scalars: list[Any] = [np.float32(0.5), jnp.array(0.5)]
+    assert [tt.graded_perceptual(x) for x in scalars] == [half, half]

@@ -53,8 +53,10 @@ def test_draws_of_another_order_than_jaxs_own_are_left_to_jax():
 @pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
 def test_tasks_of_rbg_keys_do_not_depend_on_the_batch(impl):
     keys = jax.random.split(jax.random.key(5, impl=impl), 4)
-    reset = tt.make("pstsy").reset
-    assert_same(rows(jax.vmap(reset)(keys), 3), reset(keys[3]))
+    for env in (tt.make("pstsy"), tt.AutoReset(tt.make("pstsy"))):
+        batch = jax.vmap(env.reset)(keys)
+        for index, key in enumerate(keys):
+            assert_same(rows(batch, index), env.reset(key))
 
 
 @pytest.mark.parametrize("transfer", [tt.perceptual, tt.structural, tt.symbolic])

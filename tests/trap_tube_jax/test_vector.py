@@ -1,5 +1,7 @@
 """The fast path against its plain reference, `jax.vmap` of an `AutoReset`."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,7 +58,7 @@ def run_plain(env):
 NEAR = tt.State.from_ascii(["AF.........T", *["." * 12] * 11])
 ENVIRONMENTS = [
     (tt.make("pstsy", max_steps=MAX_STEPS), 3, "threefry2x32"),
-    (tt.Environment((tt.structural,), base=NEAR, max_steps=MAX_STEPS), 64, "rbg"),
+    (tt.Environment((tt.structural,), base=NEAR, max_steps=MAX_STEPS), 64, "unsafe_rbg"),
     (tt.make("base", num_features=1, max_steps=MAX_STEPS), 1, "threefry2x32"),
 ]
 
@@ -88,11 +90,15 @@ def test_refuses_what_it_cannot_batch():
         assert_refused(words, tt.VectorEnvironment, env, chunk_size=size)
     for other in (tt.AutoReset(env), None):
         assert_refused(["must be a trap_tube_jax.Environment"], tt.VectorEnvironment, other)
+    words = ["jax.vmap(AutoReset(env).step) steps a subclass"]
+    assert_refused(words, tt.VectorEnvironment, type("Own", (tt.Environment,), {})())
+    size: Any = np.int64(8)
+    assert type(tt.VectorEnvironment(env, chunk_size=size).chunk_size) is int
 
 
 def test_refuses_one_key_and_what_is_not_its_state():
     vector, keys = tt.VectorEnvironment(tt.make("base")), jax.random.split(jax.random.key(0), 3)
-    for key in (keys[0], jax.random.PRNGKey(0), 0, None, "keys", keys[:0]):
+    for key in (keys[0], jax.random.PRNGKey(0), 0, None, "keys", keys[:0], list(keys)):
         assert_refused(["PRNG keys [B]", "jax.random.split"], vector.reset, key)
     state, timestep = jax.eval_shape(vector.reset, keys)
     actions = np.zeros((3, 2), np.int32)

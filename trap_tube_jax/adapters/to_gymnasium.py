@@ -55,7 +55,7 @@ def _compile(env: AutoReset | VectorEnvironment) -> _Programs:
 
 
 class _Compiled:
-    """Mixin that runs the programs of `_pure`, and leaves them out of copies and pickles."""
+    """Mixin that runs the programs of `_pure`, and leaves them out of deep copies and pickles."""
 
     _pure: AutoReset | VectorEnvironment
 

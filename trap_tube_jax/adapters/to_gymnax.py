@@ -77,6 +77,8 @@ class _TrapTube(environment.Environment):
                 f"num_features={num_features} does not apply to an Environment of your own; "
                 "give it the base state you mean"
             )
+        elif type(task_set) is not Environment:
+            raise ValueError(f"task_set must be no subclass of Environment, got {task_set!r}")
         else:
             self._name = repr(task_set)
         self._default_max_steps = task_set.max_steps

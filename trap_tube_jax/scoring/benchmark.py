@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import check_integer, check_seed
+from trap_tube_jax.checks import check_integer, check_seed, described, integer_array
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
@@ -80,7 +80,7 @@ def score(
     optimality: int = 0,
     num_features: int | None = None,
 ) -> Scores:
-    """Plays the fixed tasks of every set once, compiled, and counts the solved ones.
+    """Plays the fixed tasks of every set once, and counts the solved ones. Each call compiles.
 
     Args:
       policy: an object with the functions of `Policy`, such as `agents.load` returns.
@@ -140,9 +140,9 @@ def score_gymnasium(
     Args:
       agent: an object with `predict(observation)` or `act(observation)`, which takes
         u8[12, 12, N] and returns (grasp, move) or 4 * grasp + move. A function that takes
-        `state` gets None at first and returns the action and the next state, as in
-        Stable-Baselines3. A function that takes `deterministic` gets True. An agent's `reset()`,
-        if it has one, is called before every episode.
+        `state` besides the observation gets None at first and returns the action and the next
+        state, as in Stable-Baselines3. A function that takes `deterministic` gets True. An agent's
+        `reset()`, if it has one, is called before every episode.
       sets: as for `score`.
       tasks: as for `score`.
       optimality: as for `score`.
@@ -218,7 +218,8 @@ def _play(
 
     def step(now: _Episodes) -> _Episodes:
         step_key = jax.random.fold_in(key, now.time)
-        action, carry = _pair(policy.act(now.observation, now.carry, step_key))
+        batch = len(now.observation)
+        action, carry = _pair(policy.act(now.observation, now.carry, step_key), batch)
         states, timestep = jax.vmap(env.step)(now.states, action)
         in_range = jnp.all((action >= 0) & (action < NUM_DIRECTIONS), axis=-1)
         return _Episodes(
@@ -247,21 +248,28 @@ def _has_nan(tree: Any) -> jax.Array:
     return jnp.any(jnp.array([jnp.any(jnp.isnan(leaf)) for leaf in leaves], bool))
 
 
-def _pair(returned: Any) -> tuple[jax.Array, Any]:
-    """Returns the result of a policy's act if it is a pair."""
+def _pair(returned: Any, batch: int) -> tuple[jax.Array, Any]:
+    """Returns the result of a policy's act if it is a pair of actions and carry."""
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         raise ValueError(
             "the policy's act must return a pair (actions i32[B, 2], carry), with carry = () for a "
             f"policy without memory, got {type(returned).__name__}"
         )
-    return returned[0], returned[1]
+    action, carry = returned
+    action = integer_array("the policy's action", action)
+    if action.shape != (batch, 2):
+        raise ValueError(
+            f"the policy's act must return actions integer{[batch, 2]}, (grasp, move) each, got "
+            f"{described(action)}; action_from_index converts 4 * grasp + move"
+        )
+    return jnp.asarray(action), carry
 
 
 def _play_one(
     agent: Any, act: Callable[..., Any], step: Callable[..., Any], state: State
 ) -> tuple[bool, int]:
     """Plays one task; returns solved and the number of steps."""
-    known = inspect.signature(act).parameters
+    known = list(inspect.signature(act).parameters)[1:]  # without the observation
     options: dict[str, Any] = {"deterministic": True} if "deterministic" in known else {}
     if callable(getattr(agent, "reset", None)):
         agent.reset()

@@ -4,6 +4,7 @@ Source: protocol.md, "What is reported".
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -144,9 +145,13 @@ class Scores:
             raise ValueError(f"no score of {name!r}; allowed: {', '.join(by_name)}")
         return by_name[name]
 
+    def __iter__(self) -> Iterator[str]:
+        """Iterates over the short names of the sets."""
+        return (score.set for score in self.sets)
+
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; `sets` is a list of records."""
-        return {**dataclasses.asdict(self), "sets": list(map(dataclasses.asdict, self.sets))}
+        """Returns plain values for JSON; `sets` is a sequence of records."""
+        return dataclasses.asdict(self)
 
     def __str__(self) -> str:
         heads = ["set", "tasks", "solved", "%", "95 % interval", "layouts", "steps"]

@@ -47,8 +47,8 @@ def evaluation_tasks(
       name: the set's id or short name.
       num_tasks: 1 to 1,000,000.
       num_features: N, feature channels; see `make`.
-      purpose: `test` for tasks that are reported, `validation` for tasks that stop training and
-        select parameters.
+      purpose: `test` for tasks that are reported, `validation` for early stopping and model
+        selection.
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.

@@ -6,6 +6,7 @@ Source: environment.md, "One step".
 import numpy as np
 from flax import struct
 
+from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver.search import checked, levels
@@ -14,7 +15,7 @@ from trap_tube_jax.state import State
 UNKNOWN = -1
 
 
-class Distances(struct.PyTreeNode):
+class Distances(ByValue, struct.PyTreeNode, eq=False):
     """Shortest distances in one task, in steps. NumPy arrays.
 
     The indices of both are row and column of the food, of the tool's top-left cell and of the

@@ -15,6 +15,7 @@ from flax import struct
 from jax.core import Tracer
 
 from trap_tube_jax import dynamics
+from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.environment import action_from_index
 from trap_tube_jax.geometry import cell_of
 from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
@@ -25,8 +26,8 @@ from trap_tube_jax.state import State, take, validate
 CHUNK_SIZES = (256, 1024, 4096)
 
 
-class Plan(struct.PyTreeNode):
-    """A shortest plan, or the result that there is none. NumPy arrays.
+class Plan(ByValue, struct.PyTreeNode, eq=False):
+    """A shortest plan, or proof that none exists. NumPy arrays.
 
     Ties go to the first plan in the order of action indices (4 * grasp + move), compared step by
     step.

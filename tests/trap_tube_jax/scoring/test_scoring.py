@@ -66,8 +66,8 @@ class Single:
     def reset(self):
         self.resets += 1
 
-    def act(self, observation):
-        self.seen.append(observation)
+    def act(self, state):
+        self.seen.append(state)
         return self.action
 
 
@@ -195,6 +195,8 @@ def test_scores_are_records(scores):
     assert re.search(rf" {scores['near'].solved} \| +{scores['near'].percent:.1f} \|", lines[2])
     assert " 0 of 1 |" in lines[3]
     assert lines[-1] == f"Protocol {PROTOCOL}, trap-tube-jax {tt.__version__}."
+    assert list(scores) == ["near", "base"]
+    assert "near" in scores
     with pytest.raises(ValueError, match="no score of 'p'; allowed: near, base"):
         scores["p"]
 
@@ -322,4 +324,7 @@ def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     with pytest.raises(ValueError, match="act returned a carry with NaN on near"):
         tt.score(Broken(), ["near"], 20)
     floats = Constant(np.array([0, 3], np.float32))
-    assert_refused(["must hold integers", "float32[2]"], tt.score, floats, ["near"], 20)
+    assert_refused(["must hold integers", "float32[20, 2]"], tt.score, floats, ["near"], 20)
+    flat: Any = Random()
+    flat.act = lambda observation, carry, key: (jnp.zeros(len(observation), jnp.int32), carry)
+    assert_refused(["integer[20, 2]", "int32[20]"], tt.score, flat, ["near"], 20)
