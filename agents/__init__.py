@@ -17,7 +17,6 @@ __all__ = ["Config", "Learner", "Policy", "TrainState", "load", "make_train", "r
 def load(
     source: str | Path,
     *,
-    seed: int | None = None,
     iteration: int | None = None,
     greedy: bool = True,
     imports: tuple[str, ...] = (),
@@ -31,8 +30,8 @@ def load(
     Reading runs no code that the source names; only `imports` are imported.
 
     Args:
-      source: a run's folder, a file of parameters, or the name of a shipped agent.
-      seed: seed of a run; its first if None.
+      source: a run's folder, a file of parameters, or the name of a shipped agent. Of a run that
+        was evaluated as it went, `best.safetensors` is the policy with the best evaluation.
       iteration: checkpoint of a run; the newest if None.
       greedy: take the most probable actions; False samples them.
       imports: modules to import first, which register curiosities, encoders or task sets.
@@ -42,18 +41,14 @@ def load(
     """
     from agents.runs import loading  # noqa: PLC0415  training needs no files
 
-    found = {each.name: each for each in loading.load_policies(source, iteration, imports)}
-    name = next(iter(found)) if seed is None else f"seed {seed}"
-    if name not in found:
-        raise ValueError(f"{source} has no seed {seed}; it holds {', '.join(found)}")
-    return found[name]._replace(greedy=greedy)
+    return loading.load_policy(source, iteration, imports)._replace(greedy=greedy)
 
 
 def save(path: str | Path, policy: Policy) -> None:
     """Saves a policy to one safetensors file, which `load` reads."""
-    from agents.acting import policy_files  # noqa: PLC0415  training needs no files
+    from agents.runs import loading  # noqa: PLC0415  training needs no files
 
-    policy_files.save_policy(Path(path), policy)
+    loading.save_policy(Path(path), policy)
 
 
 def results(paths: str | Path | Iterable[str | Path]) -> "pd.DataFrame":

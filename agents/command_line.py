@@ -50,9 +50,10 @@ def parse_all(
       SystemExit: the command line is invalid, or asks for help.
       ValueError: a value is not allowed.
     """
+    positional = [f.name for each in declared for f in dataclasses.fields(each) if _is_required(f)]
     parser = argparse.ArgumentParser(
         prog=prog,
-        usage=f"{prog} [options]",
+        usage=" ".join([prog, *map(str.upper, positional), "[options]"]),
         description=(inspect.getdoc(declared[0]) or "").partition("\n\nAttributes:")[0],
         formatter_class=functools.partial(
             argparse.RawDescriptionHelpFormatter, max_help_position=32
@@ -81,9 +82,14 @@ def _class(declared: Any) -> type:
     return declared if isinstance(declared, type) else type(declared)
 
 
+def _is_required(field: dataclasses.Field) -> bool:
+    return field.default is dataclasses.MISSING
+
+
 def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: Any) -> None:
-    if field.default is dataclasses.MISSING:
-        group.add_argument(field.name, help=text, **_values(kind))
+    if _is_required(field):
+        options = {**_values(kind), "metavar": field.name.upper()}
+        group.add_argument(field.name, help=text, **options)
         return
     options = _values(kind)
     if field.metadata.get("append"):

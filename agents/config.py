@@ -9,10 +9,12 @@ import math
 from functools import partial
 from typing import Any, Literal, Self, get_args, get_origin
 
+import numpy as np
+
 from agents import registry
 from trap_tube_jax.registry import task_set
 
-LARGEST = 2**31 - 1  # of an i32, in which training counts
+LARGEST = 2**31 - 1  # the largest i32, in which training counts
 GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
 
@@ -110,7 +112,7 @@ class Config:
     learning_rate: float = _ppo(1e-3, 0)
     lr_decay_fraction: float = _ppo(0.0, 0, 1)
     adam_epsilon: float = _ppo(1e-7, 1e-12)
-    max_gradient_norm: float = _ppo(1.0, 0)
+    max_gradient_norm: float = _ppo(1.0, 1e-12)
 
     curiosity: str = _curiosity("icm")
     intrinsic_coef: float = _curiosity(0.1, 0)
@@ -134,9 +136,9 @@ class Config:
     def __post_init__(self) -> None:
         """Raises ValueError for a setting that is not allowed, with its value and what is."""
         for field in dataclasses.fields(self):
-            if isinstance(getattr(self, field.name), list):  # as JSON has it
-                object.__setattr__(self, field.name, tuple(getattr(self, field.name)))
-            _check_value(field, getattr(self, field.name))
+            value = _plain(getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
+            _check_value(field, value)
         registry.curiosities.factory(self.curiosity)
         registry.encoders.factory(self.encoder)
         if self.value_heads == "separate" and self.bootstrap != "value":
@@ -145,18 +147,13 @@ class Config:
             )
         if self.intrinsic_coef_init and not 0 < self.intrinsic_coef <= self.intrinsic_coef_init:
             raise ValueError(
-                f"intrinsic_coef_init must be 0, or at least intrinsic_coef, which must then be "
-                f"above 0; got {self.intrinsic_coef_init} and intrinsic_coef={self.intrinsic_coef}"
+                f"intrinsic_coef_init must be 0, or at least intrinsic_coef > 0; got "
+                f"{self.intrinsic_coef_init} and intrinsic_coef={self.intrinsic_coef}"
             )
         if self.num_new < 1:
             raise ValueError(
                 f"replay_fractions must leave at least one of {self.episodes_per_iteration} "
                 f"episodes to new tasks, got {self.replay_fractions}"
-            )
-        if self.max_transitions is not None and self.max_transitions < self.longest_iteration:
-            raise ValueError(
-                f"max_transitions must allow an iteration, which takes up to "
-                f"{self.longest_iteration:,} steps, or be None; got {self.max_transitions:,}"
             )
         episodes = self.episodes_per_iteration
         if episodes % self.minibatch_size:
@@ -275,20 +272,36 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
+def _plain(value: Any) -> Any:
+    """Returns NumPy scalars as Python's, and lists, as JSON has them, as tuples."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
+
+
 def _check_value(field: dataclasses.Field, value: Any) -> None:
-    """Raises ValueError for a choice or a number that the field does not allow."""
-    if get_origin(field.type) is Literal and value not in get_args(field.type):
-        choices = ", ".join(get_args(field.type))
+    """Raises ValueError for a value that the field's type or limits do not allow."""
+    kind, limits = field.type, field.metadata["limits"]
+    if get_origin(kind) is Literal and value not in get_args(kind):
+        choices = ", ".join(get_args(kind))
         raise ValueError(f"{field.name} must be one of {choices}, got {value!r}")
-    if field.metadata["limits"] is None or (value is None and field.default is None):
+    if kind in (bool, str) and type(value) is not kind:
+        wanted = "True or False" if kind is bool else "a name"
+        raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
+    if limits is None or (value is None and field.default is None):
         return
-    low, high = field.metadata["limits"]
-    types, kind = (int, float), "a finite number"
-    if "int" in str(field.type):
-        types, kind = (int,), "an integer"
-    numbers: tuple[Any, ...] = value if isinstance(value, tuple) else (value,)
+    low, high = limits
+    types, wanted = (int, float), f"a finite number from {low:g}"
+    if "int" in str(kind):
+        types, wanted = (int,), f"an integer from {low:,}"
+    wanted += f" to {high:,}" if high < LARGEST else ""
+    is_tuple = get_origin(kind) is tuple
+    length = 2 if field.name == "filters" else None
+    if is_tuple:
+        wanted = f"{length or 'a tuple of'} numbers, each {wanted}"
+    numbers: tuple[Any, ...] = value if isinstance(value, tuple) and is_tuple else (value,)
+    if isinstance(value, tuple) != is_tuple or len(numbers) != (length or len(numbers)):
+        raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
     for number in numbers:  # bool is no number
         if type(number) not in types or not math.isfinite(number) or not low <= number <= high:
-            raise ValueError(f"{field.name} must be {kind} in [{low:g}, {high:g}], got {value!r}")
-    if field.name == "filters" and len(numbers) != 2:
-        raise ValueError(f"filters must be two integers, got {value!r}")
+            raise ValueError(f"{field.name} must be {wanted}, got {value!r}")

@@ -10,7 +10,7 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.command_line import option, parse
 from agents.runs import compilation
-from agents.runs.loading import load_policies
+from agents.runs.loading import load_policy
 from agents.runs.metrics import evaluation_rows
 from agents.runs.report import save_first_solved
 from trap_tube_jax._version import __version__
@@ -22,14 +22,14 @@ from trap_tube_jax.solver import solve_batch
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Evaluates trained agents greedily, on fixed tasks drawn with keys that training never draws.
+    """Evaluates a trained agent greedily, on fixed tasks drawn with keys that training never draws.
 
     Attributes:
       source: a run's folder, a file of parameters, or the name of a shipped agent.
-      sets: ids or short names of task sets; the paper's eight and the training set if absent.
+      sets: ids or short names of task sets, by default the paper's eight and the training set.
       imports: modules to import first, which register curiosities, encoders or task sets.
-      tasks: tasks per set; the run's `eval_episodes` if absent. Base has one.
-      iteration: checkpoint of a run; the newest if absent.
+      tasks: tasks per set, by default the run's `eval_episodes`. Base has one.
+      iteration: checkpoint of a run, by default the newest.
       optimality: compares with shortest plans, which are searched for first.
       output: CSV file for the results.
       gif: GIF file for the first solved episode.
@@ -60,33 +60,28 @@ def evaluate(options: Options) -> None:
       ValueError: an option is not allowed, or there is nothing to evaluate.
       OSError: a file cannot be written.
     """
-    policies = load_policies(options.source, options.iteration, options.imports)
-    config = policies[0].config
+    policy = load_policy(options.source, options.iteration, options.imports)
+    config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks
     evaluator = Evaluator.of_sets(config, options.sets or own_and_paper_sets(config), tasks)
     shortest = None
     if options.optimality:
         shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
-    played = [evaluator(policy.params) for policy in policies]
-    scores = [evaluator.scores(outcome, shortest) for outcome in played]
+    played = evaluator(policy.params)
+    scores = evaluator.scores(played, shortest)
     notes = []
     if options.output is not None:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        rows = [
-            {"policy": policy.name, **row}
-            for policy, own in zip(policies, scores, strict=True)
-            for row in evaluation_rows(own, policy, 0, "test")
-        ]
-        pd.DataFrame(rows).to_csv(options.output, index=False)
+        rows = pd.DataFrame(evaluation_rows(scores, policy, "test"))
+        rows.to_csv(options.output, index=False)
         notes.append(f"results: {options.output}")
     if options.gif is not None:
         options.gif.parent.mkdir(parents=True, exist_ok=True)
         prefer = tt.task_set(config.env_id).short
         shown = save_first_solved(options.gif, evaluator, played, prefer)
         notes.append(f"solved episode of {shown}: {options.gif}" if shown else "nothing is solved")
-    for policy, own in zip(policies, scores, strict=True):
-        print(f"{policy.name}, iteration {policy.iteration}\n")
-        print(Scores(PROTOCOL, __version__, None, tuple(own)), end="\n\n")
+    print(f"{policy.name}, iteration {policy.iteration}\n")
+    print(Scores(PROTOCOL, __version__, None, tuple(scores)), end="\n\n")
     print(*notes, sep="\n")
 
 

@@ -13,7 +13,7 @@ from agents.profiles import figures
 from agents.profiles.measure import failure_table, profile, success_table
 from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation
-from agents.runs.loading import load_policies
+from agents.runs.loading import load_policy
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import plain_errors
 
@@ -27,7 +27,7 @@ class Options:
     controls.png.
 
     Attributes:
-      runs: runs' folders (all seeds), files of parameters, or names of shipped agents.
+      runs: runs' folders, files of parameters, or names of shipped agents.
       output: folder for the files.
       parts: some of structural, perceptual and both (success by strength), symbolic (by swapped
         object), kind and plan-length (of the tasks of {P}) and control.
@@ -44,20 +44,14 @@ class Options:
     imports: tuple[str, ...] = option((), append=True, flags=("--import",))
 
     def policies(self) -> dict[str, Policy]:
-        """Loads the policies, by source and, where a source has several, by seed.
+        """Loads the policies by their sources.
 
         Raises:
           ValueError: no source is given, or one cannot be read.
         """
         if not self.runs:
             raise ValueError("give one or more runs' folders, files or names of shipped agents")
-        found = {}
-        for source in self.runs:
-            policies = load_policies(source, imports=self.imports)
-            for policy in policies:
-                suffix = f", {policy.name}" if len(policies) > 1 else ""
-                found[f"{Path(source)}{suffix}"] = policy
-        return found
+        return {str(Path(each)): load_policy(each, imports=self.imports) for each in self.runs}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -15,12 +15,11 @@ from agents.experiments import report
 from agents.experiments.grids import Grid
 from agents.experiments.workers import ProcessPerCall, log_of, make_executor, train_logged
 from agents.runs.display import say
-from agents.runs.folder import Run, RunFolder
-from agents.runs.session import RunOptions
+from agents.runs.folder import Run, RunFolder, RunOptions
 from agents.runs.stopping import Stopped, exit_code, stop_signals
 from trap_tube_jax.command_line import plain_errors
 
-LINES = 5  # of a failed run's log that are shown
+LINES = 5  # shown of a failed run's log
 
 
 def main(
@@ -57,7 +56,8 @@ def main(
         except (Stopped, KeyboardInterrupt) as stopped:
             say(console, "Stopped. The same command continues.")
             raise SystemExit(exit_code(stopped)) from None
-    raise SystemExit(1 if failed else 0)
+    if failed:
+        raise SystemExit(1)
 
 
 def launch(

@@ -13,8 +13,8 @@ from agents.config import Config
 from agents.parallel import processes
 from agents.parallel.devices import become_devices
 from agents.runs import compilation, display
-from agents.runs.folder import Run, RunFolder, check_name
-from agents.runs.session import RunOptions, train_run
+from agents.runs.folder import Run, RunFolder, RunOptions, check_name
+from agents.runs.session import train_run
 from agents.runs.stopping import Stopped, exit_code
 from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
@@ -34,12 +34,11 @@ class Options:
 
     Attributes:
       preset: named settings to start from: fast, best or paper.
-      seed: the first seed.
-      seeds: number of seeds to train side by side.
-      name: the run's folder within --out; <preset>-<task set>-<seed> if absent.
+      seed: seed of all draws. agents.sweep trains several.
+      name: the run's folder within --out, by default <preset>-<task set>-<seed>.
       out: the folder of all runs.
-      resume: folder of a run to continue; its settings become the defaults, and only
-        --iterations, --max-transitions and --stop-when-solved may change.
+      resume: folder of a run to continue with its options. Of its settings only --iterations,
+        --max-transitions and --stop-when-solved may change.
       imports: module to import first. It may register curiosities, encoders and task sets.
       distributed: trains with the other processes of a job of Slurm, Open MPI, Kubernetes or a
         Cloud TPU, or else of HOST:PORT PROCESSES NUMBER.
@@ -47,7 +46,6 @@ class Options:
 
     preset: str = option("fast", "run")
     seed: int = option(0, "run")
-    seeds: int = option(1, "run")
     name: str | None = option(None, "run")
     out: Path = option(Path("runs"), "run")
     resume: Path | None = option(None, "run")
@@ -70,15 +68,15 @@ def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     # The preset, or the stored run, decides the defaults of all other options.
     (first,) = parse_all([Options], arguments, PROGRAM, partly=True)
     import_modules(first.imports)
-    defaults, config = Options(), Config.preset(first.preset)
+    defaults, config, how = Options(), Config.preset(first.preset), RunOptions()
     if first.resume is not None:
-        stored = RunFolder(first.resume).read(first.imports)
-        defaults = Options(preset=stored.preset, seed=stored.seed, seeds=stored.seeds)
-        config = stored.config
-    options, config, how = parse_all([defaults, config, RunOptions], arguments, PROGRAM)
-    config = dataclasses.replace(config, env_id=tt.task_set(config.env_id).id)
-    run = Run(config, options.preset, options.seed, options.seeds, imports=options.imports)
-    return options, run, how
+        if first.name is not None:
+            raise ValueError("--resume continues the run in its folder; leave out --name")
+        folder = RunFolder(first.resume)
+        stored, how = folder.read(first.imports), folder.read_options()
+        defaults, config = Options(seed=stored.seed), stored.config
+    options, config, how = parse_all([defaults, config, how], arguments, PROGRAM)
+    return options, Run(config, options.seed, imports=options.imports), how
 
 
 def train(options: Options, run: Run, how: RunOptions) -> None:
@@ -96,7 +94,7 @@ def train(options: Options, run: Run, how: RunOptions) -> None:
     processes.join(options.distributed)
     console = Console(quiet=jax.process_index() > 0)
     compilation.enable_cache()
-    again = f"Continue with: {display.resume_command(folder)}"
+    again = f"Continue with: {display.resume_command(folder, run)}"
     try:
         scores = train_run(folder.path, run, how, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
@@ -106,8 +104,8 @@ def train(options: Options, run: Run, how: RunOptions) -> None:
         raise
     except OSError as error:
         raise OSError(f"{error}. Saved checkpoints are kept. {again}") from error
-    tables = [str(Scores(PROTOCOL, __version__, None, tuple(each))) for each in scores.values()]
-    for line in (*tables, *display.summary(folder, run, scores)):
+    table = [str(Scores(PROTOCOL, __version__, None, tuple(scores)))] if scores else []
+    for line in (*table, *display.summary(folder, run, scores)):
         display.say(console, line)
 
 
@@ -115,9 +113,8 @@ def run_path(options: Options, run: Run) -> Path:
     """Returns the run's folder; ValueError if its name is a path."""
     if options.resume is not None:
         return options.resume
-    last = f"to{run.seed_range[-1]}" if run.seeds > 1 else ""
     short = tt.task_set(run.config.env_id).short
-    name = options.name or f"{options.preset}-{short}-{run.seed}{last}"
+    name = options.name or f"{options.preset}-{short}-{run.seed}"
     check_name(name)
     return options.out / name
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import trap_tube_jax as tt
 from agents.acting.episodes import along_episodes
@@ -38,23 +38,36 @@ def make_learner(axis=ONE_DEVICE):
     return make_train(CONFIG, tt.Environment(base=base, max_steps=6), axis)
 
 
-def train(devices, seeds, iterations):
-    """Returns the final states [S, ...] where they are, all metrics [S], and the placement."""
-    placement = Placement.of(devices, CONFIG, seeds)
+def train(devices, iterations):
+    """Returns the final state where it is, all metrics, and the placement."""
+    placement = Placement.of(devices, CONFIG)
     learner = make_learner(placement.axis)
-    states = jax.jit(jax.vmap(learner.init))(jax.vmap(jax.random.key)(np.arange(seeds)))
-    states, rows = placement.put(states), []
-    iterate = jax.jit(placement.shard(jax.vmap(learner.iterate)), donate_argnums=0)
+    state, rows = placement.put(learner.init(jax.random.key(0))), []
+    iterate = jax.jit(placement.shard(learner.iterate), donate_argnums=0)
     for _ in range(iterations):
-        states, metrics = iterate(states)
+        state, metrics = iterate(state)
         rows.append(to_arrays(placement.local(metrics)))
-    return states, rows, placement
+    return state, rows, placement
 
 
-def unequal_copies(states):
-    """Names the arrays of which two devices that share a seed hold different numbers."""
+def train_seeds(devices):
+    """Trains two seeds for an iteration, spread over devices by JAX alone; returns arrays [2, ...].
+
+    This is the program of agents/parallel/README.md.
+    """
+    learner = make_learner()
+    mesh = jax.make_mesh((devices,), ("seeds",), (AxisType.Auto,), devices=jax.devices()[:devices])
+    keys = jax.random.split(jax.random.key(0), 2)
+    keys = jax.device_put(keys, NamedSharding(mesh, PartitionSpec("seeds")))
+    states = jax.jit(jax.vmap(learner.init))(keys)
+    states, _ = jax.jit(jax.vmap(learner.iterate), donate_argnums=0)(states)
+    return to_arrays(states), len(states.iteration.devices())
+
+
+def unequal_copies(state):
+    """Names the arrays of which the two devices hold different numbers."""
     shards = [
-        to_arrays(jax.tree.map(lambda x, i=i: key_data(x).addressable_shards[i].data, states))
+        to_arrays(jax.tree.map(lambda x, i=i: key_data(x).addressable_shards[i].data, state))
         for i in range(2)
     ]
     return [name for name, x in shards[0].items() if not np.array_equal(x, shards[1][name])]
@@ -72,7 +85,7 @@ def gradient_gap():
         reward, _ = learner.intrinsic_reward(state, trajectory)
         return learner.make_batch(state, trajectory, reward)[0]
 
-    placement, batch = Placement.of(2, CONFIG, 1), make_batch(state)
+    placement, batch = Placement.of(2, CONFIG), make_batch(state)
     assert placement.mesh is not None
 
     def gradient(params, batch):
@@ -100,26 +113,27 @@ def gradient_gap():
 
 def main():
     become_devices(2)
-    shared, rows, placement = train(2, 1, 3)
+    shared, rows, placement = train(2, 3)
     state = to_arrays(placement.local(shared))
-    two_seeds = to_arrays(train(2, 2, 1)[0])
-    alone, rows_alone, _ = train(1, 2, 1)
+    alone, rows_alone, _ = train(1, 1)
     expected = to_arrays(alone)
-    steps = sum(row["episode_length"][0] for row in rows) * CONFIG.episodes_per_iteration
+    (spread, seed_devices), (together, _) = train_seeds(2), train_seeds(1)
+    steps = sum(row["episode_length"] for row in rows) * CONFIG.episodes_per_iteration
     report = {
         "unequal_copies": unequal_copies(shared),
-        "is_finite": [float(row["is_finite"][0]) for row in rows],
-        "iteration": int(state["iteration"][0]),
-        "transitions": int(state["transitions"][0]),
+        "is_finite": [float(row["is_finite"]) for row in rows],
+        "iteration": int(state["iteration"]),
+        "transitions": int(state["transitions"]),
         "steps_played": round(float(steps)),
         "gradient_gap": gradient_gap(),
+        "seed_devices": seed_devices,
         "seeds_gap": max(
-            float(np.max(np.abs(np.float64(two_seeds[name]) - x))) for name, x in expected.items()
+            float(np.max(np.abs(np.float64(spread[name]) - x))) for name, x in together.items()
         ),
         "different_shapes": [
             name
             for name, x in expected.items()
-            if (state[name].dtype, state[name].shape[1:]) != (x.dtype, x.shape[1:])
+            if (state[name].dtype, state[name].shape) != (x.dtype, x.shape)
         ],
         "different_metrics": sorted(set(rows[0]) ^ set(rows_alone[0])),
     }

@@ -17,7 +17,7 @@ from trap_tube_jax.observation import observe
 from trap_tube_jax.positions import position_id
 from trap_tube_jax.state import State
 
-CACHE_BITS = 20  # of an observation's hash, in the table of `Cache`
+CACHE_BITS = 20  # hash bits; `Cache` has a slot for each value
 
 
 def encode_episodes(

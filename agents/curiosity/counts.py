@@ -14,7 +14,7 @@ from agents.networks.grouping import hash_rows, slots
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.positions import position_id
 
-VISIT_BITS = 20  # of an observation's hash, in the table of visits
+VISIT_BITS = 20  # hash bits; the table of visits has a slot for each value
 
 
 class Counts(Curiosity):
@@ -32,7 +32,7 @@ class Counts(Curiosity):
         if any(transfer is not tt.symbolic for transfer in env.transfers):
             names = [getattr(transfer, "__name__", str(transfer)) for transfer in env.transfers]
             raise ValueError(
-                "curiosity 'counts' needs tasks that return: base or Sy, no transfers or "
+                "curiosity 'counts' needs tasks that recur: base or Sy, no transfers or "
                 f"symbolic alone, got {', '.join(names)}"
             )
 

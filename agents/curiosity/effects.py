@@ -24,8 +24,8 @@ LOWEST_RATE = 1e-4  # effects per step; effects of a lower rate do not pay more
 class Effects(Curiosity):
     """reward_t = sum over kinds k of new_k(o_0, a_0, ..., a_t, o_{t+1}) / rate_k.
 
-    `new_effects` computes `new` from one episode's observations and actions, for three kinds:
-    changes of the food, changes of anything else but the agent's body, and grasps. Each kind pays
+    `new_effects` computes `new` for three kinds: the food enters a cell that is new to it in the
+    episode, the tool enters one, and the agent grasps at a new colour. Each kind pays
     the inverse of its rate, a moving average of its effects per step. So all kinds pay the same in
     total, a rare effect pays more, and a kind pays less as the agent learns it. The decay of this
     average is `reward_ema_decay`.

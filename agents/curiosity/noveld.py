@@ -12,7 +12,7 @@ from agents.curiosity.base import Experience, Params
 from agents.curiosity.rnd import RND
 from agents.curiosity.visits import first_visits
 
-ALPHA = 0.5  # of the paper
+ALPHA = 0.5  # as in the paper
 
 
 class NovelD(RND):

@@ -127,7 +127,8 @@ class PlainPPO:
     """Training as pure functions; an iteration is `collect`, then an `update` per minibatch."""
 
     def __init__(self, config: Config, env: Any = None, encoder: nn.Module | None = None):
-        self.config, self.env = config, env or tt.make(config.env_id, max_steps=config.max_steps)
+        sizes = {"num_features": config.num_features, "max_steps": config.max_steps}
+        self.config, self.env = config, env or tt.make(config.env_id, **sizes)
         encoder = encoder or Encoder(config.filters)
         self.network: Any = Network(encoder, config.hidden, config.embedding)
         self.apply = jax.vmap(self.network.apply, (None, 0))  # to episodes [B, ...]

@@ -12,8 +12,7 @@ import trap_tube_jax as tt
 from agents.command_line import option
 from agents.config import Config
 from agents.ppo.learner import make_train
-from agents.runs.folder import Run, RunFolder, check_name
-from agents.runs.session import RunOptions
+from agents.runs.folder import Run, RunFolder, RunOptions, check_name
 from trap_tube_jax.imports import import_modules
 
 COMMA = re.compile(r",(?![^\[]*\])")  # but not those of a list
@@ -31,13 +30,13 @@ class Options:
       settings: settings of all runs as NAME=VALUE, or of a grid as NAME=VALUE,VALUE.
       imports: modules to import first, which register curiosities, encoders or task sets.
       preset: named settings to start from.
-      env: task set to train on, by id or short name; the preset's if absent.
-      only: names of the points to train; all if absent.
+      env: task set to train on, by id or short name, by default the preset's.
+      only: names of the points to train, by default all.
       seeds: number of seeds.
       seed: the first seed.
-      name: the grid's folder within --out; named after the grid, preset and task set if absent.
+      name: the grid's folder within --out, by default named after grid, preset and task set.
       out: the folder of all grids.
-      processes: runs at a time; one per core if absent, or one at all with a GPU or TPU.
+      processes: runs at a time, by default one per core, or one on a GPU or TPU.
       cluster: address of a Dask scheduler whose workers train the runs, as in tcp://HOST:8786.
     """
 
@@ -87,7 +86,7 @@ class Grid:
         root, runs = options.out / (options.name or name), {}
         for seed in range(options.seed, options.seed + options.seeds):
             for point, config in configs.items():
-                run = Run(config, options.preset, seed, algorithm=point, imports=options.imports)
+                run = Run(config, seed, point, options.imports)
                 path = root / f"{point}-seed{seed}"
                 check_name(path.name)
                 if RunFolder(path).config.is_file():
@@ -113,9 +112,9 @@ class Grid:
         configs = {}
         for name, *labels in itertools.product(self.points, *given.values()):
             chosen = {k: given[k][each] for k, each in zip(given, labels, strict=True)}
-            config = Config.preset(options.preset, **{**common, **chosen, **self.points[name]})
             point = ",".join(filter(None, [name, *labels])) or options.preset
-            configs[point] = dataclasses.replace(config, env_id=tt.task_set(config.env_id).id)
+            settings = {**common, **chosen, **self.points[name]}
+            configs[point] = Config.preset(options.preset, **settings)
         for name in options.only:
             if name not in configs:
                 raise ValueError(f"no point {name!r}; allowed: {', '.join(configs)}")
@@ -136,8 +135,9 @@ def _parse(text: str) -> tuple[str, dict[str, Any]]:
 
 
 def _value(text: str) -> Any:
+    python = {"True": True, "False": False, "None": None}
     try:
-        return json.loads(text)
+        return python[text] if text in python else json.loads(text)
     except ValueError:
         return text
 

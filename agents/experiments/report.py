@@ -27,9 +27,11 @@ def collect(root: Path, command: str) -> None:
     """Writes results.csv, curves.csv and grid.json from the runs in a folder.
 
     Raises:
-      ValueError: there is no run, or one cannot be read.
+      ValueError: no run has finished an iteration, or one cannot be read.
     """
     results, curves, folders = agents.results(root), metrics(root), find_runs(root)
+    if curves.empty:
+        raise ValueError(f"no run in {root} has finished an iteration")
     results["run"] = results["run"].map(lambda path: Path(path).name)
     results.to_csv(root / "results.csv", index=False)
     curves[CURVES].to_csv(root / "curves.csv", index=False)

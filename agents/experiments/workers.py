@@ -16,9 +16,9 @@ from rich.console import Console
 
 from agents.parallel.devices import become_devices
 from agents.runs.compilation import enable_cache
-from agents.runs.folder import Run
+from agents.runs.folder import Run, RunOptions
 from agents.runs.provenance import cores
-from agents.runs.session import RunOptions, train_run
+from agents.runs.session import train_run
 from agents.runs.stopping import Stopped
 from trap_tube_jax.imports import import_modules
 

@@ -15,7 +15,7 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
 
-PARTS = ("encoder", "core", "heads")  # of the parameters of the policy network
+PARTS = ("encoder", "core", "heads")  # the policy network's parameters
 
 
 class Agent:
@@ -29,10 +29,15 @@ class Agent:
         self.heads: Any = Heads(config.num_value_heads)
 
     def init(self, key: jax.Array) -> Params:
-        """Draws the parameters."""
+        """Draws the parameters; raises ValueError for an encoder whose features are no rows."""
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         # Only layers of Flax, in an encoder of your own, use the folded key; see `draw`.
         features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
+        if features.ndim != 2:
+            raise ValueError(
+                f"encoder {self.config.encoder!r} must map observations [M, 12, 12, N] to features "
+                f"[M, F], got {list(features.shape)} for M = 1"
+            )
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
         params = {
@@ -47,7 +52,7 @@ class Agent:
         return self.encoder.apply(params["encoder"], observation)
 
     def encode_rows(self, params: Params, observation: jax.Array, remembered: Any = None) -> Any:
-        """Does the same by the fast path; see `windows.encode_rows`."""
+        """Encodes observations by the fast path; see `windows.encode_rows`."""
         return encode_rows(self.encoder, params["encoder"], observation, remembered)
 
     def initial_state(self, params: Params, batch: int) -> jax.Array:

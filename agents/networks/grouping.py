@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-GROUPING_BITS = 16  # of a hash, in the table of `group_rows`
+GROUPING_BITS = 16  # hash bits; the table of `group_rows` has a slot for each value
 
 
 class Groups(NamedTuple):

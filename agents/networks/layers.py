@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-TRUNCATED_STD = 0.87962566103423978  # of a standard normal variable truncated at -2 and 2
+TRUNCATED_STD = 0.87962566103423978  # a standard normal variable's, truncated at -2 and 2
 
 
 def variance_scaling(scale: float) -> Callable[..., np.ndarray]:

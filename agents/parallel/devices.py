@@ -1,15 +1,13 @@
-"""Several devices for one run: a mesh of seeds × episodes, as README.md describes it.
+"""Several devices for one run, which share the episodes of every iteration; see README.md.
 
-States [S, ...] are split along `seeds` and replicated along `episodes`.
-
-    learner = make_train(config, axis=placement.axis)
-    iterate = jax.jit(placement.shard(jax.vmap(learner.iterate)), donate_argnums=0)
-    states, metrics = iterate(placement.put(states))
+placement = Placement.of(2, config)
+learner = make_train(config, axis=placement.axis)
+iterate = jax.jit(placement.shard(learner.iterate), donate_argnums=0)
+state, metrics = iterate(placement.put(state))
 """
 
 import contextlib
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
@@ -22,7 +20,7 @@ from agents.config import Config
 
 Tree = TypeVar("Tree")
 
-SEEDS, EPISODES = "seeds", "episodes"  # axes of the mesh
+EPISODES = "episodes"  # the axis of the mesh
 
 
 def become_devices(devices: int | None) -> None:
@@ -34,7 +32,7 @@ def become_devices(devices: int | None) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeAxis:
-    """The `size` devices that share a seed's episodes; on one every method is the identity."""
+    """The `size` devices that share the episodes; on one every method is the identity."""
 
     size: int = 1
 
@@ -63,63 +61,58 @@ ONE_DEVICE = EpisodeAxis()
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """The devices of a run: a mesh, seeds × episodes; None for the default device alone."""
+    """The devices of a run, a mesh along `EPISODES`; None for the default device alone."""
 
     mesh: Mesh | None = None
 
     @classmethod
-    def of(cls, devices: int | None, config: Config, seeds: int) -> Self:
-        """Places seeds on a number of devices; None is one, or all of several processes.
+    def of(cls, devices: int | None, config: Config) -> Self:
+        """Chooses a number of devices; None is one, or all of several processes.
 
         Raises:
           ValueError: the devices do not exist, or do not divide the minibatches.
         """
         processes, available = jax.process_count(), jax.device_count()
         counts = range(1, available + 1) if processes == 1 else [available]
-        allowed = [n for n in counts if config.minibatch_size % (n // math.gcd(n, seeds)) == 0]
+        allowed = [n for n in counts if config.minibatch_size % n == 0]
         devices = counts[0] if devices is None else devices
         if devices not in allowed:
             raise ValueError(
                 f"{devices} of {available} {jax.default_backend()} devices in {processes} "
-                f"process(es) cannot share {seeds} seed(s) with minibatch_size="
-                f"{config.minibatch_size}; allowed: {', '.join(map(str, allowed)) or 'none'}"
+                f"process(es) cannot share minibatch_size={config.minibatch_size}; allowed: "
+                f"{', '.join(map(str, allowed)) or 'none'}"
             )
         if devices == 1:
             return cls()
-        grid = np.array(jax.devices()[:devices]).reshape(math.gcd(devices, seeds), -1)
-        return cls(Mesh(grid, (SEEDS, EPISODES)))
+        return cls(Mesh(np.array(jax.devices()[:devices]), (EPISODES,)))
 
     @property
     def axis(self) -> EpisodeAxis:
-        """The devices that share a seed."""
-        return EpisodeAxis(1 if self.mesh is None else self.mesh.shape[EPISODES])
+        """The devices that share the episodes."""
+        return EpisodeAxis(1 if self.mesh is None else self.mesh.size)
 
     def shard(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Maps a function of arrays [S, ...] to arrays [S, ...] over the devices."""
+        """Runs a function on every device; arguments and results are the same on all."""
         if self.mesh is None:
             return function
-        rows = PartitionSpec(SEEDS)
+        same = PartitionSpec()
         # Loops turn replicated carries into ones that vary, which check_vma refuses.
         return jax.shard_map(
-            function, mesh=self.mesh, in_specs=rows, out_specs=rows, check_vma=False
+            function, mesh=self.mesh, in_specs=same, out_specs=same, check_vma=False
         )
 
-    def put(self, states: Tree) -> Tree:
-        """Moves arrays [S, ...] from the default device, or NumPy, to the devices."""
+    def put(self, tree: Tree) -> Tree:
+        """Copies arrays from the default device, or NumPy, to all devices."""
         if self.mesh is None:
-            return states
-        rows = NamedSharding(self.mesh, PartitionSpec(SEEDS))
+            return tree
+        same = NamedSharding(self.mesh, PartitionSpec())
         # Unlike `device_put`, takes keys to the devices of several processes.
         place = jax.make_array_from_callback
-        return jax.tree.map(lambda x: place(x.shape, rows, lambda index: x[index]), states)
+        return jax.tree.map(lambda x: place(x.shape, same, lambda index: x[index]), tree)
 
-    def local(self, states: Tree) -> Tree:
-        """Copies arrays [S, ...] to one device of this process; all processes must call it."""
-        if self.mesh is None:
-            return states
-        # `device_put` does not take keys of several processes.
-        replicate = jax.jit(_same, out_shardings=NamedSharding(self.mesh, PartitionSpec()))
-        return jax.tree.map(lambda x: x.addressable_data(0), replicate(states))
+    def local(self, tree: Tree) -> Tree:
+        """Returns one device's copy of arrays that are on all."""
+        return tree if self.mesh is None else jax.tree.map(lambda x: x.addressable_data(0), tree)
 
     def __str__(self) -> str:
         """Names the devices, as in "4 gpu devices of 2 process(es)"."""
@@ -127,7 +120,3 @@ class Placement:
         if self.mesh is None:
             return platform
         return f"{self.mesh.size} {platform} devices of {jax.process_count()} process(es)"
-
-
-def _same(tree: Tree) -> Tree:
-    return tree

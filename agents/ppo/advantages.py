@@ -31,7 +31,7 @@ INTRINSIC_RETURN_STD = 0.3
 # Added to the variance of advantages, so that those of a nearly constant reward stay small.
 VARIANCE_FLOOR = 4e-4
 
-RewardMoments = tuple[returns.Moments, returns.Moments]  # of extrinsic and intrinsic reward
+RewardMoments = tuple[returns.Moments, returns.Moments]  # extrinsic, intrinsic
 
 
 def intrinsic_coef_schedule(config: Config) -> optax.Schedule:

@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import Episodes, take
 from agents.acting.rollout import Trajectory, rollout
-from agents.config import Config
+from agents.config import LARGEST, Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
 from agents.networks.layers import init_module
@@ -33,8 +32,6 @@ from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.registry import make
 
 Metrics = dict[str, jax.Array]
-
-LARGEST_COUNT = np.iinfo(np.int32).max  # of `TrainState.transitions`
 
 
 class TrainState(NamedTuple):
@@ -259,7 +256,8 @@ class Learner:
           L f32[] and metrics: its terms as weighted in L, and the mean entropy of a step.
 
         Raises:
-          ValueError: a loss of the curiosity has the name of another term, or not `..._loss`.
+          ValueError: a loss of the curiosity has the name of another term, not `..._loss`, or
+            another shape.
         """
         config, mask = self.config, batch.episodes.mask
         experience = self.experience(params, batch.episodes)
@@ -286,6 +284,11 @@ class Learner:
                 raise ValueError(
                     f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
                     f"differ from {', '.join(terms)}; got {name!r}"
+                )
+            if term.shape != mask.shape:
+                raise ValueError(
+                    f"curiosity {config.curiosity!r}: {name} must be a number per step, "
+                    f"{_shapes(mask)}, got {_shapes(term)}"
                 )
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         total = sum(terms.values(), jnp.zeros((), jnp.float32))
@@ -366,18 +369,24 @@ def make_train(
                 f"the environment's {name} is {getattr(env, name)}, the config's "
                 f"{getattr(config, name)}; they must agree"
             )
-    steps = config.iterations * config.episodes_per_iteration * env.max_steps
-    if min(steps, config.max_transitions or steps) > LARGEST_COUNT:
+    longest = config.episodes_per_iteration * env.max_steps
+    if config.max_transitions is not None and config.max_transitions < longest:
+        raise ValueError(
+            f"max_transitions must allow an iteration, which takes up to {longest:,} steps, or be "
+            f"None; got {config.max_transitions:,}"
+        )
+    steps = config.iterations * longest
+    if min(steps, config.max_transitions or steps) > LARGEST:
         raise ValueError(
             f"iterations={config.iterations} of {config.episodes_per_iteration} episodes of "
-            f"{env.max_steps} steps are {steps:,} steps; allowed: at most {LARGEST_COUNT:,}"
+            f"{env.max_steps} steps are {steps:,} steps; allowed: at most {LARGEST:,}"
         )
     curiosity = curiosities.factory(config.curiosity)(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))
     if axis.size > 1 and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in memory):
         raise ValueError(
-            f"curiosity {config.curiosity!r} needs one device: several average its memory, which "
-            "must then be floats"
+            f"curiosity {config.curiosity!r} cannot train on several devices: they average its "
+            "memory, so its arrays must be floats"
         )
     return Learner(config, env, Agent(config), curiosity, make_optimizer(config), axis)
 

@@ -67,33 +67,26 @@ def normalize(x: jax.Array, mask: jax.Array, epsilon: float = 1e-8) -> jax.Array
 
 
 class Moments(NamedTuple):
-    """Exponential moving averages of batch moments.
+    """Exponential moving average of the variance of batches.
 
     Attributes:
-      mean: f32[].
       variance: f32[].
       batches: i32[], batches seen; the first one replaces the zeros.
     """
 
-    mean: jax.Array
     variance: jax.Array
     batches: jax.Array
 
     @staticmethod
     def zero() -> "Moments":
         """Returns the moments before the first batch."""
-        zero = jnp.zeros((), jnp.float32)
-        return Moments(zero, zero, jnp.zeros((), jnp.int32))
+        return Moments(jnp.zeros((), jnp.float32), jnp.zeros((), jnp.int32))
 
     def update(self, x: jax.Array, mask: jax.Array, decay: float) -> "Moments":
-        """Moves by 1 - `decay` towards the moments of a batch f32[...] under its mask."""
-        mean, variance = masked_moments(x, mask)
+        """Moves by 1 - `decay` towards the variance of a batch f32[...] under its mask."""
+        _, variance = masked_moments(x, mask)
         keep = jnp.where(self.batches == 0, jnp.float32(0), jnp.float32(decay))
-        return Moments(
-            mean=keep * self.mean + (1 - keep) * mean,
-            variance=keep * self.variance + (1 - keep) * variance,
-            batches=self.batches + 1,
-        )
+        return Moments(keep * self.variance + (1 - keep) * variance, self.batches + 1)
 
     @property
     def std(self) -> jax.Array:

@@ -19,7 +19,7 @@ PANELS = {  # part, and the label of its x axis
     "both": "strength of both transfers",
     "plan-length": "shortest plan of the task in {P}, steps",
 }
-COLUMNS = 7  # of the sheet of controls
+COLUMNS = 7  # in the sheet of controls
 
 
 def save_success(profile: pd.DataFrame, path: Path) -> None:

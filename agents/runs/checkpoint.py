@@ -22,7 +22,7 @@ def save(folder: Path, iteration: int, state: Any, record: dict[str, Any], *, ke
       OSError: the file cannot be written.
     """
     folder.mkdir(exist_ok=True)
-    for draft in folder.glob(".*"):  # of a killed process
+    for draft in folder.glob(".*"):  # left by a killed process
         draft.unlink()
     path, arrays = _file(folder, iteration), to_arrays(state)
     if not path.exists():
@@ -71,7 +71,7 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
     raise ValueError(f"checkpoint {path} is damaged ({problem}); delete it to {advice}")
 
 
-def digest(arrays: Arrays, record: Any = None) -> str:
+def digest(arrays: Arrays, record: Any) -> str:
     """Returns the SHA-256 of a record and of names, dtypes, shapes and values."""
     total = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):

@@ -2,7 +2,7 @@
 
 import shlex
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -31,15 +31,13 @@ class ProgressLine(Progress):
         )
         self.add_task("", total=iterations)
 
-    def show(self, rows: Sequence[Row]) -> None:
-        """Shows an iteration, given its rows of metrics; numbers are means over seeds."""
-        mean = {name: statistics.fmean(row[name] for row in rows) for name in rows[0]}
+    def show(self, row: Row) -> None:
+        """Shows an iteration, given its row of metrics."""
         text = (
-            f"{mean['episodes']:,.0f} episodes, {mean['success']:.1%} solved, "
-            f"{mean['evaluation']:.1%} greedily, "
-            f"{len(rows) * mean['transitions_per_second']:,.0f} steps/s"
+            f"{row['episodes']:,} episodes, {row['success']:.1%} solved, "
+            f"{row['evaluation']:.1%} greedily, {row['transitions_per_second']:,.0f} steps/s"
         )
-        done = int(mean["iteration"])
+        done = row["iteration"]
         if self.console.is_terminal:
             self.update(self.task_ids[0], completed=done, description=text, refresh=True)
         else:
@@ -51,30 +49,31 @@ def say(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
-def summary(folder: RunFolder, run: Run, scores: Mapping[int, Sequence[Score]]) -> list[str]:
+def summary(folder: RunFolder, run: Run, scores: Sequence[Score]) -> list[str]:
     """Returns the facts that a run ends with, one a line; scores as `train_run` returns them."""
     own, config, lines = tt.task_set(run.config.env_id), run.config, []
-    rows = read_rows(folder.metrics)
-    solving = rows[rows["evaluation"] >= (config.stop_when_solved or 1.0)]
-    episodes = solving.groupby("seed")["episodes"].min()
-    if len(episodes):
-        count = f" by {len(episodes)} of {run.seeds} seeds" if run.seeds > 1 else ""
-        lines.append(f"First solved {own.label} after {episodes.mean():,.0f} episodes{count}.")
-    each = [score for seed in scores.values() for score in seed]
+    threshold = config.stop_when_solved or 1.0
+    solving = read_rows(folder.metrics).query("evaluation >= @threshold")["episodes"]
+    if len(solving):
+        share = "" if threshold == 1 else f"{threshold:.0%} of "
+        lines.append(f"First solved {share}{own.label} after {solving.min():,} episodes.")
     parts = {
-        own.label: [score.percent for score in each if score.set == own.short],
-        "other sets": [score.percent for score in each if score.set != own.short],
+        own.label: [score.percent for score in scores if score.set == own.short],
+        "other sets": [score.percent for score in scores if score.set != own.short],
     }
     means = [f"{statistics.fmean(own):.1f} % of {name}" for name, own in parts.items() if own]
     lines += [f"Solves {', '.join(means)}."] if means else []
     lines.append(f"Report with curves and episodes to step through: {folder.page}")
-    if config.stop_when_solved and len(episodes) == run.seeds:
+    has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init
+    if config.stop_when_solved and len(solving):
         lines.append("Next, learn all transfers: python -m agents.train --preset best")
-    elif not config.lr_decay_fraction and not config.intrinsic_coef_init:
-        lines.append(f"Train longer: {resume_command(folder)} --iterations {2 * config.iterations}")
+    elif not has_schedule and config.max_transitions is None:
+        again = resume_command(folder, run)
+        lines.append(f"Train longer: {again} --iterations {2 * config.iterations}")
     return lines
 
 
-def resume_command(folder: RunFolder) -> str:
+def resume_command(folder: RunFolder, run: Run) -> str:
     """Returns the command that continues a run."""
-    return f"python -m agents.train --resume {shlex.quote(str(folder.path))}"
+    imports = [word for name in run.imports for word in ("--import", name)]
+    return shlex.join(["python", "-m", "agents.train", "--resume", str(folder.path), *imports])

@@ -1,4 +1,4 @@
-"""The folder of one run: its files, its settings in `config.json`, and the lock of its writer."""
+"""The folder of one run: its files, its settings and options in `config.json`, and its lock."""
 
 import contextlib
 import dataclasses
@@ -11,10 +11,13 @@ from typing import Any, Self
 
 import filelock
 
-from agents.config import PRESETS, Config
+from agents.command_line import option
+from agents.config import Config
 from agents.files import read_json, write_json
 from trap_tube_jax._version import __version__
+from trap_tube_jax.checks import MOST_TASKS, check_integer
 from trap_tube_jax.imports import import_modules
+from trap_tube_jax.registry import task_set
 
 CONFIG_FILE = "config.json"
 MAX_SEED = 2**31 - 1
@@ -28,38 +31,24 @@ class Run:
 
     Attributes:
       config: the settings.
-      preset: the preset that the settings started from.
-      seed: the first seed.
-      seeds: number of seeds trained side by side, from `seed` on.
+      seed: seed of all draws.
       algorithm: name in tables; `ppo+<curiosity>` if empty.
       imports: modules that registered names of the settings. They are recorded, and imported
         again only at the caller's request.
     """
 
     config: Config
-    preset: str = "paper"
     seed: int = 0
-    seeds: int = 1
     algorithm: str = ""
     imports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Names the algorithm; ValueError names the allowed values of preset and seeds."""
-        if self.preset not in PRESETS:
-            raise ValueError(f"unknown preset {self.preset!r}; allowed: {', '.join(PRESETS)}")
-        for name, low, high in (("seed", 0, MAX_SEED), ("seeds", 1, 65_536)):
-            value = getattr(self, name)
-            if type(value) is not int or not low <= value <= high:
-                raise ValueError(f"{name} must be an integer in [{low}, {high}], got {value!r}")
+        """Names the algorithm; raises ValueError for a seed that is not allowed."""
+        check_integer("seed", self.seed, 0, MAX_SEED)
         if not self.algorithm:
             curiosity = self.config.curiosity
             name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"
             object.__setattr__(self, "algorithm", name)
-
-    @property
-    def seed_range(self) -> range:
-        """All seeds."""
-        return range(self.seed, self.seed + self.seeds)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, for JSON."""
@@ -76,7 +65,10 @@ class Run:
 
     def check_continues(self, before: "Run") -> None:
         """Raises ValueError unless resuming `before` trains as this run alone would have."""
-        old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
+        old, new = (
+            {**run.to_dict(), **run.config.to_dict(), "env_id": task_set(run.config.env_id).id}
+            for run in (before, self)
+        )
         scheduled = old["lr_decay_fraction"] > 0 or old["intrinsic_coef_init"] > 0
         free = {*EXTENDABLE, "config", "imports"} - ({"iterations"} if scheduled else set())
         for name, value in old.items():
@@ -88,15 +80,54 @@ class Run:
                 )
 
 
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """Options of carrying out a run; none changes what it learns on one device.
+
+    Attributes:
+      checkpoint_every: iterations between checkpoints.
+      keep: number of newest checkpoints to keep.
+      evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation
+        selects the parameters that the run reports.
+      sets: sets to evaluate on, by default the paper's eight and the training set.
+      reported: test tasks per set in the final evaluation, by default `eval_episodes`.
+      report: writes curves, page and GIF at the end.
+      tensorboard: logs metrics for TensorBoard.
+      wandb: logs metrics to Weights & Biases; offline with WANDB_MODE=offline.
+      devices: devices that share the run, by default one, or all if distributed (`Placement.of`).
+    """
+
+    checkpoint_every: int = option(10, "run")
+    keep: int = option(3, "run")
+    evaluate_every: int = option(0, "run")
+    sets: tuple[str, ...] | None = option(None, "run")
+    reported: int | None = option(None, "run")
+    report: bool = option(True, "run")
+    tensorboard: bool = option(False, "run")
+    wandb: bool = option(False, "run")
+    devices: int | None = option(None, "devices and hosts")
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a number that is too small or an unknown set."""
+        check_integer("checkpoint_every", self.checkpoint_every)
+        check_integer("keep", self.keep)
+        check_integer("evaluate_every", self.evaluate_every, minimum=0)
+        if self.reported is not None:
+            check_integer("reported", self.reported, maximum=MOST_TASKS)
+        for name in self.sets or ():
+            task_set(name)
+
+
 class RunFolder:
     """The files of a run.
 
     Attributes:
       path: the folder.
-      config: settings, JSON.
+      config: settings and options, JSON.
       provenance: machines, versions and commits that trained it, JSON.
-      metrics: a row per seed and iteration, CSV.
-      evaluations: a row per seed, evaluated iteration and task set, CSV.
+      metrics: a row per iteration, CSV.
+      evaluations: a row per evaluated iteration and task set, CSV.
+      best: the parameters with the best evaluation so far, if the run is evaluated as it goes.
       checkpoints: a file per checkpoint, named by its iteration.
       curves: learning curves, PNG.
       page: the report, HTML.
@@ -109,14 +140,11 @@ class RunFolder:
         self.provenance = path / "provenance.json"
         self.metrics = path / "metrics.csv"
         self.evaluations = path / "evaluations.csv"
+        self.best = path / "best.safetensors"
         self.checkpoints = path / "checkpoints"
         self.curves = path / "curves.png"
         self.page = path / "report.html"
         self.animation = path / "solved.gif"
-
-    def best(self, seed: int) -> Path:
-        """Returns the file of a seed's parameters with the best evaluation so far."""
-        return self.path / f"best-seed{seed}.safetensors"
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -139,7 +167,7 @@ class RunFolder:
             lock.release()
 
     @contextlib.contextmanager
-    def opened_for(self, run: Run) -> Iterator[None]:
+    def opened_for(self, run: Run, options: RunOptions) -> Iterator[None]:
         """Locks the folder for training a new run or continuing the stored one.
 
         A new folder in which nothing was saved is removed at the end. Raises the errors of `lock`,
@@ -151,7 +179,7 @@ class RunFolder:
                 yield
                 return
             self.check_free()
-            self.note(run)
+            self.note(run, options)
             try:
                 yield
             finally:
@@ -165,13 +193,22 @@ class RunFolder:
                 f"{self.path} holds a run; continue it with --resume {self.path}, or give "
                 "another --name"
             )
-        hidden = self.path.is_dir() and all(p.name.startswith(".") for p in self.path.iterdir())
-        if self.path.exists() and not hidden:
-            raise ValueError(f"{self.path} is taken, and holds no run; give another --name")
+        own = {".lock", ".writer"}
+        if self.path.exists() and {entry.name for entry in self.path.iterdir()} - own:
+            raise ValueError(f"{self.path} exists, but holds no run; give another --name")
 
-    def note(self, run: Run) -> None:
-        """Writes the settings of a run and the version of this package."""
-        write_json(self.config, {"version": __version__, **run.to_dict()})
+    def note(self, run: Run, options: RunOptions | None = None) -> None:
+        """Writes a run, its options and the version of this package."""
+        values = {**run.to_dict(), "options": dataclasses.asdict(options or RunOptions())}
+        write_json(self.config, {"version": __version__, **values})
+
+    def read_options(self) -> RunOptions:
+        """Returns the stored options; ValueError names one that is unknown or not allowed."""
+        stored = read_json(self.config)["options"]
+        try:
+            return RunOptions(**{**stored, "sets": stored["sets"] and tuple(stored["sets"])})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{self.config} holds unknown options: {error}") from error
 
     def read(self, imports: tuple[str, ...] = ()) -> Run:
         """Returns the stored run.
@@ -188,6 +225,7 @@ class RunFolder:
         values = read_json(self.config)
         if not isinstance(values, dict):
             raise ValueError(f"{self.config} must be a table of settings")
+        values.pop("options", None)
         version, needs = values.pop("version", "unknown"), values.get("imports") or ()
         try:
             return Run.from_dict(values)

@@ -1,26 +1,24 @@
-"""Trained policies from a run, a file or the shipped agents."""
+"""Trained policies: files of parameters, runs' folders and the shipped agents."""
 
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
 from agents import pretrained
-from agents.acting import policy_files
 from agents.acting.policy import Policy
-from agents.arrays import SUFFIX, from_arrays
-from agents.networks.agent import PARTS, Agent
+from agents.arrays import SUFFIX, Arrays, from_arrays, read_arrays, to_arrays, write_arrays
+from agents.config import Config
+from agents.networks.agent import PARTS, Agent, Params
 from agents.runs import checkpoint
-from agents.runs.folder import CONFIG_FILE, Run, RunFolder, runs_next_to
+from agents.runs.folder import CONFIG_FILE, RunFolder, runs_next_to
 from trap_tube_jax.imports import import_modules
-from trap_tube_jax.state import take
 
 
-def load_policies(
+def load_policy(
     source: str | Path, iteration: int | None = None, imports: tuple[str, ...] = ()
-) -> list[Policy]:
-    """Loads all greedy policies of a source: one per seed of a run, else one.
+) -> Policy:
+    """Loads a greedy policy.
 
     Args:
       source: a run's folder, a file of parameters, or the name of a shipped agent.
@@ -39,7 +37,7 @@ def load_policies(
         import_modules(imports)
         if iteration is not None:
             raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
-        return [policy_files.load_policy(path)]
+        return read_policy(path)
     if not is_run:
         raise ValueError(
             f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
@@ -47,22 +45,41 @@ def load_policies(
         )
     folder = RunFolder(path)
     run = folder.read(imports)
-    arrays, _ = checkpoint.load(folder.checkpoints, iteration)
-    keys = jax.random.split(jax.random.key(0), run.seeds)
-    expected = {"params": jax.eval_shape(jax.vmap(Agent(run.config).init), keys)}
-    wanted = tuple(f"params/{part}/" for part in PARTS)
-    stored = {name: array for name, array in arrays.items() if name.startswith(wanted)}
+    arrays, record = checkpoint.load(folder.checkpoints, iteration)
+    prefixes = tuple(f"params/{part}/" for part in PARTS)
+    stored = {name: array for name, array in arrays.items() if name.startswith(prefixes)}
     try:
-        params = from_arrays(stored, expected)["params"]
+        params = _params(run.config, {k.removeprefix("params/"): v for k, v in stored.items()})
     except ValueError as error:
         raise ValueError(f"{folder.checkpoints} does not fit this version: {error}") from error
-    return list(policies(run, params, arrays["iteration"]).values())
+    return Policy(f"seed {run.seed}", run.config, params, record["iteration"])
 
 
-def policies(run: Run, params: Any, iterations: np.ndarray) -> dict[int, Policy]:
-    """Returns policies by seed, given parameters [S, ...] that were trained i32[S] iterations."""
-    params = {part: params[part] for part in PARTS}
-    return {
-        seed: Policy(f"seed {seed}", run.config, take(params, index), int(iterations[index]))
-        for index, seed in enumerate(run.seed_range)
-    }
+def save_policy(path: Path, policy: Policy) -> None:
+    """Writes the parameters and settings of a policy, atomically; its name is not stored."""
+    params = {part: policy.params[part] for part in PARTS}
+    about = {"config": policy.config.to_dict(), "iteration": policy.iteration}
+    write_arrays(path, to_arrays(params), about)
+
+
+def read_policy(path: Path) -> Policy:
+    """Reads a policy that `save_policy` wrote; the file's name without its suffix names it.
+
+    Raises:
+      ValueError: the file is damaged, of another kind, or its settings are unknown.
+      OSError: the file cannot be opened.
+    """
+    arrays, about = read_arrays(path)
+    try:
+        config, iteration = Config.from_dict(about["config"]), int(about["iteration"])
+        params = _params(config, arrays)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} does not hold a policy of this version: {error}") from error
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{path} holds parameters that are not finite: {name}")
+    return Policy(path.name.removesuffix(SUFFIX), config, params, iteration)
+
+
+def _params(config: Config, arrays: Arrays) -> Params:
+    return from_arrays(arrays, jax.eval_shape(Agent(config).init, jax.random.key(0)))

@@ -1,7 +1,7 @@
 """Metrics to TensorBoard and to Weights & Biases, by their own libraries."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,10 @@ from trap_tube_jax.imports import needs_extra
 @contextlib.contextmanager
 def open_loggers(
     folder: Path, run: Run, *, tensorboard: bool, wandb: bool
-) -> Iterator[Callable[[Sequence[Row]], None]]:
-    """Opens the loggers asked for, in a run's folder; yields a function that logs rows.
+) -> Iterator[Callable[[Row], None]]:
+    """Opens the loggers asked for, in a run's folder; yields a function that logs a row.
 
-    Names are those of `metrics.csv`; a run of several seeds puts `seed<n>/` in front. A missing
-    library raises an ImportError that names its extra.
+    Names are those of `metrics.csv`. A missing library raises an ImportError that names its extra.
     """
     with contextlib.ExitStack() as stack:
         logs: list[Callable[[dict[str, float], int], Any]] = []
@@ -39,14 +38,9 @@ def open_loggers(
             )
             logs.append(logged.log)
 
-        def log(rows: Sequence[Row]) -> None:
-            values = {
-                f"seed{row['seed']}/{name}" if run.seeds > 1 else name: value
-                for row in rows
-                for name, value in row.items()
-                if name not in ("seed", "iteration")
-            }
+        def log(row: Row) -> None:
+            values = {name: value for name, value in row.items() if name != "iteration"}
             for each in logs:
-                each(values, rows[0]["iteration"])
+                each(values, row["iteration"])
 
         yield log

@@ -38,7 +38,7 @@ def read_rows(path: Path) -> Frame:
     """Reads a CSV file of a run; one without rows if it is missing or empty."""
     lines = _whole_lines(path)
     if not lines:
-        return pd.DataFrame(columns=["seed", "iteration", "purpose", "evaluation", "episodes"])
+        return pd.DataFrame(columns=["iteration", "purpose", "evaluation", "episodes"])
     return pd.read_csv(io.StringIO("".join(lines)))
 
 
@@ -65,9 +65,7 @@ def _whole_lines(path: Path) -> list[str]:
     return text[: text.rfind("\n") + 1].splitlines(keepends=True)
 
 
-def evaluation_rows(
-    scores: Sequence[Score], policy: Policy, seed: int, purpose: Purpose
-) -> list[Row]:
+def evaluation_rows(scores: Sequence[Score], policy: Policy, purpose: Purpose) -> list[Row]:
     """Returns a row of `evaluations.csv` for each score of a policy.
 
     `solved` counts tasks. Where a set has few layouts, `layouts` of `layouts_total` are solved in
@@ -75,7 +73,6 @@ def evaluation_rows(
     """
     return [
         {
-            "seed": seed,
             "iteration": policy.iteration,
             "purpose": purpose,
             "task_set": score.set,
@@ -90,7 +87,7 @@ def evaluation_rows(
 
 
 def is_last(row: Row, config: Config) -> bool:
-    """Returns whether a seed trains no more after the iteration of this row."""
+    """Returns whether training ends with the iteration of this row."""
     if row["iteration"] >= config.iterations:
         return True
     if 0 < config.stop_when_solved <= row["evaluation"]:

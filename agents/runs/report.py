@@ -10,7 +10,7 @@ import io
 import json
 import math
 import string
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,19 +48,18 @@ PANELS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 Played = Mapping[str, Evaluation]
 
 
-def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Mapping[int, Played]) -> None:
-    """Writes curves, GIF and page of a run, given each seed's outcomes of an evaluator."""
+def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played) -> None:
+    """Writes curves, GIF and page of a run, given its policy's outcomes of an evaluator."""
     save_curves(read_rows(folder.metrics), folder.curves, folder.path.name)
     folder.animation.unlink(missing_ok=True)
     own = tt.task_set(run.config.env_id).short
-    save_first_solved(folder.animation, evaluator, played.values(), own)
-    episodes = json.dumps(_episodes(evaluator, played[run.seed]))
-    settings = {"preset": run.preset, "seeds": run.seeds, **run.config.to_dict()}
+    save_first_solved(folder.animation, evaluator, played, own)
+    episodes = json.dumps(_episodes(evaluator, played))
+    settings = {"seed": run.seed, **run.config.to_dict()}
     values = [(name, str(value)) for name, value in settings.items()]
-    scores = [_scores(f"seed {seed}", evaluator.scores(each)) for seed, each in played.items()]
     page = string.Template(PAGE.read_text(encoding="utf-8")).substitute(
         title=html.escape(folder.path.name),
-        scores="\n".join(scores),
+        scores=_scores(evaluator.scores(played)),
         curves=base64.b64encode(folder.curves.read_bytes()).decode(),
         settings=_table(pd.DataFrame(values, columns=["setting", "value"])),
         episodes=episodes.replace("</", "<\\/"),
@@ -69,7 +68,7 @@ def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Mapping[int
 
 
 def save_curves(rows: Frame, path: Path, title: str) -> None:
-    """Draws learning curves over episodes as PNG, a line per seed; gaps where not finite."""
+    """Draws learning curves over episodes as PNG; gaps where not finite."""
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
 
     rows = rows.replace([math.inf, -math.inf], math.nan)
@@ -86,38 +85,33 @@ def save_curves(rows: Frame, path: Path, title: str) -> None:
         axis.set_title(name, loc="left")
         axis.grid(alpha=0.3)
         for color, metric in zip(COLORS, metrics, strict=False):
-            values = rows.pivot_table(metric, "episodes", "seed", dropna=False)
-            marker = "." if len(values) < 20 else None
-            lines = axis.plot(values.index, values, color=color, linewidth=1.2, marker=marker)
-            lines[0].set_label(metric.replace("_", " "))
+            style = {"color": color, "linewidth": 1.2, "marker": "." if len(rows) < 20 else None}
+            axis.plot(rows["episodes"], rows[metric], label=metric.replace("_", " "), **style)
         if len(metrics) > 1:
             axis.legend(fontsize="small")
     figure.savefig(path, format="png", dpi=100)
 
 
-def save_first_solved(
-    path: Path, evaluator: Evaluator, played: Iterable[Played], prefer: str
-) -> str | None:
-    """Writes a GIF of the first solved episode of the first policy that solves one.
+def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: str) -> str | None:
+    """Writes a GIF of the first solved episode.
 
     Returns the episode's task set, `prefer` if possible; None, and no file, if none is solved.
     """
-    for outcomes in played:
-        for name in sorted(outcomes, key=lambda name: name != prefer):
-            outcome = outcomes[name]
-            if np.any(outcome.solved):
-                index = int(np.argmax(outcome.solved))
-                actions = np.asarray(outcome.action[index, : outcome.length[index]])
-                state = take(evaluator.tasks[name], index)
-                save_gif(episode_frames(state, actions, GIF_CELL_SIZE), path, fps=4)
-                return name
+    for name in sorted(played, key=lambda name: name != prefer):
+        outcome = played[name]
+        if np.any(outcome.solved):
+            index = int(np.argmax(outcome.solved))
+            actions = np.asarray(outcome.action[index, : outcome.length[index]])
+            state = take(evaluator.tasks[name], index)
+            save_gif(episode_frames(state, actions, GIF_CELL_SIZE), path, fps=4)
+            return name
     return None
 
 
-def _scores(name: str, scores: Sequence[Score]) -> str:
+def _scores(scores: Sequence[Score]) -> str:
     rows = [
         {
-            name: score.label,
+            "set": score.label,
             "tasks": score.tasks,
             "solved %": f"{score.percent:.1f}",
             "95 % interval": "{:.1f}–{:.1f}".format(*score.interval) if score.interval else "–",

@@ -21,9 +21,9 @@ def results(paths: Paths) -> pd.DataFrame:
       paths: one or several folders: of a run, or of runs at any depth.
 
     Returns:
-      A data frame with a row for each run, seed, evaluated iteration, purpose of the tasks
-      (validation or test) and task set. Columns: run, algorithm, preset, commit, the columns of
-      `evaluations.csv` (seed, iteration, purpose, task_set, tasks, solved, layouts, layouts_total,
+      A data frame with a row for each run, evaluated iteration, purpose of the tasks (validation
+      or test) and task set. Columns: run, algorithm, seed, commit, the columns of
+      `evaluations.csv` (iteration, purpose, task_set, tasks, solved, layouts, layouts_total,
       length), and every setting.
 
     Raises:
@@ -31,19 +31,18 @@ def results(paths: Paths) -> pd.DataFrame:
     """
     tables = []
     for folder in find_runs(paths):
-        values = read_json(folder.config)  # plain values: no name in it is looked up or imported
         machines = read_json(folder.provenance) if folder.provenance.exists() else []
         commit = machines[-1]["commit"] if machines else None
-        table = _table(folder, folder.evaluations, preset=values["preset"], commit=commit)
-        settings = values["config"].items()
+        table = _table(folder, folder.evaluations, commit=commit)
+        settings = read_json(folder.config)["config"].items()
         tables.append(table.assign(**{k: str(v) if type(v) is list else v for k, v in settings}))
     return _join(tables)
 
 
 def metrics(paths: Paths) -> pd.DataFrame:
-    """Returns the training metrics of all runs in folders, one row per seed and iteration.
+    """Returns the training metrics of all runs in folders, one row per run and iteration.
 
-    Columns: run, algorithm, and those of `metrics.csv`. Arguments and errors as in `results`.
+    Columns: run, algorithm, seed, and those of `metrics.csv`. Arguments and errors as in `results`.
     """
     return _join([_table(folder, folder.metrics) for folder in find_runs(paths)])
 
@@ -61,8 +60,9 @@ def find_runs(paths: Paths) -> list[RunFolder]:
 
 
 def _table(folder: RunFolder, path: Path, **about: Any) -> pd.DataFrame:
-    rows, algorithm = read_rows(path), read_json(folder.config)["algorithm"]
-    first = {"run": str(folder.path), "algorithm": algorithm, **about}
+    run = read_json(folder.config)  # plain values: no name in it is looked up or imported
+    rows, names = read_rows(path), ("algorithm", "seed")
+    first = {"run": str(folder.path), **{name: run[name] for name in names}, **about}
     return rows.assign(**first)[[*first, *rows]]
 
 

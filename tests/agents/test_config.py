@@ -5,6 +5,7 @@ import inspect
 import json
 import math
 
+import numpy as np
 import pytest
 
 import trap_tube_jax as tt
@@ -59,14 +60,19 @@ def test_every_setting_is_documented():
     ("settings", "words"),
     [
         ({"minibatch_size": 100}, ["minibatch_size must divide", "100", "1024", "512"]),
-        ({"minibatch_size": 0}, ["minibatch_size", "0", "[1, "]),
+        ({"minibatch_size": 0}, ["minibatch_size must be an integer from 1 to 1,000,000, got 0"]),
         ({"curiosity": "rdn"}, ["curiosity", "rdn", "icm-detached", "rnd", "none"]),
-        ({"discount": 1.5}, ["discount", "1.5", "[0, 1]"]),
+        ({"discount": 1.5}, ["discount", "1.5", "from 0 to 1"]),
+        ({"recurrent": "no"}, ["recurrent must be True or False", "'no'"]),
+        ({"env_id": None}, ["env_id must be a name", "None"]),
+        ({"hidden": (64, 32)}, ["hidden must be an integer from 1", "(64, 32)"]),
+        ({"replay_fractions": 0.5}, ["replay_fractions must be a tuple of numbers", "0.5"]),
+        ({"max_gradient_norm": 0.0}, ["max_gradient_norm", "from 1e-12", "0.0"]),
         ({"gae_lambda": -0.1}, ["gae_lambda", "-0.1"]),
         ({"episodes_per_iteration": 1.0}, ["episodes_per_iteration", "integer", "1.0"]),
         ({"episodes_per_iteration": True}, ["episodes_per_iteration", "integer", "True"]),
         ({"episodes_per_iteration": 10**9}, ["episodes_per_iteration", "1000000000"]),
-        ({"filters": (32,)}, ["filters must be two integers", "(32,)"]),
+        ({"filters": (32,)}, ["filters must be 2 numbers, each an integer", "(32,)"]),
         ({"filters": (0, 64)}, ["filters", "0"]),
         ({"replay_fractions": (0.6, 0.4)}, ["replay_fractions must leave", "(0.6, 0.4)"]),
         ({"adam_epsilon": 0.0}, ["adam_epsilon", "1e-12", "0.0"]),
@@ -79,9 +85,8 @@ def test_every_setting_is_documented():
             ["value_heads='separate'", "bootstrap='value'", "'baseline'"],
         ),
         ({"intrinsic_coef_init": 0.01}, ["intrinsic_coef_init", "at least intrinsic_coef", "0.01"]),
-        ({"intrinsic_coef_init": 1.0, "intrinsic_coef": 0.0}, ["above 0", "intrinsic_coef=0.0"]),
+        ({"intrinsic_coef_init": 1.0, "intrinsic_coef": 0.0}, ["> 0", "intrinsic_coef=0.0"]),
         ({"max_steps": 5.0}, ["max_steps", "integer", "5.0"]),
-        ({"max_transitions": 51_199}, ["takes up to 51,200 steps, or be None; got 51,199"]),
         ({"epsiodes_per_iteration": 3}, ["did you mean 'episodes_per_iteration'", "epochs"]),
     ],
 )
@@ -90,6 +95,19 @@ def test_refusals_name_the_value_and_what_is_allowed(settings, words):
         Config.preset("paper", **settings)
     for word in words:
         assert word in str(error.value)
+
+
+def test_numpy_scalars_are_those_of_python():
+    values = {"learning_rate": np.float64(1e-3), "hidden": np.int64(8), "filters": [np.int32(2), 4]}
+    config = Config(**values)
+    assert config == Config(learning_rate=1e-3, hidden=8, filters=(2, 4))
+    assert json.loads(json.dumps(config.to_dict()))["hidden"] == 8
+
+
+def test_the_limit_of_steps_allows_an_iteration():
+    config = Config(env_id="Unknown-v0", max_transitions=51_199)  # a policy's, without its set
+    with pytest.raises(ValueError, match="takes up to 51,200 steps, or be None; got 51,199"):
+        make_train(config, tt.make("base"))
 
 
 def test_unknown_preset_lists_the_known():

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from agents import load, profile
+from agents import profile
 from agents.pretrained import FOLDER
 
 
@@ -30,13 +30,6 @@ def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
     for name in ("success.png", "controls.png"):
         with Image.open(out / name) as picture:
             assert picture.width == 830
-
-
-def test_policies_of_a_source_with_several_are_told_apart_by_name(monkeypatch):
-    policies = [load("fast-base")._replace(name=f"seed {seed}") for seed in range(2)]
-    monkeypatch.setattr(profile, "load_policies", lambda source, imports: policies)
-    names = list(profile.Options(("runs/mine/",)).policies())
-    assert names == ["runs/mine, seed 0", "runs/mine, seed 1"]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from agents import evaluate
 from agents.config import PRESETS, Config
 from agents.files import read_json
 from agents.runs import compilation
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import Run, RunFolder, RunOptions
 from agents.train import main, parse, run_path
 from refusal import refused
 from small_runs import final_state, options, read_iterations, run, start, untimed
@@ -56,8 +56,8 @@ def test_killed_runs_continue_to_the_same_bits(whole, tmp_path):
     run("agents.train", "--resume", path, "--checkpoint-every", 1)
     assert final_state(path) == final_state(whole[0])
     assert untimed(path) == untimed(whole[0])
-    for name in ("config.json", "evaluations.csv"):
-        assert (path / name).read_text() == (whole[0] / name).read_text()
+    assert RunFolder(path).read() == RunFolder(whole[0]).read()
+    assert (path / "evaluations.csv").read_text() == (whole[0] / "evaluations.csv").read_text()
 
 
 def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
@@ -122,8 +122,8 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
     output = run("agents.evaluate", *arguments, *files, PYTHONIOENCODING="ascii")
     with (tmp_path / "new/x.csv").open() as file:
         rows = list(csv.DictReader(file))
-    found = [(row["policy"], row["iteration"], row["task_set"], row["tasks"]) for row in rows]
-    assert found == [("seed 0", "30", "base", "1"), ("seed 0", "30", "st", "3")]
+    found = [(row["iteration"], row["task_set"], row["tasks"]) for row in rows]
+    assert found == [("30", "base", "1"), ("30", "st", "3")]
     assert "{St}" in output
     assert str(tmp_path / "new/x.csv") in output
 
@@ -136,15 +136,19 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--minibatch-size 3", "minibatch_size must divide episodes_per_iteration=256, got 3"),
         ("--episodess 8", "--episodess"),
         ("--curiosity icmm", "unknown curiosity 'icmm'; allowed: icm, "),
-        ("--discount 2", "discount must be a finite number in [0, 1], got 2"),
+        ("--discount 2", "discount must be a finite number from 0 to 1, got 2"),
         ("--max-gradient-norm inf", "max_gradient_norm must be a finite number"),
-        ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer in"),
-        ("--epochs 2147483648", "epochs must be an integer in [1, 10000], got 2147483648"),
-        ("--seeds 100000", "seeds must be an integer in [1, 65536], got 100000"),
-        ("--seed -1", "seed must be an integer in [0, 2147483647], got -1"),
+        ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),
+        ("--epochs 2147483648", "epochs must be an integer from 1 to 10,000, got 2147483648"),
+        ("--seed -1", "seed must be an integer >= 0 and <= 2147483647, got -1"),
+        (
+            "--max-transitions 5",
+            "max_transitions must allow an iteration, which takes up to 12,800",
+        ),
         ("--keep 0", "keep must be an integer >= 1, got 0"),
         ("--name a/b", "name must be a folder's name without a path, got 'a/b'"),
         ("--resume no/such", "no/such holds no run; runs in no: none"),
+        ("--resume x --name y", "leave out --name"),
         ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
 )
@@ -176,28 +180,29 @@ def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_options_take_precedence_over_every_preset(preset):
-    arguments = f"--preset {preset} --env psy --seed 3 --seeds 2 --hidden 32 --curiosity none"
+    arguments = f"--preset {preset} --env psy --seed 3 --hidden 32 --curiosity none"
     found, wanted, *_ = parse(arguments.split())
-    own = {"env_id": "PerceptualSymbolicTrapTube-v0", "hidden": 32, "curiosity": "none"}
-    assert wanted == Run(Config.preset(preset, **own), preset, 3, 2)
-    assert run_path(found, wanted).name == f"{preset}-psy-3to4"
+    own = {"env_id": "psy", "hidden": 32, "curiosity": "none"}
+    assert wanted == Run(Config.preset(preset, **own), 3)
+    assert run_path(found, wanted).name == f"{preset}-psy-3"
 
 
 def test_the_default_is_the_preset_fast():
     found, wanted, *_ = parse([])
-    assert wanted == Run(Config.preset("fast"), "fast")
+    assert wanted == Run(Config.preset("fast"))
     assert str(run_path(found, wanted)) == "runs/fast-base-0"
 
 
-def test_resumed_runs_keep_their_settings(tmp_path):
-    stored = Run(Config.preset("paper", hidden=32), "paper", 5, 2)
-    RunFolder(tmp_path / "x").note(stored)
+def test_resumed_runs_keep_their_settings_and_options(tmp_path):
+    stored, how = Run(Config.preset("paper", hidden=32), 5), RunOptions(keep=7, sets=("p", "st"))
+    RunFolder(tmp_path / "x").note(stored, how)
     arguments = ["--resume", str(tmp_path / "x")]
-    found, wanted, *_ = parse(arguments)
-    assert wanted == stored
-    assert run_path(found, wanted) == tmp_path / "x"
-    _, wanted, *_ = parse([*arguments, "--iterations", "999"])
-    assert wanted.config == dataclasses.replace(stored.config, iterations=999)
+    found, *wanted = parse(arguments)
+    assert wanted == [stored, how]
+    assert run_path(found, stored) == tmp_path / "x"
+    _, *wanted = parse([*arguments, "--iterations", "999", "--keep", "2"])
+    expected = dataclasses.replace(stored.config, iterations=999)
+    assert wanted == [Run(expected, 5), dataclasses.replace(how, keep=2)]
 
 
 def test_help_documents_every_setting(capsys, monkeypatch):

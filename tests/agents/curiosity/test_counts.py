@@ -14,11 +14,11 @@ BATCH = 40
 
 
 @pytest.mark.parametrize("env_id", ["base", "sy", "p", "st", "pstsy"])
-def test_counts_are_for_tasks_that_return(env_id):
+def test_counts_are_for_tasks_that_recur(env_id):
     if env_id in ("base", "sy"):
         assert Counts(tt.make(env_id)).memory().shape == (2**20,)
     else:
-        with pytest.raises(ValueError, match="'counts' needs tasks that return: base or Sy"):
+        with pytest.raises(ValueError, match="'counts' needs tasks that recur: base or Sy"):
             Counts(tt.make(env_id))
 
 

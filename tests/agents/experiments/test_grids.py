@@ -5,10 +5,8 @@ import sys
 
 import pytest
 
-import trap_tube_jax as tt
 from agents.experiments.grids import GRIDS, Grid, Options
-from agents.runs.folder import Run, RunFolder
-from agents.runs.session import RunOptions
+from agents.runs.folder import Run, RunFolder, RunOptions
 from refusal import assert_refused
 
 
@@ -30,6 +28,8 @@ def test_a_grid_holds_every_combination_by_name():
         ("filters=[2,3],[4,5]", "filters=4x5", "filters", (4, 5)),
         ("align_to_food=true,false", "align_to_food=true", "align_to_food", True),
         ("max_steps=null,7", "max_steps=null", "max_steps", None),
+        ("recurrent=True,False", "recurrent=False", "recurrent", False),
+        ("max_steps=None,7", "max_steps=None", "max_steps", None),
     ],
 )
 def test_values_are_json_or_text(text, name, setting, value):
@@ -54,18 +54,18 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, o
     ]
     run = list(runs.values())[1]
     assert (run.algorithm, run.seed, run.imports) == ("curiosity=icm", 3, given.imports)
-    assert run.config.env_id == "NearFood-v0"
+    assert run.config.env_id == "near-food"
 
 
 @pytest.mark.parametrize(
     ("name", "short", "iterations"), [("exp1", "base", 250), ("exp2", "pstsy", 500)]
 )
 def test_the_papers_experiments(name, short, iterations):
-    grid, env = GRIDS[name], tt.task_set(short).id
+    grid = GRIDS[name]
     found = grid.configs(grid.options)
     assert {k: v.curiosity for k, v in found.items()} == {"ppo": "none", "ppo+icm": "icm"}
     for config in found.values():
-        assert (config.env_id, config.iterations, config.eval_episodes) == (env, iterations, 128)
+        assert (config.env_id, config.iterations, config.eval_episodes) == (short, iterations, 128)
     assert (grid.options.preset, grid.options.seeds) == ("paper", 5)
     assert grid.run == RunOptions(evaluate_every=1, reported=1000)
 
@@ -84,7 +84,7 @@ def test_a_named_grid_keeps_its_settings_unless_given():
 def test_a_stored_run_with_other_settings_is_refused(tmp_path):
     given = Options(settings=("clip_eps=0.3",), out=tmp_path)
     ((path, run),) = Grid().runs("sweep", given).items()
-    other = Run(dataclasses.replace(run.config, clip_eps=0.2), "fast", algorithm="fast")
+    other = Run(dataclasses.replace(run.config, clip_eps=0.2), algorithm="fast")
     path.mkdir(parents=True)
     RunFolder(path).note(other)
     assert_refused(["clip_eps=0.2, not 0.3"], Grid().runs, "sweep", given)

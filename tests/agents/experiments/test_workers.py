@@ -7,8 +7,7 @@ import pytest
 
 from agents.config import Config
 from agents.experiments import workers
-from agents.runs.folder import Run
-from agents.runs.session import RunOptions
+from agents.runs.folder import Run, RunOptions
 from agents.runs.stopping import Stopped
 
 

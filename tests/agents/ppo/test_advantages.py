@@ -60,7 +60,7 @@ def test_two_streams_step_by_step():
     arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
     zero = jnp.zeros(())
     episodes = Episodes(tt.base_state(), zero, zero, *arrays, zero)  # pyright: ignore
-    old = returns.Moments(jnp.float32(9), jnp.float32(4), jnp.int32(3))
+    old = returns.Moments(jnp.float32(4), jnp.int32(3))
     intrinsic_reward = jnp.float32(novelty)
     moments = advantages.update_moments(config, (old, old), episodes, intrinsic_reward)
     advantage, target = advantages.estimate(

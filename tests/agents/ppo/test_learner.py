@@ -6,6 +6,7 @@ Play and gradient steps are replaced where they are not tested.
 import dataclasses
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +23,7 @@ from agents.curiosity import Curiosity
 from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
-from agents.registry import curiosities
+from agents.registry import curiosities, encoders
 from easy import rows
 from small_runs import SETTINGS
 
@@ -229,8 +230,10 @@ class Returning(Curiosity):
             experience.episodes.reward if reward is None else reward,
             memory if given is None else given,
         )
-        self.losses = lambda params, experience: dict.fromkeys(
-            losses or (), experience.episodes.reward
+        self.losses = lambda params, experience: (
+            losses
+            if type(losses) is dict
+            else dict.fromkeys(losses or (), experience.episodes.reward)
         )
 
 
@@ -256,6 +259,7 @@ def with_curiosity(monkeypatch):
         ({"given": jnp.zeros(2, jnp.float32)}, ["int32[]", "float32[2]"]),
         ({"losses": ["policy_loss"]}, ["losses must end in '_loss'", "got 'policy_loss'"]),
         ({"losses": ["mine"]}, ["policy_loss, value_loss, entropy_loss", "got 'mine'"]),
+        ({"losses": {"my_loss": jnp.ones(3)}}, ["my_loss must be a number per step", "float32[3]"]),
     ],
 )
 def test_a_curiosity_that_breaks_its_contract_is_named(with_curiosity, returned, words):
@@ -265,8 +269,18 @@ def test_a_curiosity_that_breaks_its_contract_is_named(with_curiosity, returned,
     assert all(word in str(error.value) for word in words)
 
 
+def test_an_encoder_of_maps_is_named(monkeypatch):
+    class Maps(nn.Module):
+        def __call__(self, observation):
+            return observation.astype(jnp.float32)
+
+    monkeypatch.setitem(encoders, "maps", lambda config: Maps())
+    with pytest.raises(ValueError, match=r"encoder 'maps' must map .* got \[1, 12, 12, 3\] for M"):
+        make_train(Config(encoder="maps")).init(jax.random.key(0))
+
+
 def test_devices_average_floats_only(with_curiosity):
-    with pytest.raises(ValueError, match="'none' needs one device"):
+    with pytest.raises(ValueError, match="'none' cannot train on several devices"):
         with_curiosity(Returning(), axis=EpisodeAxis(2))
 
 

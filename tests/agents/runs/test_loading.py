@@ -1,55 +1,116 @@
 """Policies of runs, files and shipped agents are loaded by name, or refused with the known ones."""
 
+import json
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 import pytest
+import safetensors.numpy
 
 import agents
+from agents.arrays import to_arrays
 from agents.runs import checkpoint
 from agents.runs.folder import Run, RunFolder
-from easy import assert_same
-from tiny_policy import CONFIG, random_params
+from agents.runs.loading import read_policy, save_policy
+from easy import assert_same, enable_x64
+from tiny_policy import CONFIG, random_params, random_policy
 
-SEEDS = (3, 4)
+POLICY = random_policy()
+ARRAYS = to_arrays(POLICY.params)
 
 
 @pytest.fixture(scope="module")
 def run_path(tmp_path_factory) -> Path:
-    """A run of two seeds with one checkpoint."""
-    path = tmp_path_factory.mktemp("runs") / "mine"
-    folder = RunFolder(path)
-    folder.note(Run(CONFIG, seed=SEEDS[0], seeds=2))
-    params = [random_params(seed=seed) for seed in SEEDS]
-    both = jax.tree.map(lambda *x: jnp.stack(x), *params)
-    state = {"params": both, "iteration": jnp.full(2, 6)}
+    """A run of seed 3 with one checkpoint."""
+    folder = RunFolder(tmp_path_factory.mktemp("runs") / "mine")
+    folder.note(Run(CONFIG, seed=3))
+    state = {"params": {**random_params(), "curiosity": np.ones(2)}, "iteration": np.int32(6)}
     checkpoint.save(folder.checkpoints, 6, state, {}, keep=1)
-    return path
+    return folder.path
 
 
 def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path, monkeypatch):
-    first, second = agents.load(str(run_path)), agents.load(run_path, seed=4, greedy=False)
-    assert (first.name, first.iteration, first.greedy) == ("seed 3", 6, True)
-    assert (second.name, second.iteration, second.greedy) == ("seed 4", 6, False)
-    assert_same(second.params, random_params(seed=4))
-    agents.save(tmp_path / "x.safetensors", first)
-    assert_same(agents.load(tmp_path / "x.safetensors").params, first.params)
+    policy = agents.load(str(run_path), greedy=False)
+    assert (policy.name, policy.iteration, policy.greedy) == ("seed 3", 6, False)
+    assert_same(policy.params, random_params())
+    agents.save(tmp_path / "x.safetensors", policy)
+    assert_same(agents.load(tmp_path / "x.safetensors").params, policy.params)
     (tmp_path / "fast-base").mkdir()  # a folder that holds no run hides no shipped agent
     monkeypatch.chdir(tmp_path)
     assert agents.load("fast-base").config.env_id == "TrapTube-v0"
 
 
 @pytest.mark.parametrize(
-    ("source", "options", "message"),
+    ("source", "message"),
     [
-        (None, {"seed": 5}, "mine has no seed 5; it holds seed 3, seed 4"),
-        (None, {"iteration": 5}, "no checkpoint 5; allowed: 6"),
-        ("none", {}, "none is neither a run, a file nor a shipped agent; .* shipped agents: best"),
-        ("fast-base", {"iteration": 5}, "iteration is for runs, which fast-base is not"),
-        ("fast-base", {"seed": 0}, "fast-base has no seed 0; it holds fast-base"),
+        (None, "no checkpoint 5; allowed: 6"),
+        ("none", "none is neither a run, a file nor a shipped agent; .* shipped agents: best"),
+        ("fast-base", "iteration is for runs, which fast-base is not"),
     ],
 )
-def test_unknown_sources_seeds_and_iterations_are_refused(run_path, source, options, message):
+def test_unknown_sources_and_iterations_are_refused(run_path, source, message):
     with pytest.raises(ValueError, match=message):
-        agents.load(source or run_path, **options)
+        agents.load(source or run_path, iteration=5)
+
+
+def test_a_stored_policy_is_the_same(tmp_path):
+    path = tmp_path / "mine.safetensors"
+    curious = {**POLICY.params, "curiosity": {"of": np.ones(2)}}
+    save_policy(path, POLICY._replace(params=curious))
+    loaded = read_policy(path)
+    assert loaded._replace(params=None) == POLICY._replace(params=None)
+    assert_same(loaded.params, POLICY.params)
+    with enable_x64(True):
+        assert_same(read_policy(path).params, POLICY.params)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def header(iteration: int | str = 1, **settings):
+    values = {"config": {**CONFIG.to_dict(), **settings}, "iteration": iteration}
+    return {"json": json.dumps(values)}
+
+
+@pytest.mark.parametrize(
+    ("stored", "changes", "message"),
+    [
+        *(
+            (header, {}, "is not a file of arrays of this package")
+            for header in ({}, *({"json": text} for text in ("{", "[]", "[" * 100_000)))
+        ),
+        ({"json": '{"config": []}'}, {}, "does not hold a policy of this version"),
+        (header(iteration="x"), {}, "does not hold a policy of this version"),
+        (header(clip=0.2), {}, "unknown setting 'clip'"),
+        (header(hidden=5), {}, r"core/params/bias is float32\[2, 12\], not float32\[2, 15\]"),
+        (header(encoder="own"), {}, "unknown encoder 'own'.*--import MODULE"),
+        (header(), {"heads/params/more": np.ones(1)}, "heads/params/more is not expected"),
+        (header(), {"heads/params/value/bias": None}, "heads/params/value/bias is missing"),
+        (
+            header(),
+            {"heads/params/value/bias": np.array([np.nan], np.float32)},
+            "parameters that are not finite: heads/params/value/bias",
+        ),
+    ],
+)
+def test_files_of_other_content_are_refused(stored, changes, message, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    arrays = {name: array for name, array in {**ARRAYS, **changes}.items() if array is not None}
+    path.write_bytes(safetensors.numpy.save(arrays, stored))
+    with pytest.raises(ValueError, match=message) as error:
+        read_policy(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-1], lambda b: b[:100], lambda b: b"", lambda b: b[1:]]
+)
+def test_damaged_files_are_refused(damage, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    save_policy(path, POLICY)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match=r"mine\.safetensors is not a file of arrays"):
+        read_policy(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="mine"):
+        read_policy(tmp_path / "mine.safetensors")

@@ -7,9 +7,9 @@ from agents.config import Config
 from agents.runs.metrics import append_rows, is_last, read_rows, rewind_rows
 
 
-def row(iteration, seed=0, **values):
+def row(iteration, **values):
     counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 1.0 * iteration}
-    return {"seed": seed, "iteration": iteration, "evaluation": 0.0, **counts, **values}
+    return {"iteration": iteration, "evaluation": 0.0, **counts, **values}
 
 
 def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
@@ -18,7 +18,7 @@ def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
         append_rows(path, [row(iteration, loss=float(np.float32(1 / 3)), length="")])
     before = path.read_text()
     with path.open("a") as file:
-        file.write("0,2,1")  # a kill in mid-write
+        file.write("4,0.0,3")  # a kill in mid-write
     assert list(read_rows(path)["iteration"]) == [1, 2, 3]
     rewind_rows(path, 2)
     assert path.read_text() == "".join(before.splitlines(keepends=True)[:3])
@@ -37,7 +37,7 @@ def test_files_without_folder_header_or_column_are_refused(tmp_path):
     append_rows(path, [row(1)])
     with pytest.raises(ValueError, match="fields not in fieldnames: 'more'"):
         append_rows(path, [row(2, more=1)])
-    path.write_text("0,2,1\n0,3,1\n")
+    path.write_text("2,1\n3,1\n")
     with pytest.raises(ValueError, match=r"x.csv has no header with a column 'iteration'"):
         rewind_rows(path, 3)
 

@@ -37,7 +37,7 @@ def row(iteration, **values):
     counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 1.0}
     shares = {"success": 0.25, "evaluation": 0.5, "loss": math.nan, "policy_loss": math.nan}
     rate = {"transitions_per_second": 6000.0, "intrinsic_reward": 0.1}
-    return {"seed": 0, "iteration": iteration, **counts, **shares, **rate, **values}
+    return {"iteration": iteration, **counts, **shares, **rate, **values}
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def page(played, tmp_path_factory):
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "<mine>")
     folder.path.mkdir()
     append_rows(folder.metrics, [row(1), row(2, policy_loss=0.5)])
-    report.write(folder, Run(CONFIG, "fast"), evaluator, {0: outcome})
+    report.write(folder, Run(CONFIG), evaluator, outcome)
     start, end = '<script type="application/json" id="data">', "</script>"
     return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
 
@@ -109,12 +109,12 @@ def test_a_page_shows_shortest_plans(played, page):
 def test_a_solved_episode_becomes_a_gif(played, tmp_path):
     evaluator, outcome = played
     path = tmp_path / "solved.gif"
-    assert report.save_first_solved(path, evaluator, [outcome], prefer="base") == "mine"
+    assert report.save_first_solved(path, evaluator, outcome, prefer="base") == "mine"
     with Image.open(path) as picture:
         index = int(np.argmax(outcome["mine"].solved))
         assert getattr(picture, "n_frames", 1) == outcome["mine"].length[index] + 1
     unsolved = {"base": outcome["base"]}
-    assert report.save_first_solved(tmp_path / "x.gif", evaluator, [unsolved], "base") is None
+    assert report.save_first_solved(tmp_path / "x.gif", evaluator, unsolved, "base") is None
     assert not (tmp_path / "x.gif").exists()
 
 
@@ -141,10 +141,9 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
     console = Console(file=file, force_terminal=is_terminal, width=100)
     with display.ProgressLine(console, 5) as progress:
         for iteration in (1, 2):
-            rows = [row(iteration), row(iteration, seed=1, success=0.75)]
-            progress.show(rows)
+            progress.show(row(iteration))
     text = file.getvalue()
-    assert "16 episodes, 50.0% solved, 50.0% greedily, 12,000 steps/s" in text
+    assert "16 episodes, 25.0% solved, 50.0% greedily, 6,000 steps/s" in text
     assert ("iteration 2: " in text) != is_terminal
     assert ("2/5" in text) == is_terminal
 
@@ -159,6 +158,7 @@ def score(name, solved):
         ({"stop_when_solved": 1.0}, 4321, "--preset best"),
         ({"stop_when_solved": 1.0}, None, "--iterations 14"),
         ({"stop_when_solved": 0.0, "lr_decay_fraction": 0.5}, None, "report.html"),
+        ({"stop_when_solved": 0.0, "max_transitions": 100}, None, "report.html"),
     ],
 )
 def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
@@ -166,7 +166,7 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
     solved = [row(2, evaluation=1.0, episodes=episodes)] if episodes else []
     rows = [row(1), *solved, row(3, evaluation=1.0, episodes=9999)] if solved else [row(1)]
     append_rows(folder.metrics, rows)
-    scores = {0: [score("base", 10), score("p", 5), score("st", 0)]}
+    scores = [score("base", 10), score("p", 5), score("st", 0)]
     lines = display.summary(folder, run, scores)
     assert lines[-1].endswith(expected)
     assert ("First solved base after 4,321 episodes." in lines) == bool(episodes)
