@@ -18,15 +18,28 @@ def own(text):
     return "".join(line for line in text.splitlines(True) if not line.startswith("[Gloo]"))
 
 
-@pytest.mark.slow
-def test_two_processes_stop_together_and_one_continues(tmp_path):
+def start_two(tmp_path, iterations):
+    """Starts both processes of a run in the folder "joint"."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    command = [*options(), "--iterations", 100_000, "--checkpoint-every", 1, "--keep", 1]
-    command += ["--out", tmp_path, "--name", "joint"]
-    command += ["--distributed", address, 2]
-    first, second = (start("agents.train", *command, number) for number in range(2))
+    command = [*options(), "--iterations", iterations, "--checkpoint-every", 1, "--keep", 1]
+    command += ["--out", tmp_path, "--name", "joint", "--sets", "base", "p"]
+    return [start("agents.train", *command, "--distributed", address, 2, i) for i in range(2)]
+
+
+@pytest.mark.slow
+def test_two_processes_end_together_and_the_first_reports(tmp_path):
+    ended = [(each.communicate(), each.returncode) for each in start_two(tmp_path, 2)]
+    assert [code for _, code in ended] == [0, 0], ended
+    rows = read_rows(tmp_path / "joint" / "evaluations.csv")
+    assert rows["task_set"].tolist() == ["base", "p"]
+    assert (tmp_path / "joint" / "report.html").exists()
+
+
+@pytest.mark.slow
+def test_two_processes_stop_together_and_one_continues(tmp_path):
+    first, second = start_two(tmp_path, 100_000)
     assert first.stdout is not None
     while not re.match("iteration 2:", line := first.stdout.readline()):
         assert line, first.communicate()
