@@ -79,6 +79,8 @@ class Config:
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: newest failed tasks kept for each of them.
       align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
+      repeat_penalty: nats that greedy play subtracts for a repeated action. An action counts as
+        often as the episode has taken it at the same observation (`agents.acting.repeats`).
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
       filters: channels of the first and of later convolutions; layer widths of `objects`.
@@ -126,6 +128,7 @@ class Config:
     replay_capacity: int = _replay(1024, 1, 1_000_000)
 
     align_to_food: bool = _network(False)
+    repeat_penalty: float = _network(0.0, 0)
     encoder: str = _network("paper")
     filters: tuple[int, int] = _network((32, 64), 1, 4096)
     hidden: int = _network(64, 1, 65_536)

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from agents.acting.frames import Frame
+from agents.acting.repeats import Repeats
 from agents.config import Config
 from agents.networks.agent import Agent, Params
+from agents.networks.grouping import hash_rows
 from trap_tube_jax.objects import BOARD_SIZE
 
 
@@ -19,12 +21,14 @@ class Carry(NamedTuple):
       action_tm1: i32[B, 2], the previous (grasp, move) in the frame; zeros before the first step.
       frame: the frames, three arrays bool[B], fixed by each episode's first observation.
       is_first: bool[B], true before the first step.
+      repeats: observations and actions so far; None without `repeat_penalty`.
     """
 
     embedding: jax.Array
     action_tm1: jax.Array
     frame: Frame
     is_first: jax.Array
+    repeats: Repeats | None
 
 
 class Policy(NamedTuple):
@@ -38,7 +42,7 @@ class Policy(NamedTuple):
       config: the settings of its training.
       params: its parameters.
       iteration: iterations trained.
-      greedy: takes the most probable actions; otherwise draws them.
+      greedy: takes the most probable actions, less `repeat_penalty`; otherwise draws them.
     """
 
     name: str
@@ -55,6 +59,7 @@ class Policy(NamedTuple):
             action_tm1=jnp.zeros((batch, 2), jnp.int32),
             frame=Frame.of(zeros),
             is_first=zeros == 0,
+            repeats=Repeats.none(batch) if self.config.repeat_penalty else None,
         )
 
     def act(
@@ -86,10 +91,16 @@ class Policy(NamedTuple):
             first = jax.vmap(Frame.facing_food)(observation)
             frame = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, frame)
             observation = jax.vmap(Frame.picture)(frame, observation)
+        place = hash_rows(observation.reshape(len(observation), -1)).astype(jnp.int32)
         features = agent.encode(self.params, observation)
         reward_tm1 = jnp.zeros(len(observation), jnp.float32)
         embedding = agent.step(self.params, carry.embedding, features, carry.action_tm1, reward_tm1)
         actions, _ = agent.policy_and_value(self.params, embedding)
-        action = actions.mode() if key is None or self.greedy else actions.sample(key)
-        after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first))
+        repeats, penalty = carry.repeats, self.config.repeat_penalty
+        if key is None or self.greedy:
+            action = actions.mode(repeats and penalty * repeats.counts(place))
+        else:
+            action = actions.sample(key)
+        repeats = repeats and repeats.add(place, action)
+        after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first), repeats)
         return jax.vmap(Frame.original_action)(frame, action), after

@@ -23,10 +23,18 @@ class ActionDistribution(NamedTuple):
         drawn = [jax.random.categorical(*pair) for pair in zip(keys, self, strict=True)]
         return jnp.stack(drawn, axis=-1).astype(jnp.int32)
 
-    def mode(self) -> jax.Array:
-        """Returns the most probable actions i32[..., 2]; ties go to the lowest index."""
-        chosen = [jnp.argmax(logits, axis=-1) for logits in self]
-        return jnp.stack(chosen, axis=-1).astype(jnp.int32)
+    def mode(self, penalty: jax.Array | None = None) -> jax.Array:
+        """Returns the most probable actions i32[..., 2]; ties go to the lowest index.
+
+        `penalty` f32[..., 4, 4] is subtracted from the log-probability of each (grasp, move).
+        """
+        if penalty is None:
+            chosen = [jnp.argmax(logits, axis=-1) for logits in self]
+            return jnp.stack(chosen, axis=-1).astype(jnp.int32)
+        grasp, move = (jax.nn.log_softmax(logits) for logits in self)
+        joint = grasp[..., :, None] + move[..., None, :] - penalty
+        index = jnp.argmax(joint.reshape(*joint.shape[:-2], -1), axis=-1).astype(jnp.int32)
+        return jnp.stack([index // move.shape[-1], index % move.shape[-1]], axis=-1)
 
     def log_prob(self, action: jax.Array) -> jax.Array:
         """Returns log p(grasp) + log p(move), f32[...], of actions i32[..., 2]."""

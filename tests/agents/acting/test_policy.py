@@ -32,7 +32,13 @@ def drive(policy, tasks):
 
 @pytest.mark.parametrize(
     ("seed", "settings"),
-    [(3, {}), (4, {}), (4, {"align_to_food": True}), (3, {"encoder": "objects"})],
+    [
+        (3, {}),
+        (4, {}),
+        (4, {"align_to_food": True}),
+        (3, {"encoder": "objects"}),
+        (3, {"repeat_penalty": 3.0}),
+    ],
 )
 def test_a_policy_reaches_the_evaluators_outcomes(seed, settings):
     policy, tasks = random_policy(seed, **settings), food_next_to_agent()
