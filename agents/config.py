@@ -79,8 +79,8 @@ class Config:
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: newest failed tasks kept for each of them.
       align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
-      repeat_penalty: nats that greedy play subtracts for a repeated action. An action counts as
-        often as the episode has taken it at the same observation (`agents.acting.repeats`).
+      repeat_penalty: penalty on repeats in greedy play. An action loses this many nats for each time
+        that the episode has taken it at the same observation (`agents.acting.repeats`).
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
       filters: channels of the first and of later convolutions; layer widths of `objects`.
@@ -252,7 +252,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "intrinsic_coef": 2.0,
         "filters": (8, 16),
     },
-    # Learns {P, St, Sy}: encodes objects, replays failed tasks and predicts motion.
+    # Learns {P, St, Sy}: encodes objects, replays failed tasks, predicts motion, avoids repeats.
     "best": {
         **PAYS_FOR_EFFECTS,
         "env_id": "pstsy",
@@ -267,6 +267,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "intrinsic_anneal_fraction": 0.5,
         "replay_fractions": (0.0625, 0.125, 0.75),
         "align_to_food": True,
+        "repeat_penalty": 3.0,
         "encoder": "objects",
         "filters": (64, 64),
         "hidden": 128,
