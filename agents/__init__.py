@@ -30,8 +30,8 @@ def load(
     Reading runs no code that the source names; only `imports` are imported.
 
     Args:
-      source: a run's folder, a file of parameters, or the name of a shipped agent. Of a run that
-        was evaluated as it went, `best.safetensors` is the policy with the best evaluation.
+      source: a run's folder, a file of parameters, or the name of a shipped agent. In the folder of
+        a run trained with `evaluate_every`, `best.safetensors` holds the best parameters.
       iteration: checkpoint of a run; the newest if None.
       greedy: take the most probable actions; False samples them.
       imports: modules to import first, which register curiosities, encoders or task sets.

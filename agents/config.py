@@ -41,7 +41,7 @@ class Config:
       iterations: rollouts to train for, at most. Schedules span this number.
       max_transitions: environment steps to train for, at most; training stops before an iteration
         that could exceed it. None sets no limit.
-      stop_when_solved: solved fraction at which a seed stops. Counts the validation tasks of
+      stop_when_solved: solved fraction at which training stops. Counts the validation tasks of
         `env_id`, played greedily; 0 never stops early.
       eval_episodes: fixed evaluation tasks per task set.
       episodes_per_iteration: episodes played per iteration.
@@ -74,13 +74,13 @@ class Config:
       value_heads: one for all rewards, or one each. `shared`: rewards are divided by their standard
         deviation and added, and one head values the sum. `separate`: each reward has its own head,
         and the normalised advantages are added (`agents.ppo.advantages`).
-      reward_ema_decay: decay of the rewards' moving moments. They normalise both rewards; the
+      reward_ema_decay: decay of the rewards' moving variances. They normalise both rewards; the
         rates of `effects` decay alike.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: newest failed tasks kept for each of them.
       align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
-      repeat_penalty: penalty on repeats in greedy play. An action loses this many nats for each time
-        that the episode has taken it at the same observation (`agents.acting.repeats`).
+      repeat_penalty: penalty on repeats in greedy play. An action loses this many nats for each of
+        the last 64 steps that took it at the same observation (`agents.acting.repeats`).
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
       filters: channels of the first and of later convolutions; layer widths of `objects`.

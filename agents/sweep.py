@@ -19,7 +19,7 @@ from agents.runs.folder import Run, RunFolder, RunOptions
 from agents.runs.stopping import Stopped, exit_code, stop_signals
 from trap_tube_jax.command_line import plain_errors
 
-LINES = 5  # shown of a failed run's log
+LINES = 5  # last lines shown of a failed run's log
 
 
 def main(
@@ -50,7 +50,7 @@ def main(
         try:
             with make_executor(options.processes, options.cluster) as pool, RunFolder(root).lock():
                 failed = launch(runs, how, pool, console)
-                if any((path / "config.json").exists() for path in runs):
+                if any(RunFolder(path).metrics.exists() for path in runs):
                     report.collect(root, f"{program} {shlex.join(arguments)}".strip())
                     say(console, report.write(root))
         except (Stopped, KeyboardInterrupt) as stopped:

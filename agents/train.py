@@ -68,15 +68,18 @@ def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     # The preset, or the stored run, decides the defaults of all other options.
     (first,) = parse_all([Options], arguments, PROGRAM, partly=True)
     import_modules(first.imports)
-    defaults, config, how = Options(), Config.preset(first.preset), RunOptions()
+    defaults, run, how = Options(), Run(Config.preset(first.preset)), RunOptions()
     if first.resume is not None:
-        if first.name is not None:
-            raise ValueError("--resume continues the run in its folder; leave out --name")
+        if (first.name, first.preset) != (defaults.name, defaults.preset):
+            raise ValueError("--resume continues a run as it is; leave out --name and --preset")
         folder = RunFolder(first.resume)
-        stored, how = folder.read(first.imports), folder.read_options()
-        defaults, config = Options(seed=stored.seed), stored.config
-    options, config, how = parse_all([defaults, config, how], arguments, PROGRAM)
-    return options, Run(config, options.seed, imports=options.imports), how
+        run, how = folder.read(first.imports), folder.read_options()
+        defaults = Options(seed=run.seed, imports=run.imports)
+    options, config, how = parse_all([defaults, run.config, how], arguments, PROGRAM)
+    given = {"config": config, "seed": options.seed, "imports": options.imports}
+    if first.resume is None:
+        given["algorithm"] = ""  # named after the settings given
+    return options, dataclasses.replace(run, **given), how
 
 
 def train(options: Options, run: Run, how: RunOptions) -> None:

@@ -56,7 +56,9 @@ def train_seeds(devices):
     This is the program of agents/parallel/README.md.
     """
     learner = make_learner()
-    mesh = jax.make_mesh((devices,), ("seeds",), (AxisType.Auto,), devices=jax.devices()[:devices])
+    mesh = jax.make_mesh(
+        (devices,), ("seeds",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
+    )
     keys = jax.random.split(jax.random.key(0), 2)
     keys = jax.device_put(keys, NamedSharding(mesh, PartitionSpec("seeds")))
     states = jax.jit(jax.vmap(learner.init))(keys)

@@ -123,7 +123,7 @@ def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
         `trap_turned`.
 
     Raises:
-      ValueError: `layouts` is no named function.
+      ValueError: `layouts` is not a named function.
     """
     if not callable(layouts) or not hasattr(layouts, "__name__"):
         raise ValueError(f"layouts must be a named function that lists states, got {layouts!r}")

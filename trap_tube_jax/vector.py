@@ -61,7 +61,7 @@ class VectorEnvironment:
     environments needs.
 
     Attributes:
-      env: an environment without auto-reset; no subclass, whose methods a batch would not call.
+      env: an environment without auto-reset, not a subclass: the batch would bypass its methods.
       chunk_size: environments that start over at a time, at least 1. Small chunks waste less
         when few end together, and suit a CPU; large ones suit a GPU.
 

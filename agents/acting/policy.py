@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from agents.acting.frames import Frame
-from agents.acting.repeats import Repeats
+from agents.acting.repeats import Repeats, board_ids
 from agents.config import Config
 from agents.networks.agent import Agent, Params
-from agents.networks.grouping import hash_rows
 from trap_tube_jax.objects import BOARD_SIZE
 
 
@@ -21,7 +20,7 @@ class Carry(NamedTuple):
       action_tm1: i32[B, 2], the previous (grasp, move) in the frame; zeros before the first step.
       frame: the frames, three arrays bool[B], fixed by each episode's first observation.
       is_first: bool[B], true before the first step.
-      repeats: observations and actions so far; None without `repeat_penalty`.
+      repeats: what greedy play has tried; None without `repeat_penalty`.
     """
 
     embedding: jax.Array
@@ -42,7 +41,7 @@ class Policy(NamedTuple):
       config: the settings of its training.
       params: its parameters.
       iteration: iterations trained.
-      greedy: takes the most probable actions, less `repeat_penalty`; otherwise draws them.
+      greedy: takes the most probable actions after `repeat_penalty`; otherwise draws them.
     """
 
     name: str
@@ -59,7 +58,7 @@ class Policy(NamedTuple):
             action_tm1=jnp.zeros((batch, 2), jnp.int32),
             frame=Frame.of(zeros),
             is_first=zeros == 0,
-            repeats=Repeats.none(batch) if self.config.repeat_penalty else None,
+            repeats=Repeats.empty(batch) if self.config.repeat_penalty else None,
         )
 
     def act(
@@ -91,16 +90,18 @@ class Policy(NamedTuple):
             first = jax.vmap(Frame.facing_food)(observation)
             frame = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, frame)
             observation = jax.vmap(Frame.picture)(frame, observation)
-        place = hash_rows(observation.reshape(len(observation), -1)).astype(jnp.int32)
         features = agent.encode(self.params, observation)
         reward_tm1 = jnp.zeros(len(observation), jnp.float32)
         embedding = agent.step(self.params, carry.embedding, features, carry.action_tm1, reward_tm1)
         actions, _ = agent.policy_and_value(self.params, embedding)
-        repeats, penalty = carry.repeats, self.config.repeat_penalty
-        if key is None or self.greedy:
-            action = actions.mode(repeats and penalty * repeats.counts(place))
-        else:
+        repeats = carry.repeats
+        if key is not None and not self.greedy:
             action = actions.sample(key)
-        repeats = repeats and repeats.add(place, action)
+        elif repeats is None:
+            action = actions.mode()
+        else:
+            seen = board_ids(observation)
+            action = actions.mode(self.config.repeat_penalty * repeats.counts(seen))
+            repeats = repeats.add(seen, action)
         after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first), repeats)
         return jax.vmap(Frame.original_action)(frame, action), after

@@ -6,7 +6,7 @@ effect again, and a policy that always takes the most probable action may walk i
 
   log p(a | o, h) - repeat_penalty * n(o, a),
 
-n counting the earlier steps of the episode with this observation and action.
+n counting those of the last 64 steps of the episode that took this action at this observation.
 
 Source: own.
 """
@@ -16,16 +16,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from agents.networks.grouping import hash_rows
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 
-MEMORY = 64  # steps; earlier ones are forgotten
+MEMORY = 64  # steps
 
 
 class Repeats(NamedTuple):
     """The last observations of B episodes and the actions taken there, newest first.
 
     Attributes:
-      observation: i32[MEMORY, B], equal only for equal observations of an episode.
+      observation: i32[MEMORY, B], see `board_ids`.
       action: i32[MEMORY, B], 4 * grasp + move; -1 before the first step.
     """
 
@@ -33,10 +34,10 @@ class Repeats(NamedTuple):
     action: jax.Array
 
     @staticmethod
-    def none(batch: int) -> "Repeats":
+    def empty(batch: int) -> "Repeats":
         """Returns the memory of `batch` episodes before their first step."""
-        empty = jnp.full((MEMORY, batch), -1, jnp.int32)
-        return Repeats(empty, empty)
+        nothing = jnp.full((MEMORY, batch), -1, jnp.int32)
+        return Repeats(nothing, nothing)
 
     def counts(self, observation: jax.Array) -> jax.Array:
         """Returns how often each action was taken at the observations i32[B], f32[B, 4, 4]."""
@@ -49,3 +50,8 @@ class Repeats(NamedTuple):
         """Adds a step with observations i32[B] and actions i32[B, 2]."""
         newest = Repeats(observation, action[:, 0] * NUM_DIRECTIONS + action[:, 1])
         return jax.tree.map(lambda x, old: jnp.concatenate([x[None], old[:-1]]), newest, self)
+
+
+def board_ids(observation: jax.Array) -> jax.Array:
+    """Hashes observations u8[B, 12, 12, N] to i32[B]; different ones hardly ever agree."""
+    return hash_rows(observation.reshape(len(observation), -1)).astype(jnp.int32)

@@ -11,11 +11,10 @@ import jax.numpy as jnp
 from agents.acting.encodings import Cache
 from agents.acting.episodes import Episodes, cells_of
 from agents.acting.frames import Frame
-from agents.acting.repeats import Repeats
+from agents.acting.repeats import Repeats, board_ids
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.observation import observe
-from trap_tube_jax.positions import position_id
 from trap_tube_jax.state import State
 
 
@@ -49,7 +48,8 @@ def rollout(
       params: its parameters.
       env: the dynamics; `max_steps` is T.
       initial: B states at time 0.
-      key: PRNG key of the actions; None takes the most probable ones, less `repeat_penalty`.
+      key: PRNG key of the actions; None takes the most probable ones after
+        `repeat_penalty`.
     """
     batch, penalty = len(initial.time), agent.config.repeat_penalty
     frame = Frame.of(jnp.zeros(batch, jnp.int32))
@@ -63,8 +63,12 @@ def rollout(
         features, cache = cache.encode(agent, params, state, time)
         embedding = agent.step(params, embedding, features, action_tm1, reward_tm1)
         actions, value = agent.policy_and_value(params, embedding)
-        place = jax.vmap(position_id)(state)  # within an episode, equal only for equal boards
-        action = actions.mode(repeats and penalty * repeats.counts(place))
+        if repeats is None:
+            action = actions.mode()
+        else:
+            seen = board_ids(jax.vmap(observe)(state))
+            action = actions.mode(penalty * repeats.counts(seen))
+            repeats = repeats.add(seen, action)
         if key is not None:
             action = actions.sample(jax.random.wrap_key_data(data, impl=jax.random.key_impl(key)))
         after, timestep = jax.vmap(env.step)(state, action)
@@ -75,7 +79,6 @@ def rollout(
             "mask": (~(state.terminated | state.truncated)).astype(jnp.float32),
         }
         outputs = (cells_of(state), value, taken, embedding, actions.log_prob(action))
-        repeats = repeats and repeats.add(place, action)
         return (after, embedding, action, timestep.reward, repeats, cache), outputs
 
     first = (
@@ -83,7 +86,7 @@ def rollout(
         agent.initial_state(params, batch),
         jnp.zeros((batch, 2), jnp.int32),
         jnp.zeros(batch, jnp.float32),
-        Repeats.none(batch) if penalty and key is None else None,
+        Repeats.empty(batch) if penalty and key is None else None,
         Cache.empty(agent, params, initial, env.max_steps),
     )
     # One more step than the episode has, for the last observation; states do not change any more.

@@ -29,7 +29,7 @@ class Agent:
         self.heads: Any = Heads(config.num_value_heads)
 
     def init(self, key: jax.Array) -> Params:
-        """Draws the parameters; raises ValueError for an encoder whose features are no rows."""
+        """Draws the parameters; raises ValueError unless the encoder's features are [M, F]."""
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         # Only layers of Flax, in an encoder of your own, use the folded key; see `draw`.
         features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)

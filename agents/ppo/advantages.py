@@ -31,7 +31,7 @@ INTRINSIC_RETURN_STD = 0.3
 # Added to the variance of advantages, so that those of a nearly constant reward stay small.
 VARIANCE_FLOOR = 4e-4
 
-RewardMoments = tuple[returns.Moments, returns.Moments]  # extrinsic, intrinsic
+RewardVariances = tuple[returns.RunningVariance, returns.RunningVariance]  # extrinsic, intrinsic
 
 
 def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
@@ -43,16 +43,16 @@ def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
     return optax.exponential_decay(start, steps, end / start, end_value=end)
 
 
-def update_moments(
-    config: Config, moments: RewardMoments, episodes: Episodes, intrinsic_reward: jax.Array
-) -> RewardMoments:
-    """Updates the moments by B episodes with intrinsic rewards f32[T, B].
+def update_variances(
+    config: Config, variances: RewardVariances, episodes: Episodes, intrinsic_reward: jax.Array
+) -> RewardVariances:
+    """Updates the variances by B episodes with intrinsic rewards f32[T, B].
 
-    With separate value heads, the second moments are of the discounted intrinsic returns.
+    With separate value heads, the second variance is that of discounted intrinsic returns.
     """
     if config.value_heads == "separate":
         intrinsic_reward = returns.discounted_returns(intrinsic_reward, config.discount)
-    extrinsic, intrinsic = moments
+    extrinsic, intrinsic = variances
     mask, decay = episodes.mask, config.reward_ema_decay
     extrinsic = extrinsic.update(episodes.reward, mask, decay)
     return extrinsic, intrinsic.update(intrinsic_reward, mask, decay)
@@ -64,7 +64,7 @@ def estimate(
     intrinsic_reward: jax.Array,
     intrinsic_coef: jax.typing.ArrayLike,
     value: jax.Array,
-    moments: RewardMoments,
+    variances: RewardVariances,
 ) -> tuple[jax.Array, jax.Array]:
     """Estimates the advantages of both rewards together.
 
@@ -75,12 +75,12 @@ def estimate(
       intrinsic_coef: weight of the intrinsic reward.
       value: f32[T + 1, B, V], values of all observations. With separate value heads the first is
         of the extrinsic reward, the second of the intrinsic one; V = 1 without a curiosity.
-      moments: moments as returned by `update_moments`.
+      variances: variances as returned by `update_variances`.
 
     Returns:
       Advantages f32[T, B] and value targets f32[T, B, V].
     """
-    mask, (extrinsic, intrinsic) = episodes.mask, moments
+    mask, (extrinsic, intrinsic) = episodes.mask, variances
     reward = episodes.reward
     if config.value_heads == "shared":
         reward = reward / extrinsic.std + intrinsic_coef * intrinsic_reward / intrinsic.std

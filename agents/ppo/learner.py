@@ -41,8 +41,8 @@ class TrainState(NamedTuple):
       params: parameters by part: `encoder`, `core`, `heads` of the policy network, `curiosity`, and
         `motion` if `motion_coef` is above 0.
       opt_state: state of the optimizer.
-      extrinsic: moments of the extrinsic reward.
-      intrinsic: moments of the intrinsic reward, or of its returns with separate value heads.
+      extrinsic: variance of the extrinsic reward.
+      intrinsic: variance of the intrinsic reward, or of its returns with separate value heads.
       memory: memory of the curiosity.
       task_replay: failed tasks to replay.
       key: PRNG key of all iterations to come.
@@ -53,8 +53,8 @@ class TrainState(NamedTuple):
 
     params: Params
     opt_state: Any
-    extrinsic: returns.Moments
-    intrinsic: returns.Moments
+    extrinsic: returns.RunningVariance
+    intrinsic: returns.RunningVariance
     memory: Any
     task_replay: TaskReplay
     key: jax.Array
@@ -119,8 +119,8 @@ class Learner:
         return TrainState(
             params=params,
             opt_state=self.optimizer.init(params),
-            extrinsic=returns.Moments.zero(),
-            intrinsic=returns.Moments.zero(),
+            extrinsic=returns.RunningVariance.zero(),
+            intrinsic=returns.RunningVariance.zero(),
             memory=self.curiosity.memory(),
             task_replay=TaskReplay.untried(
                 replay_key, len(config.replay_fractions), config.replay_capacity
@@ -134,7 +134,7 @@ class Learner:
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Plays one iteration's episodes and learns from them.
 
-        Returns the next state of one seed, and the iteration's metrics, f32[] each. `is_finite` is
+        Returns the next state, and the iteration's metrics, f32[] each. `is_finite` is
         1 unless a parameter or another metric is infinite or NaN.
         """
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
@@ -201,22 +201,22 @@ class Learner:
 
     def make_batch(
         self, state: TrainState, trajectory: Trajectory, intrinsic_reward: jax.Array
-    ) -> tuple[Batch, advantages.RewardMoments]:
+    ) -> tuple[Batch, advantages.RewardVariances]:
         """Computes advantages and value targets, by intrinsic rewards f32[T, B].
 
-        Returns the batch, and the moments of both rewards; see `agents.ppo.advantages`.
+        Returns the batch, and the variances of both rewards; see `agents.ppo.advantages`.
         """
         config, episodes = self.config, trajectory.episodes
-        moments = advantages.update_moments(
+        variances = advantages.update_variances(
             config, (state.extrinsic, state.intrinsic), episodes, intrinsic_reward
         )
-        moments = self.axis.mean(moments)
+        variances = self.axis.mean(variances)
         coef = advantages.intrinsic_coef_schedule(config)(state.iteration)
         advantage, target = advantages.estimate(
-            config, episodes, intrinsic_reward, coef, trajectory.value, moments
+            config, episodes, intrinsic_reward, coef, trajectory.value, variances
         )
         advantage = returns.normalize(advantage, episodes.mask)
-        return Batch(episodes, trajectory.log_prob, advantage, target), moments
+        return Batch(episodes, trajectory.log_prob, advantage, target), variances
 
     def update(
         self, state: TrainState, batch: Batch, key: jax.Array

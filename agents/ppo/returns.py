@@ -1,4 +1,4 @@
-"""Returns, advantages and the moments that scale them: functions of arrays.
+"""Returns, advantages and the variances that scale them: functions of arrays.
 
 Episodes have T steps; step t leads from observation t to observation t + 1. `mask` is 1 on steps
 before the episode's end, 0 after it.
@@ -66,7 +66,7 @@ def normalize(x: jax.Array, mask: jax.Array, epsilon: float = 1e-8) -> jax.Array
     return mask * (x - mean) / jnp.sqrt(variance + epsilon)
 
 
-class Moments(NamedTuple):
+class RunningVariance(NamedTuple):
     """Exponential moving average of the variance of batches.
 
     Attributes:
@@ -78,15 +78,15 @@ class Moments(NamedTuple):
     batches: jax.Array
 
     @staticmethod
-    def zero() -> "Moments":
-        """Returns the moments before the first batch."""
-        return Moments(jnp.zeros((), jnp.float32), jnp.zeros((), jnp.int32))
+    def zero() -> "RunningVariance":
+        """Returns the variance before the first batch."""
+        return RunningVariance(jnp.zeros((), jnp.float32), jnp.zeros((), jnp.int32))
 
-    def update(self, x: jax.Array, mask: jax.Array, decay: float) -> "Moments":
+    def update(self, x: jax.Array, mask: jax.Array, decay: float) -> "RunningVariance":
         """Moves by 1 - `decay` towards the variance of a batch f32[...] under its mask."""
         _, variance = masked_moments(x, mask)
         keep = jnp.where(self.batches == 0, jnp.float32(0), jnp.float32(decay))
-        return Moments(keep * self.variance + (1 - keep) * variance, self.batches + 1)
+        return RunningVariance(keep * self.variance + (1 - keep) * variance, self.batches + 1)
 
     @property
     def std(self) -> jax.Array:

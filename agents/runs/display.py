@@ -55,7 +55,7 @@ def summary(folder: RunFolder, run: Run, scores: Sequence[Score]) -> list[str]:
     threshold = config.stop_when_solved or 1.0
     solving = read_rows(folder.metrics).query("evaluation >= @threshold")["episodes"]
     if len(solving):
-        share = "" if threshold == 1 else f"{threshold:.0%} of "
+        share = "" if threshold == 1 else f"{100 * threshold:g} % of "
         lines.append(f"First solved {share}{own.label} after {solving.min():,} episodes.")
     parts = {
         own.label: [score.percent for score in scores if score.set == own.short],

@@ -43,8 +43,10 @@ class Run:
     imports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Names the algorithm; raises ValueError for a seed that is not allowed."""
+        """Completes task set and algorithm; ValueError names an unknown set or a wrong seed."""
         check_integer("seed", self.seed, 0, MAX_SEED)
+        env_id = task_set(self.config.env_id).id
+        object.__setattr__(self, "config", dataclasses.replace(self.config, env_id=env_id))
         if not self.algorithm:
             curiosity = self.config.curiosity
             name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"
@@ -65,10 +67,7 @@ class Run:
 
     def check_continues(self, before: "Run") -> None:
         """Raises ValueError unless resuming `before` trains as this run alone would have."""
-        old, new = (
-            {**run.to_dict(), **run.config.to_dict(), "env_id": task_set(run.config.env_id).id}
-            for run in (before, self)
-        )
+        old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
         scheduled = old["lr_decay_fraction"] > 0 or old["intrinsic_coef_init"] > 0
         free = {*EXTENDABLE, "config", "imports"} - ({"iterations"} if scheduled else set())
         for name, value in old.items():
@@ -127,7 +126,7 @@ class RunFolder:
       provenance: machines, versions and commits that trained it, JSON.
       metrics: a row per iteration, CSV.
       evaluations: a row per evaluated iteration and task set, CSV.
-      best: the parameters with the best evaluation so far, if the run is evaluated as it goes.
+      best: the parameters with the best evaluation so far, with `evaluate_every`.
       checkpoints: a file per checkpoint, named by its iteration.
       curves: learning curves, PNG.
       page: the report, HTML.
@@ -194,7 +193,8 @@ class RunFolder:
                 "another --name"
             )
         own = {".lock", ".writer"}
-        if self.path.exists() and {entry.name for entry in self.path.iterdir()} - own:
+        is_folder = self.path.is_dir()
+        if self.path.exists() and not (is_folder and {p.name for p in self.path.iterdir()} <= own):
             raise ValueError(f"{self.path} exists, but holds no run; give another --name")
 
     def note(self, run: Run, options: RunOptions | None = None) -> None:
@@ -204,11 +204,11 @@ class RunFolder:
 
     def read_options(self) -> RunOptions:
         """Returns the stored options; ValueError names one that is unknown or not allowed."""
-        stored = read_json(self.config)["options"]
         try:
+            stored = read_json(self.config)["options"]
             return RunOptions(**{**stored, "sets": stored["sets"] and tuple(stored["sets"])})
         except (KeyError, TypeError) as error:
-            raise ValueError(f"{self.config} holds unknown options: {error}") from error
+            raise ValueError(f"{self.config} lacks options or holds others: {error}") from error
 
     def read(self, imports: tuple[str, ...] = ()) -> Run:
         """Returns the stored run.

@@ -104,7 +104,7 @@ class Session:
     ):
         """Builds the learner and restores the newest checkpoint of `stored`; writes to `folder`."""
         self.run, self.options, self.console = run, options, console
-        self.folder, self.stop_file = folder, stop_file
+        self.stored, self.folder, self.stop_file = stored, folder, stop_file
         self.placement = Placement.of(options.devices, run.config)
         self.learner = make_train(run.config, axis=self.placement.axis)
         self.sets = options.sets or own_and_paper_sets(run.config)
@@ -136,6 +136,7 @@ class Session:
         """Trains until the run has reached a limit."""
         if self.done:
             return
+        self.folder.page.unlink(missing_ok=True)  # it would show the run as it was
         note_provenance(self.folder.provenance, str(self.placement))
         config = self.run.config
         say(
@@ -170,9 +171,9 @@ class Session:
     def finish(self) -> list[Score]:
         """Evaluates the final policy, or the best one; writes and returns the results."""
         policy = self._policy()
-        if self._validate and self.folder.best.is_file():
-            policy = read_policy(self.folder.best)
-        tested = read_rows(self.folder.evaluations).query("purpose == 'test'")
+        if self._validate and self.stored.best.is_file():
+            policy = read_policy(self.stored.best)
+        tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
         is_tested = policy.iteration in set(tested["iteration"])
         if is_tested and (self.folder.page.exists() or not self.options.report):
             return []
@@ -218,6 +219,7 @@ class Session:
         append_rows(path, evaluation_rows(scores, policy, "validation"))
         own = tt.task_set(self.run.config.env_id).short
         if best_iteration(read_rows(path), own) == self.iteration:
+            self._save()  # first, or a resume could start before the best policy
             save_policy(self.folder.best, policy)
 
     def _policy(self) -> Policy:

@@ -148,7 +148,8 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--keep 0", "keep must be an integer >= 1, got 0"),
         ("--name a/b", "name must be a folder's name without a path, got 'a/b'"),
         ("--resume no/such", "no/such holds no run; runs in no: none"),
-        ("--resume x --name y", "leave out --name"),
+        ("--resume x --name y", "leave out --name and --preset"),
+        ("--resume x --preset best", "leave out --name and --preset"),
         ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
 )
@@ -182,7 +183,7 @@ def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
 def test_options_take_precedence_over_every_preset(preset):
     arguments = f"--preset {preset} --env psy --seed 3 --hidden 32 --curiosity none"
     found, wanted, *_ = parse(arguments.split())
-    own = {"env_id": "psy", "hidden": 32, "curiosity": "none"}
+    own = {"env_id": "PerceptualSymbolicTrapTube-v0", "hidden": 32, "curiosity": "none"}
     assert wanted == Run(Config.preset(preset, **own), 3)
     assert run_path(found, wanted).name == f"{preset}-psy-3"
 
@@ -194,7 +195,8 @@ def test_the_default_is_the_preset_fast():
 
 
 def test_resumed_runs_keep_their_settings_and_options(tmp_path):
-    stored, how = Run(Config.preset("paper", hidden=32), 5), RunOptions(keep=7, sets=("p", "st"))
+    stored = Run(Config.preset("paper", hidden=32), 5, "mine", ("json",))
+    how = RunOptions(keep=7, sets=("p", "st"))
     RunFolder(tmp_path / "x").note(stored, how)
     arguments = ["--resume", str(tmp_path / "x")]
     found, *wanted = parse(arguments)
@@ -202,7 +204,8 @@ def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     assert run_path(found, stored) == tmp_path / "x"
     _, *wanted = parse([*arguments, "--iterations", "999", "--keep", "2"])
     expected = dataclasses.replace(stored.config, iterations=999)
-    assert wanted == [Run(expected, 5), dataclasses.replace(how, keep=2)]
+    run = dataclasses.replace(stored, config=expected)
+    assert wanted == [run, dataclasses.replace(how, keep=2)]
 
 
 def test_help_documents_every_setting(capsys, monkeypatch):

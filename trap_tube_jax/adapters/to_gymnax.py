@@ -59,8 +59,8 @@ class _TrapTube(environment.Environment):
         """Checks the arguments.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own, which has its
-            own number of features and, as the default parameter, step limit.
+          task_set: registered id or short name, or an `Environment` of your own, which has its own
+            number of features and, as the default parameter, step limit; not a subclass.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `Tuple((Discrete(4), Discrete(4)))` or i32[2].
           num_features: N, the feature channels of the observation; see `trap_tube_jax.make`.
@@ -78,7 +78,9 @@ class _TrapTube(environment.Environment):
                 "give it the base state you mean"
             )
         elif type(task_set) is not Environment:
-            raise ValueError(f"task_set must be no subclass of Environment, got {task_set!r}")
+            raise ValueError(
+                f"task_set must be an Environment itself, not a subclass, got {task_set!r}"
+            )
         else:
             self._name = repr(task_set)
         self._default_max_steps = task_set.max_steps

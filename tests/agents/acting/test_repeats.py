@@ -11,7 +11,7 @@ from tiny_policy import STEPS, food_next_to_agent, random_policy
 
 
 def test_an_action_counts_where_it_was_taken():
-    repeats = Repeats.none(2)
+    repeats = Repeats.empty(2)
     assert not repeats.counts(jnp.array([-1, 0])).any(), "nothing was taken before the first step"
     for seen, action in (([5, 5], (1, 2)), ([5, 6], (1, 2)), ([7, 5], (0, 3)), ([5, 5], (0, 3))):
         repeats = repeats.add(jnp.array(seen), jnp.array([action, action]))
@@ -21,7 +21,7 @@ def test_an_action_counts_where_it_was_taken():
 
 
 def test_actions_of_long_ago_are_forgotten():
-    repeats = Repeats.none(1)
+    repeats = Repeats.empty(1)
     for seen in range(MEMORY + 1):
         repeats = repeats.add(jnp.array([seen]), jnp.array([[0, 0]]))
     counts = [int(repeats.counts(jnp.array([seen])).sum()) for seen in (0, 1, MEMORY)]

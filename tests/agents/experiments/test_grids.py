@@ -54,7 +54,7 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, o
     ]
     run = list(runs.values())[1]
     assert (run.algorithm, run.seed, run.imports) == ("curiosity=icm", 3, given.imports)
-    assert run.config.env_id == "near-food"
+    assert run.config.env_id == "NearFood-v0"
 
 
 @pytest.mark.parametrize(

@@ -60,9 +60,9 @@ def test_two_streams_step_by_step():
     arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
     zero = jnp.zeros(())
     episodes = Episodes(tt.base_state(), zero, zero, *arrays, zero)  # pyright: ignore
-    old = returns.Moments(jnp.float32(4), jnp.int32(3))
+    old = returns.RunningVariance(jnp.float32(4), jnp.int32(3))
     intrinsic_reward = jnp.float32(novelty)
-    moments = advantages.update_moments(config, (old, old), episodes, intrinsic_reward)
+    moments = advantages.update_variances(config, (old, old), episodes, intrinsic_reward)
     advantage, target = advantages.estimate(
         config, episodes, intrinsic_reward, 0.7, jnp.float32(value), moments
     )
@@ -82,7 +82,7 @@ def test_without_curiosity_the_task_has_the_only_value():
     value = jax.random.normal(jax.random.key(2), (7, 8, 1))
     ones = jnp.ones((6, 8))
     episodes = Episodes(tt.base_state(), *[ones] * 6)
-    moments = (returns.Moments.zero(), returns.Moments.zero())
+    moments = (returns.RunningVariance.zero(), returns.RunningVariance.zero())
     found = advantages.estimate(config, episodes, jnp.zeros((6, 8)), 3.0, value, moments)
     expected = advantages.advantages_and_targets(config, ones, episodes, value[..., 0])
     assert_same((found[0], found[1][..., 0]), expected)

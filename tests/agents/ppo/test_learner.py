@@ -127,7 +127,7 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, c
     _, metrics = iterate(state._replace(iteration=jnp.int32(iteration)))
     trajectory = scripted.play(None, reset_keys(), None)
     reward, _ = scripted.intrinsic_reward(state, trajectory)
-    moments = advantages.update_moments(
+    moments = advantages.update_variances(
         BEST, (state.extrinsic, state.intrinsic), trajectory.episodes, reward
     )
     expected, _ = advantages.estimate(

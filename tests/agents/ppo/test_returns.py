@@ -61,7 +61,7 @@ def test_masked_moments_and_normalize():
 
 def test_moving_moments():
     rng = np.random.default_rng(1)
-    moments, variance = returns.Moments.zero(), 0.0
+    moments, variance = returns.RunningVariance.zero(), 0.0
     for index in range(6):
         x, mask = rng.normal(3, 2, (4, 5)), rng.integers(0, 2, (4, 5))
         moments = moments.update(jnp.float32(x), jnp.float32(mask), 0.9)
@@ -71,5 +71,5 @@ def test_moving_moments():
 
 
 def test_constant_rewards_are_not_scaled():
-    moments = returns.Moments.zero().update(jnp.zeros((3, 4)), jnp.ones((3, 4)), 0.9)
+    moments = returns.RunningVariance.zero().update(jnp.zeros((3, 4)), jnp.ones((3, 4)), 0.9)
     assert moments.std == 1.0

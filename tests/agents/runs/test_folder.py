@@ -61,10 +61,12 @@ def test_a_folder_holds_one_run(tmp_path):
 
 
 def test_a_new_folder_without_results_is_removed_and_no_other(tmp_path):
+    (tmp_path / "file").touch()
     mine = (tmp_path / "other" / "mine.txt", tmp_path / "hidden" / ".git")
     for path in mine:
         path.parent.mkdir()
         path.touch()
+    assert_refused(["holds no run", "another --name"], RunFolder(tmp_path / "file").check_free)
     for name in ("new", "other", "hidden"):
         with pytest.raises(ValueError, match=r"holds no run|broken"):
             _fail_after_creation(RunFolder(tmp_path / name))
@@ -94,6 +96,13 @@ def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
     assert_refused(
         ["unknown curiosity 'evil-curiosity'", "--import evil"], RunFolder(tmp_path / "x").read
     )
+
+
+def test_damaged_options_are_named(tmp_path):
+    folder = RunFolder(tmp_path)
+    for options in ({}, {"options": {"sets": None, "more": 1}}):
+        write_json(folder.config, options)
+        assert_refused(["config.json lacks options or holds others"], folder.read_options)
 
 
 @pytest.mark.parametrize(

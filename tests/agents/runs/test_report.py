@@ -172,3 +172,9 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
     assert ("First solved base after 4,321 episodes." in lines) == bool(episodes)
     assert "Solves 100.0 % of base, 25.0 % of other sets." in lines
     assert len(lines) <= 5
+
+
+def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
+    run, folder = Run(small_config(stop_when_solved=0.995)), RunFolder(tmp_path)
+    append_rows(folder.metrics, [row(1, evaluation=0.996)])
+    assert display.summary(folder, run, [])[0] == "First solved 99.5 % of base after 8 episodes."

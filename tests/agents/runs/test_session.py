@@ -1,5 +1,6 @@
 """Runs from Python: what they write, how they continue, and how they end badly."""
 
+import dataclasses
 import json
 import shutil
 
@@ -14,7 +15,7 @@ from agents.ppo.learner import Learner
 from agents.runs import checkpoint, session
 from agents.runs.folder import Run, RunFolder, RunOptions
 from agents.runs.loading import read_policy
-from agents.runs.metrics import read_rows
+from agents.runs.metrics import append_rows, read_rows
 from agents.runs.results import metrics, results
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped
@@ -100,6 +101,22 @@ def test_a_finished_run_returns_at_once(copy, monkeypatch):
     before = (copy / "evaluations.csv").read_bytes()
     assert train_run(copy, small_run(), TRACKED) == []
     assert (copy / "evaluations.csv").read_bytes() == before
+
+
+def test_the_best_policy_is_never_newer_than_the_last_checkpoint(tmp_path, monkeypatch):
+    """Of a run that is killed between two checkpoints."""
+    monkeypatch.setattr(session, "append_rows", lambda path, rows: _raise_at(3, path, rows))
+    options = dataclasses.replace(TRACKED, evaluate_every=1, checkpoint_every=100)
+    with pytest.raises(KeyboardInterrupt):
+        train_run(tmp_path / "x", small_run(), options)
+    best = read_policy(RunFolder(tmp_path / "x").best).iteration
+    assert best <= final_state(tmp_path / "x")[0] <= 2
+
+
+def _raise_at(iteration, path, rows):
+    if rows[0]["iteration"] == iteration:
+        raise KeyboardInterrupt
+    append_rows(path, rows)
 
 
 def test_a_finished_run_is_extended(copy):
