@@ -89,7 +89,8 @@ def _is_required(field: dataclasses.Field) -> bool:
 def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: Any) -> None:
     if _is_required(field):
         options = {**_values(kind), "metavar": field.name.upper()}
-        group.add_argument(field.name, help=text, **options)
+        many = {"nargs": "+"} if "nargs" in options else {}
+        group.add_argument(field.name, help=text, **options | many)
         return
     options = _values(kind)
     if field.metadata.get("append"):

@@ -54,12 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def evaluate(options: Options) -> None:
-    """Evaluates a source, writes the files and prints the scores.
-
-    Raises:
-      ValueError: an option is not allowed, or there is nothing to evaluate.
-      OSError: a file cannot be written.
-    """
+    """Evaluates a source, writes the files and prints the scores."""
     policy = load_policy(options.source, options.iteration, options.imports)
     config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks

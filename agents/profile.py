@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from agents.acting.policy import Policy
 from agents.command_line import option, parse
 from agents.files import write_json
 from agents.profiles import figures
@@ -43,16 +42,6 @@ class Options:
     tasks: int = 200
     imports: tuple[str, ...] = option((), append=True, flags=("--import",))
 
-    def policies(self) -> dict[str, Policy]:
-        """Loads the policies by their sources.
-
-        Raises:
-          ValueError: no source is given, or one cannot be read.
-        """
-        if not self.runs:
-            raise ValueError("give one or more runs' folders, files or names of shipped agents")
-        return {str(Path(each)): load_policy(each, imports=self.imports) for each in self.runs}
-
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if None."""
@@ -60,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(Options, arguments, "python -m agents.profile")
     with plain_errors():
         compilation.enable_cache()
-        policies = options.policies()
+        policies = {str(Path(x)): load_policy(x, imports=options.imports) for x in options.runs}
         origin = {
             "command": f"python -m agents.profile {shlex.join(arguments)}",
             "iterations": {name: policy.iteration for name, policy in policies.items()},

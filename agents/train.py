@@ -60,11 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
-    """Reads a command line and, with --resume, the stored run.
-
-    Raises:
-      ValueError: a value is not allowed, or contradicts the stored run.
-    """
+    """Reads a command line and, with --resume, the stored run."""
     # The preset, or the stored run, decides the defaults of all other options.
     (first,) = parse_all([Options], arguments, PROGRAM, partly=True)
     import_modules(first.imports)

@@ -70,11 +70,7 @@ class Grid:
     points: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=lambda: {"": {}})
 
     def runs(self, name: str, options: Options) -> dict[Path, Run]:
-        """Returns the runs by their folders, seed after seed; the grid's begins with `name`.
-
-        Raises:
-          ValueError: an option is not allowed, or a stored run has other settings.
-        """
+        """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
         if options.seeds < 1:
             raise ValueError(f"seeds must be >= 1, got {options.seeds}")
         import_modules(options.imports)
@@ -97,11 +93,7 @@ class Grid:
         return runs
 
     def configs(self, options: Options) -> dict[str, Config]:
-        """Returns the settings of every point by its name.
-
-        Raises:
-          ValueError: a setting or point is unknown or not allowed.
-        """
+        """Returns the settings of every point by its name."""
         given = dict(map(_parse, options.settings))
         if len(given) < len(options.settings):
             raise ValueError(f"give a setting only once, got {' '.join(options.settings)}")

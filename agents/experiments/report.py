@@ -24,11 +24,7 @@ WIDTH = 80
 
 
 def collect(root: Path, command: str) -> None:
-    """Writes results.csv, curves.csv and grid.json from the runs in a folder.
-
-    Raises:
-      ValueError: no run has finished an iteration, or one cannot be read.
-    """
+    """Writes results.csv, curves.csv and grid.json from the runs in a folder."""
     results, curves, folders = agents.results(root), metrics(root), find_runs(root)
     if curves.empty:
         raise ValueError(f"no run in {root} has finished an iteration")

@@ -35,7 +35,7 @@ def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "give one or more runs' folders"),
+        ([], "the following arguments are required: RUNS"),
         (["fast-base", "--import", "no.such"], "no.such"),
         (["fast-base", "--tasks", "0"], "evaluation tasks must be"),
         (["fast-base", "--parts", "swaps"], "allowed: one or more of structural, perceptual"),

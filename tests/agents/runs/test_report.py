@@ -1,13 +1,10 @@
 """Results of a run for a reader: curves, a GIF, the page, and lines on the terminal."""
 
 import base64
-import html
 import io
 import json
 import math
 import re
-import shutil
-import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -116,23 +113,6 @@ def test_a_solved_episode_becomes_a_gif(played, tmp_path):
     unsolved = {"base": outcome["base"]}
     assert report.save_first_solved(tmp_path / "x.gif", evaluator, unsolved, "base") is None
     assert not (tmp_path / "x.gif").exists()
-
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)}")
-def test_a_browser_shows_a_page(page, tmp_path):
-    """The page's script has run: it has filled in the episodes and the boards."""
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}"]
-    command = [str(BROWSER), *options, "--dump-dom", page[0].page.as_uri()]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    for each in page[1]:
-        assert f">{html.escape(each['title'])}</option>" in shown
-    assert re.search(r'<img id="board" [^>]*src="data:image/png', shown)
-    assert "The agent: step 0 of " in shown
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
