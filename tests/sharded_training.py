@@ -13,23 +13,12 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 import trap_tube_jax as tt
 from agents.acting.episodes import along_episodes
 from agents.arrays import key_data, to_arrays
-from agents.config import Config
 from agents.parallel.devices import EPISODES, ONE_DEVICE, Placement, become_devices
 from agents.ppo.learner import make_train
+from small_runs import small_config
 
-CONFIG = Config.preset(
-    "fast",
-    episodes_per_iteration=16,
-    minibatch_size=8,
-    epochs=2,
-    max_steps=6,
-    filters=(2, 2),
-    hidden=4,
-    embedding=2,
-    encode_chunk_size=8,
-    replay_fractions=(0.25, 0.25),
-    replay_capacity=5,
-)
+SIZES = {"episodes_per_iteration": 16, "minibatch_size": 8, "epochs": 2, "replay_capacity": 5}
+CONFIG = small_config(**SIZES, replay_fractions=(0.25, 0.25))
 
 
 def make_learner(axis=ONE_DEVICE):
