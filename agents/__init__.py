@@ -30,9 +30,9 @@ def load(
     Reading runs no code that the source names; only `imports` are imported.
 
     Args:
-      source: a run's folder, a file of parameters, or the name of a shipped agent. In the folder of
-        a run trained with `evaluate_every`, `best.safetensors` holds the best parameters.
-      iteration: checkpoint of a run; the newest if None.
+      source: a run's folder, a file of parameters, or the name of a shipped agent.
+      iteration: checkpoint of a run; if None, the best policy of a run that selects one
+        (`--evaluate-every`), else the newest checkpoint.
       greedy: take the most probable actions; False samples them.
       imports: modules to import first, which register curiosities, encoders or task sets.
 

@@ -29,7 +29,7 @@ class Options:
       sets: ids or short names of task sets, by default the paper's eight and the training set.
       imports: modules to import first, which register curiosities, encoders or task sets.
       tasks: tasks per set, by default the run's `eval_episodes`. Base has one.
-      iteration: checkpoint of a run, by default the newest.
+      iteration: checkpoint of a run, by default its best policy, or the newest without one.
       optimality: compares with shortest plans, which are searched for first.
       output: CSV file for the results.
       gif: GIF file for the first solved episode.

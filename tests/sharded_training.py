@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
@@ -102,6 +103,20 @@ def gradient_gap():
     )
 
 
+def shared_rows():
+    """Rows that two devices took and gave back, and how many keys they act with."""
+    placement = Placement.of(2, CONFIG)
+    axis = placement.axis
+
+    def both(rows, key):
+        own = jax.random.key_data(axis.own_key(key))[-1:]
+        return axis.gather(axis.part(rows)), axis.gather(own)
+
+    given = placement.put((jnp.arange(6), jax.random.key(0)))
+    rows, words = placement.local(jax.jit(placement.shard(both))(*given))
+    return rows.tolist(), len(set(words.tolist()))
+
+
 def main():
     become_devices(2)
     shared, rows, placement = train(2, 3)
@@ -117,6 +132,7 @@ def main():
         "transitions": int(state["transitions"]),
         "steps_played": round(float(steps)),
         "gradient_gap": gradient_gap(),
+        "shared_rows": shared_rows(),
         "seed_devices": seed_devices,
         "seeds_gap": max(
             float(np.max(np.abs(np.float64(spread[name]) - x))) for name, x in together.items()

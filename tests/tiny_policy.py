@@ -38,8 +38,8 @@ def random_policy(seed: int = 3, **settings: Any) -> Policy:
     return Policy("mine", config, random_params(config, seed), 1)
 
 
-def food_next_to_agent() -> tt.State:
+def food_next_to_agent(num_features: int = 1) -> tt.State:
     """Returns four tasks, with the food at each of `FOOD_CELLS`."""
-    base = tt.base_state(1)
+    base = tt.base_state(num_features)
     states = [base.replace(food=jnp.array(cell, jnp.int32)) for cell in FOOD_CELLS]
     return jax.tree.map(lambda *x: jnp.stack(x), *states)

@@ -22,7 +22,8 @@ def load_policy(
 
     Args:
       source: a run's folder, a file of parameters, or the name of a shipped agent.
-      iteration: checkpoint of a run; the newest if None.
+      iteration: checkpoint of a run; if None, the best policy of a run that selects one
+        (`--evaluate-every`), else the newest checkpoint.
       imports: modules to import first, which register names of the settings. No other module is
         imported, whatever the source says.
 
@@ -45,6 +46,9 @@ def load_policy(
         )
     folder = RunFolder(path)
     run = folder.read(imports)
+    name = f"seed {run.seed}"
+    if iteration is None and folder.best.is_file():
+        return read_policy(folder.best)._replace(name=name)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)
     stored = {name: array for name, array in arrays.items() if name.startswith(prefixes)}
@@ -52,7 +56,7 @@ def load_policy(
         params = _params(run.config, {k.removeprefix("params/"): v for k, v in stored.items()})
     except ValueError as error:
         raise ValueError(f"{folder.checkpoints} does not fit this version: {error}") from error
-    return Policy(f"seed {run.seed}", run.config, params, record["iteration"])
+    return Policy(name, run.config, params, record["iteration"])
 
 
 def save_policy(path: Path, policy: Policy) -> None:

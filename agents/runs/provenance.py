@@ -24,7 +24,7 @@ def provenance() -> dict[str, Any]:
         "processor": _processor(),
         "cores": cores(),
         "device": jax.devices()[0].device_kind,
-        "platform": platform.platform(),
+        "platform": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in VERSIONED},
         "commit": commit(),

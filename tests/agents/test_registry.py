@@ -8,9 +8,8 @@ from agents.registry import Registry, curiosities
 from refusal import assert_refused
 
 
-def test_a_name_of_yours_is_allowed_and_may_be_registered_again(monkeypatch):
-    monkeypatch.setitem(curiosities, "mine", print)
-    curiosities.own.add("mine")
+def test_a_name_of_yours_is_allowed_and_may_be_registered_again(own_names):
+    register("mine", print)
     register("mine", Curiosity)
     assert curiosities.factory("mine") is Curiosity
     assert Config(curiosity="mine").curiosity == "mine"

@@ -15,6 +15,7 @@ from agents.config import PRESETS, Config
 from agents.files import read_json
 from agents.runs import compilation
 from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.provenance import commit
 from agents.train import main, parse, run_path
 from refusal import refused
 from small_runs import final_state, options, read_iterations, run, start, untimed
@@ -39,20 +40,20 @@ def test_a_run_leaves_its_results_and_says_where(whole):
     assert output.count("iteration ") == ITERATIONS
     assert f"--resume {folder} --iterations {2 * ITERATIONS}" in output
     (machine,) = read_json(folder / "provenance.json")
-    assert machine["commit"]
+    assert machine["commit"] == commit()
 
 
 def test_killed_runs_continue_to_the_same_bits(whole, tmp_path):
-    """Killed at a moment that differs every time, while another process reads the run."""
+    """Killed at a moment that differs every time; it can be evaluated before it goes on."""
     path = tmp_path / "killed"
     arguments = ["--name", "killed", "--out", tmp_path, "--checkpoint-every", 1]
     process = start("agents.train", *options(), "--iterations", ITERATIONS, *arguments)
     read_iterations(process, 3)
-    output = run("agents.evaluate", path, "--sets", "base")
-    assert "seed 0, iteration" in output
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL
+    assert 2 <= final_state(path)[0] < ITERATIONS, "killed in training"
+    assert "seed 0, iteration" in run("agents.evaluate", path, "--sets", "base")
     run("agents.train", "--resume", path, "--checkpoint-every", 1)
     assert final_state(path) == final_state(whole[0])
     assert untimed(path) == untimed(whole[0])

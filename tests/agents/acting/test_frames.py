@@ -7,6 +7,7 @@ import pytest
 
 import trap_tube_jax as tt
 from agents.acting.frames import Frame
+from trap_tube_jax.objects import AGENT, FOOD
 
 NUM_FRAMES = 8
 NUMBERS = range(NUM_FRAMES)
@@ -89,6 +90,8 @@ def test_a_state_and_its_images_are_equal_in_their_frames_that_face_the_food(sta
     np.testing.assert_array_equal(boards[:, unique], np.repeat(boards[:1, unique], NUM_FRAMES, 0))
 
 
-def test_the_frame_is_the_identity_without_visible_food():
-    blank = jnp.zeros((12, 12, 3), jnp.uint8)
-    assert not any(bool(part) for part in Frame.facing_food(blank))
+@pytest.mark.parametrize("hidden", [AGENT, FOOD])
+def test_the_frame_is_the_identity_where_agent_or_food_is_hidden(hidden):
+    shown = tt.base_state().palette[AGENT + FOOD - hidden]
+    board = jnp.zeros((12, 12, 3), jnp.uint8).at[2, 7].set(shown)
+    assert not any(bool(part) for part in Frame.facing_food(board))

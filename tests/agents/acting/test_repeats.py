@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.acting.repeats import MEMORY, Repeats
+from agents.acting.repeats import MEMORY, Repeats, board_ids
 from agents.networks.actions import ActionDistribution
 from tiny_policy import STEPS, food_next_to_agent, random_policy
 
@@ -37,6 +37,13 @@ def test_a_penalty_changes_the_most_probable_action():
     assert actions.mode(penalty).tolist() == [[1, 2]]
     penalty = penalty.at[0, 1, 2].set(1.1)
     assert actions.mode(penalty).tolist() == [[1, 1]], "the lower index of two equal ones"
+
+
+def test_boards_have_numbers_of_their_own():
+    boards = jax.vmap(tt.observe)(food_next_to_agent())
+    numbers = board_ids(boards)
+    assert len(set(numbers.tolist())) == len(boards)
+    np.testing.assert_array_equal(board_ids(boards[::-1])[::-1], numbers)
 
 
 def test_under_a_high_penalty_no_action_is_repeated():

@@ -8,6 +8,7 @@ import pytest
 import trap_tube_jax as tt
 from agents.acting.encodings import layout_content
 from agents.acting.episodes import Episodes
+from agents.curiosity.base import Experience
 from agents.curiosity.counts import Counts, observation_slots, visit_bonus
 
 BATCH = 40
@@ -28,6 +29,17 @@ def test_visits_pay_by_the_root_of_their_number():
     bonus, visits = visit_bonus(jnp.zeros(8).at[5].set(3.0), slot, mask)
     np.testing.assert_allclose(bonus, [[2**-0.5, 2**-0.5], [0.5, 0.0]], rtol=1e-6)
     np.testing.assert_array_equal(visits, [0, 0, 0, 2, 0, 4, 0, 0])
+
+
+def test_the_next_observation_pays_until_the_episode_ends():
+    column = jnp.array([[0, 0], [0, 2], [1, 3], [0, 0]])  # of the agent, in two episodes
+    cells = jnp.zeros((4, 2, 3, 2), jnp.uint8).at[:, :, 0, 1].set(column.astype(jnp.uint8))
+    mask = jnp.array([[1.0, 1.0], [1.0, 0.0], [1.0, 0.0]])
+    layout = jax.tree.map(lambda x: jnp.stack([x, x]), tt.base_state())
+    counts, episodes = Counts(tt.make("base")), Episodes(layout, cells, *[mask] * 5)
+    pay, visits = counts.reward({}, counts.memory(), Experience(episodes, mask))
+    np.testing.assert_allclose(pay.T, [[0.5**0.5, 1, 0.5**0.5], [1, 0, 0]], rtol=1e-6)
+    assert visits.sum() == 4
 
 
 def test_equal_observations_share_a_slot_and_few_others_do():

@@ -60,6 +60,7 @@ def test_success_is_by_set_and_algorithm_with_the_papers_figures():
         + rows("ppo+icm", [9, 9, 9], iteration=1)  # tested before training went on
         + rows("ppo+icm", [1, 1, 1], purpose="validation", iteration=3)
         + rows("ppo+icm", [6, 6, 8], task_set="sy", layouts=3)
+        + rows("ppo+icm", [8, 10, 10], task_set="st")
         + rows("ppo+icm", [10, 10, 10], task_set="base")
         + rows("ppo", [1])
         + rows("ppo", [10], task_set="own")
@@ -68,8 +69,9 @@ def test_success_is_by_set_and_algorithm_with_the_papers_figures():
     assert list(table) == ["ppo+icm", "ppo", "PPO, paper", "PPO + ICM, paper"]
     assert table.loc["{P}"].tolist() == ["60.0 [35.2, 84.8]", "10.0", "0.0", "2.0 ± 3.0"]
     assert table.loc["{Sy}"].tolist() == ["66.7 (3 of 5)", "–", "35.5 ± 10.9", "40.2 ± 16.9"]
+    assert table.loc["{St}", "ppo+icm"] == "93.3 [64.6, 100.0]"
     assert table.loc["own"].tolist() == ["–", "100.0", "–", "–"]
-    assert table.loc[tables.MEAN, "ppo+icm"] == "63.3 [37.5, 89.2]"  # base does not count
+    assert table.loc[tables.MEAN, "ppo+icm"] == "73.3 [48.5, 98.2]"  # base does not count
     by_seed = tables.tables(results, curves(), ABOUT)["Test tasks solved by seed, %"]
     assert by_seed.loc["ppo+icm, seed 2", ["{P}", "iteration"]].tolist() == ["70.0", "2"]
     other = tables.tables(results, curves(), {**ABOUT, "train_set": "sy"})

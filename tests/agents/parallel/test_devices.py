@@ -61,5 +61,6 @@ def test_two_devices_train_as_one():
     assert two["is_finite"] == [1, 1, 1]
     assert two["transitions"] == two["steps_played"] > 0
     assert two["gradient_gap"] < 1e-5  # of the mean of two halves and the whole
+    assert two["shared_rows"] == [list(range(6)), 2]
     assert two["seed_devices"] == 2
     assert two["seeds_gap"] < 1e-5  # between a seed on each device and both on one

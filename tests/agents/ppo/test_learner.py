@@ -19,7 +19,7 @@ from agents.acting.episodes import Episodes
 from agents.acting.frames import Frame
 from agents.acting.rollout import Trajectory
 from agents.arrays import to_arrays
-from agents.curiosity import Curiosity
+from agents.curiosity import Curiosity, Experience
 from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
@@ -204,9 +204,10 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
     best = make_train(dataclasses.replace(BEST, epochs=1))
     state = best.init(jax.random.key(0))
     assert state.params["heads"]["params"]["value"]["kernel"].shape == (4, 2)
+    iterate = jax.jit(best.iterate)
     with jax.debug_key_reuse(True):
-        after, metrics = jax.jit(best.iterate)(state)
-        jax.jit(best.iterate)(after)
+        after, metrics = iterate(state)
+        iterate(after)
     assert float(metrics["is_finite"]) == 1
     assert all(np.isfinite(float(value)) for value in metrics.values())
     before, after = to_arrays(state.params), to_arrays(after.params)
@@ -214,11 +215,12 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
 
 
-def test_divergence_is_a_metric():
-    diverging = make_train(dataclasses.replace(PLAIN, learning_rate=1e9, max_gradient_norm=1e9))
-    iterate = jax.jit(diverging.iterate)
-    _, metrics = iterate(iterate(diverging.init(jax.random.key(0)))[0])
-    assert float(metrics["is_finite"]) == 0
+def test_divergence_is_a_metric(scripted):
+    _, state, iterate = scripted
+    assert float(iterate(state)[1]["is_finite"]) == 1
+    broken = jax.tree.map(jnp.copy, state.params)
+    broken["heads"]["params"]["value"]["bias"] = jnp.full(2, jnp.inf)
+    assert float(iterate(state._replace(params=broken))[1]["is_finite"]) == 0
 
 
 class Returning(Curiosity):
@@ -235,6 +237,42 @@ class Returning(Curiosity):
             if type(losses) is dict
             else dict.fromkeys(losses or (), experience.episodes.reward)
         )
+
+
+class Known(Learner):
+    """Has seen an episode of two steps, of which the second is padding."""
+
+    def experience(self, params, episodes, played=None):
+        hidden, width = self.config.hidden, 2 * self.config.embedding
+        outputs = (jnp.zeros((2, 1, hidden)), None, jnp.zeros((2, 1, width)))
+        return Experience(episodes, jnp.zeros((3, 1, 0)), *outputs)
+
+
+def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
+    """By parameters of 0: all actions and motions are as likely, and all values 0."""
+    weights = {"value_coef": 0.5, "entropy_coef": 0.1, "motion_coef": 0.25, "curiosity_coef": 3.0}
+    two_heads = {"curiosity": "effects", "value_heads": "separate", "bootstrap": "value"}
+    made = make_train(Config(**{**SETTINGS, **weights, **two_heads}))
+    own = Returning(losses={"own_loss": jnp.ones((2, 1))})
+    params = jax.eval_shape(made.init, jax.random.key(0)).params
+    params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
+    mask, cells = jnp.array([[1.0], [0.0]]), jnp.zeros((3, 1, 3, 2), jnp.uint8)
+    episodes = Episodes(tt.base_state(), cells, jnp.zeros((2, 1, 2), jnp.int32), *[mask] * 4)
+    old = jnp.full((2, 1), -2 * np.log(4) - np.log(1.5), jnp.float32)  # clipped to 1.2
+    target = jnp.array([[[3.0, 4.0]], [[9.0, 9.0]]])
+    batch = learner.Batch(episodes, old, jnp.array([[2.0], [9.0]]), target)
+    total, found = Known(**{**vars(made), "curiosity": own}).loss(params, batch)
+    expected = {
+        "policy_loss": -1.2 * 2 / 2,
+        "value_loss": 0.5 * (9 + 16) / 2,
+        "entropy_loss": -0.1 * 2 * np.log(4) / 2,
+        "motion_loss": 0.25 * 6 * np.log(2) / 2,
+        "own_loss": 3.0 * 1 / 2,
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
+    np.testing.assert_allclose(total, sum(expected.values()), rtol=1e-5)
+    np.testing.assert_allclose(found["entropy"], 2 * np.log(4), rtol=1e-6)
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Figures of profiles made by hand."""
 
+import numpy as np
 import pandas as pd
 
 from agents.profiles import figures
@@ -20,3 +21,5 @@ def test_success_is_drawn_from_0_to_1_with_a_colour_for_each_policy(tmp_path, mo
     assert shown[0].get_ylabel()
     colours = [[lines.lines[0].get_color() for lines in axis.containers] for axis in shown]
     assert colours == [list(figures.COLORS[:2])] * 3
+    bar = shown[0].containers[0].lines[2][0].get_segments()[0][:, 1]
+    np.testing.assert_allclose(bar, [0.5101, 1], atol=1e-3)  # Wilson, 4 of 4

@@ -2,6 +2,8 @@
 
 import json
 import os
+from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -19,14 +21,23 @@ def test_a_run_is_the_same_after_json():
 
 
 @pytest.mark.parametrize(
-    ("values", "words"),
+    ("make", "values", "words"),
     [
-        ({"seed": -1}, ["seed must be an integer >= 0 and <= 2147483647", "-1"]),
-        ({"seed": 1.0}, ["seed must be an integer", "1.0"]),
+        (partial(Run, Config()), {"seed": -1}, ["seed must be an integer >= 0 and <= 2147483647"]),
+        (partial(Run, Config()), {"seed": 1.0}, ["seed must be an integer", "1.0"]),
+        (RunOptions, {"keep": 0}, ["keep must be an integer >= 1, got 0"]),
+        (RunOptions, {"checkpoint_every": 0}, ["checkpoint_every must be an integer >= 1, got 0"]),
+        (RunOptions, {"evaluate_every": -1}, ["evaluate_every must be an integer >= 0, got -1"]),
+        (RunOptions, {"reported": 10**9}, ["reported must be", "<= 1000000, got 1000000000"]),
+        (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
+        *(
+            (check_name, {"name": name}, ["a folder's name without a path", repr(name)])
+            for name in ("", ".", "..", "a/b", ".hidden")
+        ),
     ],
 )
-def test_impossible_runs_are_refused(values, words):
-    assert_refused(words, Run, Config(), **values)
+def test_impossible_runs_options_and_names_are_refused(make, values, words):
+    assert_refused(words, make, **values)
 
 
 @pytest.mark.parametrize(
@@ -113,14 +124,16 @@ def test_damaged_settings_are_named(tmp_path, text):
     assert_refused([str(tmp_path / "config.json")], RunFolder(tmp_path).read)
 
 
-def test_files_are_written_whole_or_not_at_all(tmp_path):
-    write_json(tmp_path / "new" / "x.json", {"a": [1, 2]})
-    with pytest.raises(TypeError):
-        write_json(tmp_path / "new" / "x.json", {"a": object()})
-    assert read_json(tmp_path / "new" / "x.json") == {"a": [1, 2]}
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.json"]
+def test_files_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path, write = tmp_path / "new" / "x.json", Path.write_bytes
+    write_json(path, {"a": [1, 2]})
 
+    def fill_the_disk(self, content):
+        write(self, content[:3])
+        raise OSError("No space left on device")
 
-@pytest.mark.parametrize("name", ["", ".", "..", "a/b", ".hidden"])
-def test_names_are_plain(name):
-    assert_refused(["a folder's name without a path", repr(name)], check_name, name)
+    monkeypatch.setattr(Path, "write_bytes", fill_the_disk)
+    with pytest.raises(OSError, match="No space left"):
+        write_json(path, {"a": 3})
+    assert read_json(path) == {"a": [1, 2]}
+    assert list(path.parent.iterdir()) == [path]

@@ -1,6 +1,7 @@
 """Policies of runs, files and shipped agents are loaded by name, or refused with the known ones."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,10 @@ import pytest
 import safetensors.numpy
 
 import agents
+import trap_tube_jax as tt
+from agents import pretrained
 from agents.arrays import to_arrays
+from agents.config import Config
 from agents.runs import checkpoint
 from agents.runs.folder import Run, RunFolder
 from agents.runs.loading import read_policy, save_policy
@@ -38,6 +42,14 @@ def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path, monkeypatc
     (tmp_path / "fast-base").mkdir()  # a folder that holds no run hides no shipped agent
     monkeypatch.chdir(tmp_path)
     assert agents.load("fast-base").config.env_id == "TrapTube-v0"
+
+
+def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path):
+    path = shutil.copytree(run_path, tmp_path / "copy")
+    save_policy(RunFolder(path).best, POLICY._replace(iteration=4))
+    policy = agents.load(path)
+    assert (policy.name, policy.iteration) == ("seed 3", 4)
+    assert agents.load(path, iteration=6).iteration == 6
 
 
 @pytest.mark.parametrize(
@@ -100,17 +112,16 @@ def test_files_of_other_content_are_refused(stored, changes, message, tmp_path):
     assert str(path) in str(error.value)
 
 
-@pytest.mark.parametrize(
-    "damage", [lambda b: b[:-1], lambda b: b[:100], lambda b: b"", lambda b: b[1:]]
-)
-def test_damaged_files_are_refused(damage, tmp_path):
-    path = tmp_path / "mine.safetensors"
-    save_policy(path, POLICY)
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match=r"mine\.safetensors is not a file of arrays"):
-        read_policy(path)
+PRESETS_OF = {
+    "fast-base": ("fast", {}),
+    "icm-base": ("paper", {"stop_when_solved": 1.0}),
+    "best-pstsy": ("best", {}),
+}
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="mine"):
-        read_policy(tmp_path / "mine.safetensors")
+@pytest.mark.parametrize("name", pretrained.names())
+def test_shipped_agents_have_the_presets_of_today_and_solve_their_tasks(name):
+    policy, (preset, changes) = agents.load(name), PRESETS_OF[name]
+    own = tt.task_set(policy.config.env_id)
+    assert policy.config == Config.preset(preset, **changes, env_id=own.id)
+    assert tt.score(policy, [own.short], tasks=32)[own.short].percent > 85

@@ -1,10 +1,14 @@
 """Rows of numbers on disk, and what follows from them."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from agents.config import Config
-from agents.runs.metrics import append_rows, is_last, read_rows, rewind_rows
+from agents.runs.metrics import append_rows, evaluation_rows, is_last, read_rows, rewind_rows
+from trap_tube_jax.scoring.scores import Score
 
 
 def row(iteration, **values):
@@ -40,6 +44,18 @@ def test_files_without_folder_header_or_column_are_refused(tmp_path):
     path.write_text("2,1\n3,1\n")
     with pytest.raises(ValueError, match=r"x.csv has no header with a column 'iteration'"):
         rewind_rows(path, 3)
+
+
+def test_a_score_is_a_row():
+    solved, layout = np.array([True, True, False]), np.array([0, 0, 1])
+    few = Score.of("sy", "{Sy}", solved, np.array([3, 6, 50]), layout=layout)
+    none = Score.of("p", "{P}", np.zeros(4, bool), np.full(4, 50))
+    policy: Any = SimpleNamespace(iteration=7)
+    names = ("task_set", "tasks", "solved", "layouts", "layouts_total", "length")
+    assert evaluation_rows([few, none], policy, "test") == [
+        {"iteration": 7, "purpose": "test", **dict(zip(names, values, strict=True))}
+        for values in (("sy", 3, 2, 1, 2, 4.5), ("p", 4, 0, "", "", ""))
+    ]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import math
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -19,14 +18,11 @@ from agents.runs import display, report
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import append_rows
 from small_runs import small_config
-from tiny_policy import random_params
+from tiny_policy import food_next_to_agent, random_params
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
-# The food next to the agent, on each side in turn: whichever way the first move of a policy
-# leads, it solves one of them.
-FOOD_CELLS = [(8, 1), (10, 1), (9, 0), (9, 2)]
 CONFIG = small_config(curiosity="counts", stop_when_solved=0.0)
 
 
@@ -40,10 +36,8 @@ def row(iteration, **values):
 @pytest.fixture(scope="module")
 def played():
     """An untrained policy's evaluator on base, {P} and a set of known outcome, and outcomes."""
-    base = tt.base_state()
-    near = [base.replace(food=jnp.array(cell, jnp.int32)) for cell in FOOD_CELLS]
     tasks = {name: evaluation_tasks(name, 2) for name in ("base", "p")}
-    tasks["mine"] = jax.tree.map(lambda *x: jnp.stack(x), *near)
+    tasks["mine"] = food_next_to_agent(3)
     evaluator = Evaluator(CONFIG, tasks)
     return evaluator, evaluator(random_params(CONFIG))
 

@@ -1,12 +1,14 @@
 """Runs from Python: what they write, how they continue, and how they end badly."""
 
 import dataclasses
+import itertools
 import json
 import shutil
+from types import SimpleNamespace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 import agents
@@ -20,24 +22,34 @@ from agents.runs.results import metrics, results
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped
 from small_runs import final_state, small_config, untimed
-from trap_tube_jax.scoring.tasks import ALL_SETS
+from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks
 
 ITERATIONS = 6
 TRACKED = RunOptions(
     checkpoint_every=2, evaluate_every=2, sets=("base", "p"), reported=3, report=False
 )
 PLAIN = RunOptions(checkpoint_every=2, sets=("base",), report=False)
+ASKED: list[tuple[str, str]] = []  # sets and purposes of the tasks that `whole` has drawn
 
 
 def small_run(iterations=ITERATIONS, **values):
-    return Run(small_config(iterations=iterations), **values)
+    replay = {"replay_fractions": (0.25, 0.25), "replay_capacity": 5}
+    return Run(small_config(iterations=iterations, motion_coef=0.5, **replay), **values)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A run that nothing interrupts, evaluated as it goes. Not to be changed."""
     path = tmp_path_factory.mktemp("runs") / "whole"
-    train_run(path, small_run(), TRACKED)
+
+    def record(name, number, features, purpose):
+        ASKED.append((name, purpose))
+        return evaluation_tasks(name, number, features, purpose)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (evaluation, session):
+            patch.setattr(module, "evaluation_tasks", record)
+        train_run(path, small_run(), TRACKED)
     return path
 
 
@@ -59,6 +71,12 @@ def test_a_run_leaves_its_rows(whole):
     ]
     best = read_policy(RunFolder(whole).best).iteration
     assert found == [*validation, (best, "test", "base", 1), (best, "test", "p", 3)]
+    assert agents.load(whole).iteration == best
+
+
+def test_only_the_final_evaluation_plays_test_tasks(whole):
+    chosen_by = [(name, "validation") for name in ("base", "p", "TrapTube-v0")]
+    assert [*chosen_by, ("base", "test"), ("p", "test")] == ASKED
 
 
 def test_results_are_a_tidy_table(whole):
@@ -119,14 +137,37 @@ def _raise_at(iteration, path, rows):
     append_rows(path, rows)
 
 
-def test_a_finished_run_is_extended(copy):
+def test_a_finished_run_is_extended(copy, monkeypatch):
+    """Its last parameters are made the best, so they are tested; an iteration takes a second."""
+    clock = SimpleNamespace(perf_counter=itertools.count().__next__)
+    monkeypatch.setattr(session, "time", clock)
+    monkeypatch.setattr(session, "best_iteration", lambda rows, own: ITERATIONS + 1)
     train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
     assert final_state(copy)[0] == ITERATIONS + 1
     assert RunFolder(copy).read().config.iterations == ITERATIONS + 1
     tested = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
-    assert len(tested) in (2, 4)  # as the best parameters are the old ones or new ones
+    assert tested["iteration"].tolist()[2:] == [ITERATIONS + 1] * 2
+    before, after = read_rows(copy / "metrics.csv")["seconds"].iloc[-2:]
+    assert after == pytest.approx(before + 1)
     with pytest.raises(ValueError, match="iterations must be at least 7, which are done, got 6"):
         train_run(copy, small_run(), TRACKED)
+
+
+@pytest.mark.parametrize(
+    ("own", "sets", "best"),
+    [("p", ("base", "p", "st"), 2), ("base", ("base", "p", "st"), 1), ("p", ("base",), 1)],
+)
+def test_the_best_iteration_is_the_first_of_the_highest_mean_over_sets(own, sets, best):
+    """Sets count the same whatever their size; base only where it is trained on; tests never."""
+    solved = {1: (1, 1, 50), 2: (0, 4, 0), 3: (0, 2, 50)}
+    rows = [
+        {"iteration": i, "purpose": "validation", "task_set": name, "tasks": tasks, "solved": count}
+        for i, counts in solved.items()
+        for name, tasks, count in zip(("base", "p", "st"), (1, 4, 100), counts, strict=True)
+    ]
+    tested = [{**x, "iteration": 4, "purpose": "test", "solved": x["tasks"]} for x in rows[:3]]
+    found = pd.DataFrame(rows + tested)
+    assert session.best_iteration(found[found["task_set"].isin(sets)], own) == best
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
@@ -179,25 +220,15 @@ def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch
     assert final_state(tmp_path / "x")[0] == ITERATIONS
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"keep": 0}, "keep must be an integer >= 1, got 0"),
-        ({"checkpoint_every": 0}, "checkpoint_every must be an integer >= 1, got 0"),
-        ({"evaluate_every": -1}, "evaluate_every must be an integer >= 0, got -1"),
-        ({"reported": 10**9}, "reported must be an integer >= 1 and <= 1000000, got 1000000000"),
-        ({"sets": ("q",)}, "unknown task set 'q'"),
-    ],
-)
-def test_impossible_options_are_refused(values, message):
-    with pytest.raises(ValueError, match=message):
-        RunOptions(**values)
-
-
 def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypatch):
     """Whose float32 mean is 0.99999994."""
-    played = evaluation.Evaluation(jnp.ones(41, bool), *jnp.ones((3, 41)))
-    monkeypatch.setattr(session, "evaluate", lambda *args: played)
+
+    def evaluate(agent, params, env, tasks):
+        """Solves all by any parameters but the first, whose biases are 0."""
+        trained = jnp.any(params["heads"]["params"]["value"]["bias"] != 0)
+        return evaluation.Evaluation(jnp.full(41, trained), *jnp.ones((3, 41)))
+
+    monkeypatch.setattr(session, "evaluate", evaluate)
     run = Run(small_config(iterations=3, stop_when_solved=1.0))
     train_run(tmp_path / "x", run, PLAIN)
     assert [row["evaluation"] for row in untimed(tmp_path / "x")] == ["1.0"]
@@ -209,8 +240,3 @@ def test_without_evaluation_the_final_policy_is_tested_on_all_sets(tmp_path):
     assert rows["task_set"].tolist() == list(ALL_SETS)
     assert set(zip(rows["purpose"], rows["iteration"], strict=True)) == {("test", 1)}
     assert not RunFolder(tmp_path / "x").best.exists()
-    policy = agents.load(tmp_path / "x")
-    agents.save(tmp_path / "mine.safetensors", policy)
-    again = agents.load(tmp_path / "mine.safetensors")
-    assert (again.name, again.config) == ("mine", policy.config)
-    jax.tree.map(np.testing.assert_array_equal, again.params, policy.params)

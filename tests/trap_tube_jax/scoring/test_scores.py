@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, wilson_interval
+from trap_tube_jax.scoring.scores import Layouts, Optimality, Score, Scores, wilson_interval
 
 
 def test_optimality_compares_with_shortest_plans():
@@ -35,4 +35,7 @@ def test_few_layouts_are_counted_and_have_no_interval():
     score = Score.of("stsy", "{St, Sy}", solved, np.full(5, 9), layout=layout)
     assert (score.percent, score.interval, score.layouts) == (60.0, None, Layouts(1, 2))
     assert str(score.layouts) == "1 of 2"
-    assert Score.of("p", "{P}", solved, np.full(5, 9)).layouts is None
+    score = Score.of("p", "{P}", np.arange(10) < 5, np.full(10, 9))
+    assert score.layouts is None
+    assert score.interval == pytest.approx((23.659, 76.341), abs=1e-3)
+    assert " 23.7-76.3 |" in str(Scores(1, "0", None, (score,)))
