@@ -34,7 +34,7 @@ def from_arrays(arrays: Arrays, template: Tree) -> Tree:
 
     Args:
       arrays: one array for each leaf of the template.
-      template: a pytree of arrays or of `jax.ShapeDtypeStruct`.
+      template: a pytree of arrays or of `jax.ShapeDtypeStruct`; its keys are of JAX's default kind.
 
     Raises:
       ValueError: a name, shape or dtype differs; the message names it.
@@ -61,17 +61,12 @@ def read_arrays(path: Path) -> tuple[Arrays, dict[str, Any]]:
       ValueError: the file is damaged or of another kind.
       OSError: the file cannot be opened.
     """
-    with path.open("rb"):  # an OSError names the file, safetensors' own may not
-        pass
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            about = json.loads((file.metadata() or {})["json"])
-    except (safetensors.SafetensorError, KeyError, ValueError, RecursionError) as error:
+            return arrays, {**json.loads((file.metadata() or {})["json"])}
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not a file of arrays of this package: {error}") from error
-    if not isinstance(about, dict):
-        raise ValueError(f"{path} is not a file of arrays of this package")
-    return arrays, about
 
 
 def is_key(x: Any) -> bool:
@@ -94,13 +89,5 @@ def _to_leaf(name: str, array: np.ndarray, template: Any) -> jax.Array:
         raise ValueError(
             f"{name} is {array.dtype}{list(array.shape)}, not {wanted.dtype}{list(wanted.shape)}"
         )
-    if is_key(template):
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=_key_impl(template))
-    return jnp.asarray(array)
-
-
-def _key_impl(template: Any) -> Any:
-    """Returns the implementation of keys, also of their shapes, which JAX tells in a trace."""
-    found: list[Any] = []
-    jax.eval_shape(lambda key: found.append(jax.random.key_impl(key)), template)
-    return found[0]
+    leaf = jnp.asarray(array)
+    return jax.random.wrap_key_data(leaf) if is_key(template) else leaf

@@ -9,6 +9,8 @@ import types
 from collections.abc import Sequence
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from trap_tube_jax.imports import import_modules
+
 Options = TypeVar("Options")
 
 
@@ -37,7 +39,7 @@ def parse(cls: type[Options], arguments: Sequence[str] | None, prog: str) -> Opt
 def parse_all(
     declared: Sequence[Any], arguments: Sequence[str] | None, prog: str, *, partly: bool = False
 ) -> list[Any]:
-    """Reads a command line into several dataclasses.
+    """Reads a command line into several dataclasses; first imports the modules of `--import`.
 
     Args:
       declared: dataclasses, or instances whose values are the defaults. The docstring of the first
@@ -72,6 +74,7 @@ def parse_all(
             _add(groups[group], field, getattr(each, field.name, None), text, kinds[field.name])
     found = vars(parser.parse_known_args(arguments)[0] if partly else parser.parse_args(arguments))
     values = {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
+    import_modules(values.get("imports", ()))  # they register names that the classes check
     return [
         _class(each)(**{field.name: values[field.name] for field in dataclasses.fields(each)})
         for each in declared

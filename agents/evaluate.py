@@ -10,13 +10,10 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.command_line import option, parse
 from agents.runs import compilation
-from agents.runs.loading import load_policy
+from agents.runs.loading import load
 from agents.runs.metrics import evaluation_rows
 from agents.runs.report import save_first_solved
-from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.scoring.scores import Scores
-from trap_tube_jax.scoring.tasks import PROTOCOL
 from trap_tube_jax.solver import solve_batch
 
 
@@ -47,15 +44,15 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if None."""
-    options = parse(Options, arguments, "python -m agents.evaluate")
-    compilation.enable_cache()
     with plain_errors():
+        options = parse(Options, arguments, "python -m agents.evaluate")
+        compilation.enable_cache()
         evaluate(options)
 
 
 def evaluate(options: Options) -> None:
     """Evaluates a source, writes the files and prints the scores."""
-    policy = load_policy(options.source, options.iteration, options.imports)
+    policy = load(options.source, iteration=options.iteration, imports=options.imports)
     config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks
     evaluator = Evaluator.of_sets(config, options.sets or own_and_paper_sets(config), tasks)
@@ -76,7 +73,7 @@ def evaluate(options: Options) -> None:
         shown = save_first_solved(options.gif, evaluator, played, prefer)
         notes.append(f"solved episode of {shown}: {options.gif}" if shown else "nothing is solved")
     print(f"{policy.name}, iteration {policy.iteration}\n")
-    print(Scores(PROTOCOL, __version__, None, tuple(scores)), end="\n\n")
+    print(scores, end="\n\n")
     print(*notes, sep="\n")
 
 

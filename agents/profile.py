@@ -12,7 +12,7 @@ from agents.profiles import figures
 from agents.profiles.measure import failure_table, profile, success_table
 from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation
-from agents.runs.loading import load_policy
+from agents.runs.loading import load
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import plain_errors
 
@@ -46,10 +46,10 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` are those of the process if None."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = parse(Options, arguments, "python -m agents.profile")
     with plain_errors():
+        options = parse(Options, arguments, "python -m agents.profile")
         compilation.enable_cache()
-        policies = {str(Path(x)): load_policy(x, imports=options.imports) for x in options.runs}
+        policies = {str(Path(x)): load(x, imports=options.imports) for x in options.runs}
         origin = {
             "command": f"python -m agents.profile {shlex.join(arguments)}",
             "iterations": {name: policy.iteration for name, policy in policies.items()},

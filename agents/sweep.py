@@ -14,12 +14,9 @@ from agents.command_line import parse_all
 from agents.experiments import report
 from agents.experiments.grids import Grid
 from agents.experiments.workers import ProcessPerCall, log_of, make_executor, train_logged
-from agents.runs.display import say
 from agents.runs.folder import Run, RunFolder, RunOptions
 from agents.runs.stopping import Stopped, exit_code, stop_signals
 from trap_tube_jax.command_line import plain_errors
-
-LINES = 5  # last lines shown of a failed run's log
 
 
 def main(
@@ -41,7 +38,7 @@ def main(
         if stopped.
     """
     arguments, grid = sys.argv[1:] if arguments is None else list(arguments), grid or Grid()
-    console = Console()
+    console = Console(highlight=False)
     with plain_errors():
         options, how = parse_all([grid.options, grid.run], arguments, program)
         jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
@@ -52,9 +49,9 @@ def main(
                 failed = launch(runs, how, pool, console)
                 if any(RunFolder(path).metrics.exists() for path in runs):
                     report.collect(root, f"{program} {shlex.join(arguments)}".strip())
-                    say(console, report.write(root))
+                    console.out(report.write(root))
         except (Stopped, KeyboardInterrupt) as stopped:
-            say(console, "Stopped. The same command continues.")
+            console.out("Stopped. The same command continues.")
             raise SystemExit(exit_code(stopped)) from None
     if failed:
         raise SystemExit(1)
@@ -82,7 +79,7 @@ def launch(
 
     def ask() -> None:
         stop_file.touch()
-        say(console, "Finishing the current iterations; Ctrl-C again stops now.")
+        console.out("Finishing the current iterations; Ctrl-C again stops now.")
 
     stop_file.unlink(missing_ok=True)
     calls: dict[Future, Path] = {}
@@ -98,10 +95,9 @@ def launch(
                 if call.cancelled():
                     continue
                 path, outcome = calls[call], _outcome(call)
-                say(console, f"[{count}/{len(runs)}] {path.name}: {outcome}")
+                log = f"; see {log_of(path)}" if outcome.startswith("failed") else ""
+                console.out(f"[{count}/{len(runs)}] {path.name}: {outcome}{log}")
                 failed += [] if outcome == "done" else [path]
-                if outcome.startswith("failed"):
-                    say(console, _tail(log_of(path)))
         except BaseException:  # not even the current iteration is waited for
             stop_file.touch()
             for call in calls:
@@ -131,11 +127,6 @@ def _outcome(call: Future) -> str:
         return call.result()
     except Exception as error:  # its process was killed, or Dask gave up
         return f"failed: {error}"
-
-
-def _tail(log: Path) -> str:
-    lines = log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
-    return "\n".join([f"The end of {log}:", *lines[-LINES:]])
 
 
 if __name__ == "__main__":

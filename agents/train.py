@@ -16,11 +16,7 @@ from agents.runs import compilation, display
 from agents.runs.folder import Run, RunFolder, RunOptions, check_name
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped, exit_code
-from trap_tube_jax._version import __version__
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.imports import import_modules
-from trap_tube_jax.scoring.scores import Scores
-from trap_tube_jax.scoring.tasks import PROTOCOL
 
 PROGRAM = "python -m agents.train"
 
@@ -63,16 +59,16 @@ def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     """Reads a command line and, with --resume, the stored run."""
     # The preset, or the stored run, decides the defaults of all other options.
     (first,) = parse_all([Options], arguments, PROGRAM, partly=True)
-    import_modules(first.imports)
     defaults, run, how = Options(), Run(Config.preset(first.preset)), RunOptions()
     if first.resume is not None:
         if (first.name, first.preset) != (defaults.name, defaults.preset):
             raise ValueError("--resume continues a run as it is; leave out --name and --preset")
         folder = RunFolder(first.resume)
         run, how = folder.read(first.imports), folder.read_options()
-        defaults = Options(seed=run.seed, imports=run.imports)
+        defaults = Options(seed=run.seed)
     options, config, how = parse_all([defaults, run.config, how], arguments, PROGRAM)
-    given = {"config": config, "seed": options.seed, "imports": options.imports}
+    imports = tuple(dict.fromkeys((*run.imports, *options.imports)))
+    given = {"config": config, "seed": options.seed, "imports": imports}
     if first.resume is None:
         given["algorithm"] = ""  # named after the settings given
     return options, dataclasses.replace(run, **given), how
@@ -87,25 +83,20 @@ def train(options: Options, run: Run, how: RunOptions) -> None:
       OSError: a file cannot be written.
     """
     folder = RunFolder(run_path(options, run))
-    if options.resume is None:
-        folder.check_free()
+    if options.resume is None and folder.config.is_file():
+        again = f"continue it with --resume {folder.path}, or give another --name"
+        raise ValueError(f"{folder.path} holds a run; {again}")
     become_devices(how.devices)
     processes.join(options.distributed)
-    console = Console(quiet=jax.process_index() > 0)
+    console = Console(quiet=jax.process_index() > 0, highlight=False)
     compilation.enable_cache()
-    again = f"Continue with: {display.resume_command(folder, run)}"
     try:
         scores = train_run(folder.path, run, how, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
-        display.say(console, f"Stopped. {again}")
+        console.out(f"Stopped. Continue with: {display.resume_command(folder, run)}")
         raise SystemExit(exit_code(stopped)) from None
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise OSError(f"{error}. Saved checkpoints are kept. {again}") from error
-    table = [str(Scores(PROTOCOL, __version__, None, tuple(scores)))] if scores else []
-    for line in (*table, *display.summary(folder, run, scores)):
-        display.say(console, line)
+    for line in ([scores] if scores else []) + display.summary(folder, run):
+        console.out(line)
 
 
 def run_path(options: Options, run: Run) -> Path:

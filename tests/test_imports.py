@@ -38,7 +38,6 @@ AGENTS = (
     ("experiments", "profiles", "sweep"),
     ("evaluate", "examples", "profile"),
 )
-LEARNING = {"registry", "config", "parallel", "networks", "acting", "curiosity", "ppo"}
 PACKAGES = ("trap_tube_jax", "agents", "benchmarks")  # a package never imports a later one
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
 # Libraries that neither importing the environment nor drawing text needs.
@@ -116,14 +115,6 @@ def test_nothing_is_unpickled():
     for own, tree in TREES.items():
         assert not IMPORTS[own] & {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
         assert not re.search("allow_pickle|read_pickle", ast.unparse(tree)), own
-
-
-def test_training_imports_no_command_line(tmp_path):
-    """Nor matplotlib: learning needs arrays alone."""
-    program = "import json, sys, agents; print(json.dumps([sorted(sys.modules)]))"
-    (modules,) = modules_after(program, tmp_path)
-    assert {room(name) for name in modules if name.startswith("agents.")} == LEARNING
-    assert "matplotlib" not in modules
 
 
 def test_the_environment_is_light(tmp_path):

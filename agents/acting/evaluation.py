@@ -13,9 +13,10 @@ from agents.config import Config
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.scoring.benchmark import blocks
-from trap_tube_jax.scoring.scores import Optimality, Score
+from trap_tube_jax.scoring.scores import Optimality, Score, Scores
 from trap_tube_jax.scoring.tasks import (
     ALL_SETS,
+    PROTOCOL,
     Purpose,
     evaluation_tasks,
     label,
@@ -114,7 +115,7 @@ class Evaluator:
         self,
         played: Mapping[str, Evaluation],
         shortest: Mapping[str, np.ndarray] | None = None,
-    ) -> list[Score]:
+    ) -> Scores:
         """Computes the score of every set.
 
         Args:
@@ -130,7 +131,7 @@ class Evaluator:
             layout = layout_numbers(name, self.tasks[name])
             score = Score.of(name, label(name), solved, length, layout=layout, optimality=found)
             made.append(score)
-        return made
+        return Scores(PROTOCOL, tt.__version__, None, tuple(made))
 
 
 def own_and_paper_sets(config: Config) -> tuple[str, ...]:

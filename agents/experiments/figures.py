@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from agents.experiments import tables
 from agents.runs.metrics import Frame
 from trap_tube_jax.scoring.tasks import label
@@ -84,9 +86,7 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
 
 def _panels(
     titles: Sequence[str], columns: int, height: float, title: str
-) -> tuple[Any, list[Any]]:
-    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
-
+) -> tuple[Figure, list[Any]]:
     rows = math.ceil(len(titles) / columns)
     figure = Figure(figsize=(WIDTH, rows * height + 0.9), layout="constrained")
     figure.suptitle(title)

@@ -13,7 +13,6 @@ from agents.command_line import option
 from agents.config import Config
 from agents.ppo.learner import make_train
 from agents.runs.folder import Run, RunFolder, RunOptions, check_name
-from trap_tube_jax.imports import import_modules
 
 COMMA = re.compile(r",(?![^\[]*\])")  # but not those of a list
 
@@ -73,7 +72,6 @@ class Grid:
         """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
         if options.seeds < 1:
             raise ValueError(f"seeds must be >= 1, got {options.seeds}")
-        import_modules(options.imports)
         configs = self.configs(options)
         short = tt.task_set(next(iter(configs.values())).env_id).short
         if (options.preset, short) != (self.options.preset, self.options.env):
@@ -87,8 +85,6 @@ class Grid:
                 check_name(path.name)
                 if RunFolder(path).config.is_file():
                     run.check_continues(RunFolder(path).read())
-                else:
-                    RunFolder(path).check_free()
                 runs[path] = run
         return runs
 

@@ -1,4 +1,4 @@
-"""Files of a grid's results, and what is drawn from them: python -m agents.experiments.report.
+"""Files of a grid's results, and what is drawn from them.
 
 A grid's folder holds results.csv (rows of `agents.results`), curves.csv (metrics by iteration) and
 grid.json (title, command, settings that all runs share, machines). table.md and the figures are
@@ -6,7 +6,6 @@ drawn from these three alone.
 """
 
 import itertools
-import sys
 from pathlib import Path
 
 import pandas as pd
@@ -15,7 +14,6 @@ import agents
 from agents.experiments import figures, tables
 from agents.files import read_json, write_json, write_text
 from agents.runs.results import find_runs, metrics
-from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.registry import task_set
 
 COUNTS = ["iteration", "episodes", "transitions", "seconds"]
@@ -26,8 +24,6 @@ WIDTH = 80
 def collect(root: Path, command: str) -> None:
     """Writes results.csv, curves.csv and grid.json from the runs in a folder."""
     results, curves, folders = agents.results(root), metrics(root), find_runs(root)
-    if curves.empty:
-        raise ValueError(f"no run in {root} has finished an iteration")
     results["run"] = results["run"].map(lambda path: Path(path).name)
     results.to_csv(root / "results.csv", index=False)
     curves[CURVES].to_csv(root / "curves.csv", index=False)
@@ -64,12 +60,6 @@ def write(root: Path) -> str:
     ]
     write_text(root / "table.md", "\n\n".join([f"# {about['title']}", *parts]) + "\n")
     drawn = figures.save(root, results, curves, about)
-    shown = [f"{name}\n{found[name].to_string(line_width=WIDTH)}" for name in list(found)[:2]]
+    shown = [f"{name}\n{found[name].to_string(line_width=WIDTH)}" for name in found]
     files = map(str, (root / "results.csv", root / "table.md", *drawn))
     return "\n\n".join([*shown, "\n".join(files)])
-
-
-if __name__ == "__main__":
-    with plain_errors():
-        for folder in sys.argv[1:]:
-            print(write(Path(folder)))

@@ -46,7 +46,6 @@ def tables(results: Frame, curves: Frame, about: Mapping[str, Any]) -> dict[str,
     found = {"Training": training_table(curves, about["threshold"], train_set == "base")}
     if len(tested):
         found["Test tasks solved, %"] = success_table(tested, train_set == "pstsy")
-        found["Test tasks solved by seed, %"] = seeds_table(tested)
     return found
 
 
@@ -100,15 +99,6 @@ def success_table(tested: Frame, with_paper: bool) -> Frame:
             for each, mean, sd in zip(PAPER_SETS, *paper, strict=True)
         }
     return pd.DataFrame(columns).fillna(NOTHING).rename(index=label)
-
-
-def seeds_table(tested: Frame) -> Frame:
-    """Returns percent solved of every seed, and the iteration of the policy."""
-    table = by_set(tested).rename(columns=label).map("{:.1f}".format)
-    chosen = tested.groupby(["algorithm", "seed"])["iteration"].first()
-    table["iteration"] = chosen.map("{:,}".format)
-    table.index = [f"{name}, seed {seed}" for name, seed in table.index]
-    return table
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:

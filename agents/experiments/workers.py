@@ -20,7 +20,7 @@ from agents.runs.folder import Run, RunOptions
 from agents.runs.provenance import cores
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped
-from trap_tube_jax.imports import import_modules
+from trap_tube_jax.imports import import_modules, needs_extra
 
 SPAWN = multiprocessing.get_context("spawn")
 
@@ -43,14 +43,13 @@ def make_executor(processes: int | None, cluster: str | None) -> Iterator[Execut
     """Makes the executor of a grid's runs; the arguments are fields of `grids.Options`.
 
     Raises:
-      ValueError: `processes` is below 1, or Dask is not installed.
+      ValueError: `processes` is below 1.
+      ImportError: Dask is not installed.
       OSError: the scheduler does not answer.
     """
     if cluster is not None:
-        try:
+        with needs_extra("cluster"):
             from distributed import Client  # noqa: PLC0415  # pyright: ignore
-        except ImportError:
-            raise ValueError("--cluster needs Dask: pip install -e '.[agents,cluster]'") from None
         with Client(cluster) as client:
             yield client.get_executor(pure=False)
         return

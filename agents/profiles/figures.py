@@ -1,10 +1,10 @@
 """Figures of a profile, 830 pixels wide as pages show them."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
 from agents.experiments.figures import COLORS, WIDTH
@@ -29,7 +29,7 @@ def save_success(profile: pd.DataFrame, path: Path) -> None:
     """
     parts = [part for part in PANELS if part in set(profile["part"])]
     rows = -(-len(parts) // 2)
-    figure = _figure(2.9 * rows + 0.4)
+    figure = Figure(figsize=(WIDTH, 2.9 * rows + 0.4), layout="constrained")
     axes = figure.subplots(rows, min(len(parts), 2), sharey=True, squeeze=False)
     for axis, part in zip(axes.flat, parts, strict=False):
         for index, (policy, own) in enumerate(profile.groupby("policy", sort=False)):
@@ -58,7 +58,7 @@ def save_controls(profile: pd.DataFrame, path: Path) -> None:
     policies = list(dict.fromkeys(profile["policy"]))
     rows = -(-len(tasks.time) // COLUMNS)
     height = 0.25 * len(policies)
-    figure = _figure(rows * (height + 1.9))
+    figure = Figure(figsize=(WIDTH, rows * (height + 1.9)), layout="constrained")
     axes = figure.subplots(2 * rows, COLUMNS, height_ratios=rows * [1.2, height])
     boards, cells = axes[::2].flatten(), axes[1::2].flatten()
     for index, level in enumerate(levels or ()):
@@ -89,9 +89,3 @@ def _margins(groups: pd.DataFrame) -> np.ndarray:
         for solved, tasks in zip(groups["solved"], groups["tasks"], strict=True)
     ]
     return np.abs(np.transpose(ends) - (groups["solved"] / groups["tasks"]).to_numpy())
-
-
-def _figure(height: float) -> Any:
-    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
-
-    return Figure(figsize=(WIDTH, height), layout="constrained")

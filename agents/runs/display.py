@@ -1,8 +1,6 @@
 """Progress of a run on one line of a terminal, and its results in a few."""
 
 import shlex
-import statistics
-from collections.abc import Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -10,7 +8,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 import trap_tube_jax as tt
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import Row, read_rows
-from trap_tube_jax.scoring.scores import Score
 
 
 class ProgressLine(Progress):
@@ -41,28 +38,17 @@ class ProgressLine(Progress):
         if self.console.is_terminal:
             self.update(self.task_ids[0], completed=done, description=text, refresh=True)
         else:
-            say(self.console, f"iteration {done}: {text}")
+            self.console.out(f"iteration {done}: {text}")
 
 
-def say(console: Console, text: str) -> None:
-    """Prints text as it is: unwrapped, and without markup."""
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
-
-
-def summary(folder: RunFolder, run: Run, scores: Sequence[Score]) -> list[str]:
-    """Returns the facts that a run ends with, one a line; scores as `train_run` returns them."""
+def summary(folder: RunFolder, run: Run) -> list[str]:
+    """Returns the facts that a run ends with, one a line."""
     own, config, lines = tt.task_set(run.config.env_id), run.config, []
     threshold = config.stop_when_solved or 1.0
     solving = read_rows(folder.metrics).query("evaluation >= @threshold")["episodes"]
     if len(solving):
         share = "" if threshold == 1 else f"{100 * threshold:g} % of "
         lines.append(f"First solved {share}{own.label} after {solving.min():,} episodes.")
-    parts = {
-        own.label: [score.percent for score in scores if score.set == own.short],
-        "other sets": [score.percent for score in scores if score.set != own.short],
-    }
-    means = [f"{statistics.fmean(own):.1f} % of {name}" for name, own in parts.items() if own]
-    lines += [f"Solves {', '.join(means)}."] if means else []
     lines.append(f"Report with curves and episodes to step through: {folder.page}")
     has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init
     if config.stop_when_solved and len(solving):

@@ -2,9 +2,6 @@
 
 import contextlib
 import dataclasses
-import os
-import shutil
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -58,10 +55,7 @@ class Run:
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
-        """Inverts `to_dict`; ValueError names a value that is missing, unknown or not allowed."""
-        names = sorted(field.name for field in dataclasses.fields(cls))
-        if sorted(values) != names or not isinstance(values["config"], dict):
-            raise ValueError(f"expected a table of {', '.join(names)}, config a table of settings")
+        """Inverts `to_dict`; ValueError names a setting that is unknown or not allowed."""
         config = Config.from_dict(values["config"])
         return cls(**{**values, "config": config, "imports": tuple(values["imports"])})
 
@@ -85,7 +79,6 @@ class RunOptions:
 
     Attributes:
       checkpoint_every: iterations between checkpoints.
-      keep: number of newest checkpoints to keep.
       evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation
         selects the parameters that the run reports.
       sets: sets to evaluate on, by default the paper's eight and the training set.
@@ -97,7 +90,6 @@ class RunOptions:
     """
 
     checkpoint_every: int = option(10, "run")
-    keep: int = option(3, "run")
     evaluate_every: int = option(0, "run")
     sets: tuple[str, ...] | None = option(None, "run")
     reported: int | None = option(None, "run")
@@ -109,7 +101,6 @@ class RunOptions:
     def __post_init__(self) -> None:
         """Raises ValueError for a number that is too small or an unknown set."""
         check_integer("checkpoint_every", self.checkpoint_every)
-        check_integer("keep", self.keep)
         check_integer("evaluate_every", self.evaluate_every, minimum=0)
         if self.reported is not None:
             check_integer("reported", self.reported, maximum=MOST_TASKS)
@@ -152,50 +143,13 @@ class RunFolder:
         Raises ValueError if another process writes to it, OSError if it cannot be made.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        lock, holder = filelock.FileLock(self.path / ".lock", timeout=0), self.path / ".writer"
         try:
-            lock.acquire()
+            with filelock.FileLock(self.path / ".lock", timeout=0):
+                yield
         except filelock.Timeout:
-            name = holder.read_text() if holder.is_file() else "another process"
-            raise ValueError(f"{self.path} is being written by {name}; wait for its end") from None
-        try:
-            holder.write_text(f"process {os.getpid()} on {socket.gethostname()}")
-            yield
-        finally:
-            holder.unlink(missing_ok=True)
-            lock.release()
-
-    @contextlib.contextmanager
-    def opened_for(self, run: Run, options: RunOptions) -> Iterator[None]:
-        """Locks the folder for training a new run or continuing the stored one.
-
-        A new folder in which nothing was saved is removed at the end. Raises the errors of `lock`,
-        `check_free` and `Run.check_continues`.
-        """
-        with self.lock():
-            if self.config.is_file():
-                run.check_continues(self.read())
-                yield
-                return
-            self.check_free()
-            self.note(run, options)
-            try:
-                yield
-            finally:
-                if not (self.metrics.exists() or self.checkpoints.exists()):
-                    shutil.rmtree(self.path, ignore_errors=True)
-
-    def check_free(self) -> None:
-        """Raises ValueError unless a new run can be created here."""
-        if self.config.is_file():
             raise ValueError(
-                f"{self.path} holds a run; continue it with --resume {self.path}, or give "
-                "another --name"
-            )
-        own = {".lock", ".writer"}
-        is_folder = self.path.is_dir()
-        if self.path.exists() and not (is_folder and {p.name for p in self.path.iterdir()} <= own):
-            raise ValueError(f"{self.path} exists, but holds no run; give another --name")
+                f"{self.path} is being written by another process; wait for its end"
+            ) from None
 
     def note(self, run: Run, options: RunOptions | None = None) -> None:
         """Writes a run, its options and the version of this package."""
@@ -222,14 +176,13 @@ class RunFolder:
         import_modules(imports)
         if not self.config.is_file():
             raise ValueError(f"{self.path} holds no run; {runs_next_to(self.path)}")
-        values = read_json(self.config)
-        if not isinstance(values, dict):
-            raise ValueError(f"{self.config} must be a table of settings")
-        values.pop("options", None)
-        version, needs = values.pop("version", "unknown"), values.get("imports") or ()
+        version, needs = "unknown", ()
         try:
+            values = read_json(self.config)
+            version, needs = values.pop("version", version), values.get("imports", needs)
+            values.pop("options", None)
             return Run.from_dict(values)
-        except (ValueError, TypeError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             missing = "".join(f" --import {name}" for name in needs if name not in imports)
             hint = f"; it was trained with{missing}" if missing else ""
             raise ValueError(

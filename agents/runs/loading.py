@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from agents import pretrained
 from agents.acting.policy import Policy
@@ -11,44 +10,52 @@ from agents.arrays import SUFFIX, Arrays, from_arrays, read_arrays, to_arrays, w
 from agents.config import Config
 from agents.networks.agent import PARTS, Agent, Params
 from agents.runs import checkpoint
-from agents.runs.folder import CONFIG_FILE, RunFolder, runs_next_to
+from agents.runs.folder import RunFolder, runs_next_to
 from trap_tube_jax.imports import import_modules
 
 
-def load_policy(
-    source: str | Path, iteration: int | None = None, imports: tuple[str, ...] = ()
+def load(
+    source: str | Path,
+    *,
+    iteration: int | None = None,
+    greedy: bool = True,
+    imports: tuple[str, ...] = (),
 ) -> Policy:
-    """Loads a greedy policy.
+    """Loads a trained policy, which acts from observations alone.
+
+        policy = load("best-pstsy")
+        carry = policy.initial(batch)
+        action, carry = policy.act(observation, carry, key)
+
+    Reading runs no code that the source names; only `imports` are imported.
 
     Args:
       source: a run's folder, a file of parameters, or the name of a shipped agent.
       iteration: checkpoint of a run; if None, the best policy of a run that selects one
         (`--evaluate-every`), else the newest checkpoint.
-      imports: modules to import first, which register names of the settings. No other module is
-        imported, whatever the source says.
+      greedy: take the most probable actions; False samples them.
+      imports: modules to import first, which register curiosities, encoders or task sets.
 
     Raises:
       ValueError: there is no such policy, or it cannot be read.
     """
-    path = Path(source)
-    is_run = (path / CONFIG_FILE).is_file()
-    if not is_run and not path.is_file() and str(source) in pretrained.names():
-        path = pretrained.FOLDER / f"{source}{SUFFIX}"
-    if path.is_file():
-        import_modules(imports)
+    folder, path = RunFolder(Path(source)), Path(source)
+    if not folder.config.is_file():
+        if not path.is_file() and str(source) in pretrained.names():
+            path = pretrained.FOLDER / f"{source}{SUFFIX}"
+        if not path.is_file():
+            raise ValueError(
+                f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
+                f"shipped agents: {', '.join(pretrained.names())}"
+            )
         if iteration is not None:
             raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
-        return read_policy(path)
-    if not is_run:
-        raise ValueError(
-            f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
-            f"shipped agents: {', '.join(pretrained.names())}"
-        )
-    folder = RunFolder(path)
+        import_modules(imports)
+        return read_policy(path)._replace(greedy=greedy)
     run = folder.read(imports)
     name = f"seed {run.seed}"
     if iteration is None and folder.best.is_file():
-        return read_policy(folder.best)._replace(name=name)
+        return read_policy(folder.best)._replace(name=name, greedy=greedy)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)
     stored = {name: array for name, array in arrays.items() if name.startswith(prefixes)}
@@ -56,18 +63,18 @@ def load_policy(
         params = _params(run.config, {k.removeprefix("params/"): v for k, v in stored.items()})
     except ValueError as error:
         raise ValueError(f"{folder.checkpoints} does not fit this version: {error}") from error
-    return Policy(name, run.config, params, record["iteration"])
+    return Policy(name, run.config, params, record["iteration"], greedy)
 
 
-def save_policy(path: Path, policy: Policy) -> None:
-    """Writes the parameters and settings of a policy, atomically; its name is not stored."""
+def save(path: str | Path, policy: Policy) -> None:
+    """Saves a policy to one safetensors file, which `load` reads; its name is not stored."""
     params = {part: policy.params[part] for part in PARTS}
     about = {"config": policy.config.to_dict(), "iteration": policy.iteration}
-    write_arrays(path, to_arrays(params), about)
+    write_arrays(Path(path), to_arrays(params), about)
 
 
 def read_policy(path: Path) -> Policy:
-    """Reads a policy that `save_policy` wrote; the file's name without its suffix names it.
+    """Reads a policy that `save` wrote; the file's name without its suffix names it.
 
     Raises:
       ValueError: the file is damaged, of another kind, or its settings are unknown.
@@ -79,9 +86,6 @@ def read_policy(path: Path) -> Policy:
         params = _params(config, arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not hold a policy of this version: {error}") from error
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise ValueError(f"{path} holds parameters that are not finite: {name}")
     return Policy(path.name.removesuffix(SUFFIX), config, params, iteration)
 
 

@@ -10,13 +10,12 @@ import io
 import json
 import math
 import string
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import pandas as pd
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, Evaluator
@@ -26,7 +25,6 @@ from agents.runs.metrics import Frame, read_rows
 from trap_tube_jax import solver
 from trap_tube_jax.objects import DIRECTION_NAMES, NO_DIRECTION
 from trap_tube_jax.rendering import episode_frames, save_gif
-from trap_tube_jax.scoring.scores import Score
 from trap_tube_jax.scoring.tasks import label
 from trap_tube_jax.state import State, take
 
@@ -55,23 +53,20 @@ def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played) -> 
     own = tt.task_set(run.config.env_id).short
     save_first_solved(folder.animation, evaluator, played, own)
     episodes = json.dumps(_episodes(evaluator, played))
-    settings = {"seed": run.seed, **run.config.to_dict()}
-    values = [(name, str(value)) for name, value in settings.items()]
     page = string.Template(PAGE.read_text(encoding="utf-8")).substitute(
         title=html.escape(folder.path.name),
-        scores=_scores(evaluator.scores(played)),
+        scores=evaluator.scores(played),
         curves=base64.b64encode(folder.curves.read_bytes()).decode(),
-        settings=_table(pd.DataFrame(values, columns=["setting", "value"])),
+        settings=html.escape(json.dumps(run.to_dict(), indent=1)),
         episodes=episodes.replace("</", "<\\/"),
     )
     write_text(folder.page, page)
 
 
 def save_curves(rows: Frame, path: Path, title: str) -> None:
-    """Draws learning curves over episodes as PNG; gaps where not finite."""
+    """Draws learning curves over episodes as PNG."""
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
 
-    rows = rows.replace([math.inf, -math.inf], math.nan)
     panels = [
         (name, unit, found)
         for name, unit, metrics in PANELS
@@ -108,25 +103,6 @@ def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: 
     return None
 
 
-def _scores(scores: Sequence[Score]) -> str:
-    rows = [
-        {
-            "set": score.label,
-            "tasks": score.tasks,
-            "solved %": f"{score.percent:.1f}",
-            "95 % interval": "{:.1f}–{:.1f}".format(*score.interval) if score.interval else "–",
-            "layouts": score.layouts or "–",
-            "steps": "–" if score.mean_steps is None else f"{score.mean_steps:.1f}",
-        }
-        for score in scores
-    ]
-    return _table(pd.DataFrame(rows))
-
-
-def _table(rows: Frame) -> str:
-    return rows.to_html(index=False, border=0)
-
-
 def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
     """Returns the first solved and the first unsolved episode of each set.
 
@@ -156,7 +132,7 @@ def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
                 "solved": solved,
                 "agent": _replay(state, actions),
                 "plan": _replay(state, plan),
-                "values": [_finite(x) for x in outcome.value[index, :length]],
+                "values": np.asarray(outcome.value[index, :length], float).round(4).tolist(),
             }
         )
     return episodes
@@ -185,7 +161,3 @@ def _png(pixels: np.ndarray) -> str:
     file = io.BytesIO()
     Image.fromarray(pixels).quantize(32).save(file, "png")
     return base64.b64encode(file.getvalue()).decode()
-
-
-def _finite(x: Any) -> float | None:
-    return round(float(x), 4) if math.isfinite(x) else None

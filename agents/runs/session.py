@@ -25,9 +25,9 @@ from agents.parallel import processes
 from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
 from agents.runs import checkpoint, report
-from agents.runs.display import ProgressLine, say
+from agents.runs.display import ProgressLine
 from agents.runs.folder import Run, RunFolder, RunOptions
-from agents.runs.loading import read_policy, save_policy
+from agents.runs.loading import read_policy, save
 from agents.runs.loggers import open_loggers
 from agents.runs.metrics import (
     Frame,
@@ -40,7 +40,7 @@ from agents.runs.metrics import (
 )
 from agents.runs.provenance import note_provenance
 from agents.runs.stopping import Stopped, stop_signals
-from trap_tube_jax.scoring.scores import Score
+from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
@@ -53,7 +53,7 @@ def train_run(
     *,
     console: Console | None = None,
     stop_file: Path | None = None,
-) -> list[Score]:
+) -> Scores | None:
     """Trains a run to its end from its newest checkpoint, evaluates it and writes its files.
 
     A finished run is left as it is. Only one process may call it for a folder at a time.
@@ -67,7 +67,7 @@ def train_run(
         other hosts.
 
     Returns:
-      The scores on test tasks; none if the run was finished before.
+      The scores on test tasks; None if the run was finished before.
 
     Raises:
       ValueError: the run cannot be trained or continued, or it diverged.
@@ -77,7 +77,7 @@ def train_run(
     options, console = options or RunOptions(), console or Console(quiet=True)
     stored = RunFolder(path)
 
-    def carry_out(options: RunOptions, folder: RunFolder) -> list[Score]:
+    def carry_out(options: RunOptions, folder: RunFolder) -> Scores | None:
         session = Session(run, options, console, stored, folder, stop_file)
         session.train()
         return session.finish()
@@ -86,7 +86,9 @@ def train_run(
         options = dataclasses.replace(options, report=False, tensorboard=False, wandb=False)
         with tempfile.TemporaryDirectory() as copy:
             return carry_out(options, RunFolder(Path(copy)))
-    with stored.opened_for(run, options):
+    with stored.lock():
+        if stored.config.is_file():
+            run.check_continues(stored.read())
         return carry_out(options, stored)
 
 
@@ -110,16 +112,15 @@ class Session:
         self.sets = options.sets or own_and_paper_sets(run.config)
         key = jax.random.key(run.seed)
         shapes = jax.eval_shape(self.learner.init, key)
-        state, self.last = restore(stored.checkpoints, run, shapes)
+        state, self.last = restore(stored.checkpoints, run.config.iterations, shapes)
         self.state = self.placement.put(self.learner.init(key) if state is None else state)
         for rows in (folder.metrics, folder.evaluations):
             rewind_rows(rows, self.iteration)
-        if len(read_rows(folder.metrics)) < self.iteration:
-            say(console, f"{folder.metrics} has lost rows; learning curves lack these iterations.")
         self._validate = None
         if options.evaluate_every:
             tasks = run.config.eval_episodes
             self._validate = Evaluator.of_sets(run.config, self.sets, tasks, "validation")
+            self._keep_best()  # a kill may have come between checkpoint and best policy
         folder.note(run, options)  # they may differ from those before
 
     @property
@@ -139,8 +140,7 @@ class Session:
         self.folder.page.unlink(missing_ok=True)  # it would show the run as it was
         note_provenance(self.folder.provenance, str(self.placement))
         config = self.run.config
-        say(
-            self.console,
+        self.console.out(
             f"{self.folder.path}: {tt.task_set(config.env_id).id}, curiosity {config.curiosity}, "
             f"seed {self.run.seed}, {num_parameters(self.state.params):,} parameters, on "
             f"{self.placement}. Compiling ...",
@@ -149,7 +149,7 @@ class Session:
         advance = jax.jit(advance, donate_argnums=0).lower(self.state).compile()
         chosen = {"tensorboard": self.options.tensorboard, "wandb": self.options.wandb}
         asked = functools.partial(
-            say, self.console, "Finishing this iteration; Ctrl-C again stops now."
+            self.console.out, "Finishing this iteration; Ctrl-C again stops now."
         )
         with (
             stop_signals(asked, self.stop_file) as request,
@@ -168,16 +168,16 @@ class Session:
                 if number:
                     raise Stopped(number)
 
-    def finish(self) -> list[Score]:
+    def finish(self) -> Scores | None:
         """Evaluates the final policy, or the best one; writes and returns the results."""
         policy = self._policy()
-        if self._validate and self.stored.best.is_file():
+        if self.stored.best.is_file():
             policy = read_policy(self.stored.best)
         tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
         is_tested = policy.iteration in set(tested["iteration"])
         if is_tested and (self.folder.page.exists() or not self.options.report):
-            return []
-        say(self.console, "Evaluating ...")
+            return None
+        self.console.out("Evaluating ...")
         tasks = self.options.reported or self.run.config.eval_episodes
         evaluator = Evaluator.of_sets(self.run.config, self.sets, tasks)
         played = evaluator(policy.params)
@@ -214,26 +214,29 @@ class Session:
 
     def _evaluate(self, evaluator: Evaluator) -> None:
         """Evaluates the present policy; saves it if it is the best so far."""
-        policy, path = self._policy(), self.folder.evaluations
+        policy = self._policy()
         scores = evaluator.scores(evaluator(policy.params))
-        append_rows(path, evaluation_rows(scores, policy, "validation"))
-        own = tt.task_set(self.run.config.env_id).short
-        if best_iteration(read_rows(path), own) == self.iteration:
+        append_rows(self.folder.evaluations, evaluation_rows(scores, policy, "validation"))
+        self._keep_best()
+
+    def _keep_best(self) -> None:
+        """Saves the present policy if its evaluation is the best so far."""
+        rows, own = read_rows(self.folder.evaluations), tt.task_set(self.run.config.env_id).short
+        if best_iteration(rows, own) == self.iteration:
             self._save()  # first, or a resume could start before the best policy
-            save_policy(self.folder.best, policy)
+            save(self.folder.best, self._policy())
 
     def _policy(self) -> Policy:
         params = self.placement.local({part: self.state.params[part] for part in PARTS})
         return Policy(f"seed {self.run.seed}", self.run.config, params, self.iteration)
 
     def _save(self) -> None:
-        record = {"run": self.run.to_dict(), "last": self.last}
-        state, keep = self.placement.local(self.state), self.options.keep
-        checkpoint.save(self.folder.checkpoints, self.iteration, state, record, keep=keep)
+        state = self.placement.local(self.state)
+        checkpoint.save(self.folder.checkpoints, self.iteration, state, self.last or {})
 
 
 def restore(
-    folder: Path, run: Run, shapes: TrainState
+    folder: Path, iterations: int, shapes: TrainState
 ) -> tuple[TrainState | None, dict[str, Any] | None]:
     """Returns the newest checkpoint's state and row of metrics, or None and None.
 
@@ -241,30 +244,29 @@ def restore(
     """
     if not checkpoint.iterations(folder):
         return None, None
-    arrays, record = checkpoint.load(folder)
-    done = record["iteration"]
+    arrays, row = checkpoint.load(folder)
+    done = row["iteration"]
     try:
-        run.check_continues(Run.from_dict(record["run"]))
         state = from_arrays(arrays, shapes)
-    except (KeyError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"checkpoint {done} in {folder} cannot be continued: {error}") from error
-    if done > run.config.iterations:
-        raise ValueError(
-            f"iterations must be at least {done}, which are done, got {run.config.iterations}"
-        )
-    return state, record["last"]
+    if done > iterations:
+        raise ValueError(f"iterations must be at least {done}, which are done, got {iterations}")
+    return state, row
 
 
-def best_iteration(rows: Frame, own: str) -> int:
+def best_iteration(rows: Frame, own: str) -> int | None:
     """Returns when the highest mean fraction of the validation tasks was first solved.
 
-    The mean is over task sets; base, a single task, counts only if it is the training set `own`.
+    None if no evaluation is among the rows. The mean is over task sets; base, a single task, counts
+    only if it is the training set `own`.
     """
     rows = rows[rows["purpose"] == "validation"]
     ranked = rows if own == "base" else rows[rows["task_set"] != "base"]
     ranked = ranked if len(ranked) else rows
     solved = ranked["solved"] / ranked["tasks"]
-    return int(solved.groupby(ranked["iteration"]).mean().idxmax())
+    means = solved.groupby(ranked["iteration"]).mean()
+    return int(means.idxmax()) if len(means) else None
 
 
 def make_advance(learner: Learner) -> Advance:

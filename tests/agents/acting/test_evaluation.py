@@ -34,7 +34,7 @@ def test_tasks_of_your_own_are_scored(played):
     evaluator, _, outcomes = played
     assert outcomes["mine"].solved.any()
     assert 1 in outcomes["mine"].length[outcomes["mine"].solved]
-    by_set = {score.set: score for score in evaluator.scores(outcomes)}
+    by_set = {score.set: score for score in evaluator.scores(outcomes).sets}
     assert by_set["mine"].percent == 25 * outcomes["mine"].solved.sum()
     assert (by_set["mine"].interval is None, by_set["base"].interval is None) == (False, True)
 
@@ -70,7 +70,7 @@ def test_each_sets_own_limit_holds_unless_the_settings_have_one(played, own_task
 def test_scores_use_the_papers_notation():
     outcome = Evaluation(jnp.array([True, False]), jnp.array([11, 50]), *[jnp.zeros((2, 50))] * 2)
     evaluator = Evaluator.of_sets(Config(), ["pst"], 2)
-    (score,) = evaluator.scores({"pst": outcome}, {"pst": np.array([11, 12])})
+    (score,) = evaluator.scores({"pst": outcome}, {"pst": np.array([11, 12])}).sets
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
     assert score.mean_steps == 11
     assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)

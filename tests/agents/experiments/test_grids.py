@@ -8,6 +8,7 @@ import pytest
 from agents.experiments.grids import GRIDS, Grid, Options
 from agents.runs.folder import Run, RunFolder, RunOptions
 from refusal import assert_refused
+from trap_tube_jax.imports import import_modules
 
 
 def configs(*settings, grid=None, **options):
@@ -46,6 +47,7 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, o
     monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
     given = Options(("curiosity=none,icm",), ("agents.examples.near_food",), seeds=2, seed=3)
     given = dataclasses.replace(given, env="near-food", out=tmp_path)
+    import_modules(given.imports)
     runs = Grid().runs("sweep", given)
     assert [str(path.relative_to(tmp_path)) for path in runs] == [
         f"sweep-fast-near-food/curiosity={name}-seed{seed}"

@@ -44,5 +44,5 @@ def test_a_run_is_logged_next_to_its_folder(tmp_path, monkeypatch, raises, outco
 
 def test_dask_is_an_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
-    with pytest.raises(ValueError, match=r"needs Dask: pip install -e '\.\[agents,cluster\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'trap-tube-jax\[cluster\]'"):
         workers.make_executor(None, "tcp://nowhere:1").__enter__()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from agents.profiles import figures
 
@@ -13,8 +14,7 @@ def test_success_is_drawn_from_0_to_1_with_a_colour_for_each_policy(tmp_path, mo
         for policy in "ab"
     ]
     drawn = []
-    make = figures._figure
-    monkeypatch.setattr(figures, "_figure", lambda height: drawn.append(make(height)) or drawn[0])
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     figures.save_success(pd.DataFrame(groups), tmp_path / "x.png")
     shown = [axis for axis in drawn[0].axes if axis.get_visible()]
     assert all(axis.get_ylim() == (0, 1) for axis in shown)

@@ -1,7 +1,6 @@
 """The folder of a run: its settings, what may change in them, and its one writer."""
 
 import json
-import os
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +24,6 @@ def test_a_run_is_the_same_after_json():
     [
         (partial(Run, Config()), {"seed": -1}, ["seed must be an integer >= 0 and <= 2147483647"]),
         (partial(Run, Config()), {"seed": 1.0}, ["seed must be an integer", "1.0"]),
-        (RunOptions, {"keep": 0}, ["keep must be an integer >= 1, got 0"]),
         (RunOptions, {"checkpoint_every": 0}, ["checkpoint_every must be an integer >= 1, got 0"]),
         (RunOptions, {"evaluate_every": -1}, ["evaluate_every must be an integer >= 0, got -1"]),
         (RunOptions, {"reported": 10**9}, ["reported must be", "<= 1000000, got 1000000000"]),
@@ -60,39 +58,18 @@ def test_only_the_end_of_a_run_may_change(before, after, words):
         assert_refused(words, new.check_continues, old)
 
 
-def test_a_folder_holds_one_run(tmp_path):
-    folder, run = RunFolder(tmp_path / "x"), Run(Config(hidden=8))
-    options = RunOptions(keep=5, sets=("base",))
-    with folder.opened_for(run, options):
-        folder.metrics.touch()
+def test_a_folder_holds_a_run_and_its_options(tmp_path):
+    run, options = Run(Config(hidden=8)), RunOptions(reported=5, sets=("base",))
+    RunFolder(tmp_path / "x").path.mkdir()
+    RunFolder(tmp_path / "x").note(run, options)
     assert RunFolder(tmp_path / "x").read() == run
     assert RunFolder(tmp_path / "x").read_options() == options
-    assert_refused(["holds a run", "--resume"], RunFolder(tmp_path / "x").check_free)
     assert_refused(["none holds no run; runs in", "x"], RunFolder(tmp_path / "none").read)
 
 
-def test_a_new_folder_without_results_is_removed_and_no_other(tmp_path):
-    (tmp_path / "file").touch()
-    mine = (tmp_path / "other" / "mine.txt", tmp_path / "hidden" / ".git")
-    for path in mine:
-        path.parent.mkdir()
-        path.touch()
-    assert_refused(["holds no run", "another --name"], RunFolder(tmp_path / "file").check_free)
-    for name in ("new", "other", "hidden"):
-        with pytest.raises(ValueError, match=r"holds no run|broken"):
-            _fail_after_creation(RunFolder(tmp_path / name))
-    assert not (tmp_path / "new").exists()
-    assert all(path.exists() for path in mine)
-
-
-def _fail_after_creation(folder):
-    with folder.opened_for(Run(Config()), RunOptions()):
-        raise ValueError("broken")
-
-
-def test_a_second_writer_is_refused_and_named_the_first(tmp_path):
+def test_a_second_writer_is_refused(tmp_path):
     with RunFolder(tmp_path / "x").lock():
-        words = [f"{tmp_path}/x is being written by process {os.getpid()} on "]
+        words = [f"{tmp_path}/x is being written by another process"]
         assert_refused(words, RunFolder(tmp_path / "x").lock().__enter__)
     with RunFolder(tmp_path / "x").lock():
         pass

@@ -15,7 +15,7 @@ from agents.arrays import to_arrays
 from agents.config import Config
 from agents.runs import checkpoint
 from agents.runs.folder import Run, RunFolder
-from agents.runs.loading import read_policy, save_policy
+from agents.runs.loading import read_policy, save
 from easy import assert_same, enable_x64
 from tiny_policy import CONFIG, random_params, random_policy
 
@@ -29,7 +29,7 @@ def run_path(tmp_path_factory) -> Path:
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "mine")
     folder.note(Run(CONFIG, seed=3))
     state = {"params": {**random_params(), "curiosity": np.ones(2)}, "iteration": np.int32(6)}
-    checkpoint.save(folder.checkpoints, 6, state, {}, keep=1)
+    checkpoint.save(folder.checkpoints, 6, state, {})
     return folder.path
 
 
@@ -46,7 +46,7 @@ def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path, monkeypatc
 
 def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path):
     path = shutil.copytree(run_path, tmp_path / "copy")
-    save_policy(RunFolder(path).best, POLICY._replace(iteration=4))
+    save(RunFolder(path).best, POLICY._replace(iteration=4))
     policy = agents.load(path)
     assert (policy.name, policy.iteration) == ("seed 3", 4)
     assert agents.load(path, iteration=6).iteration == 6
@@ -68,7 +68,7 @@ def test_unknown_sources_and_iterations_are_refused(run_path, source, message):
 def test_a_stored_policy_is_the_same(tmp_path):
     path = tmp_path / "mine.safetensors"
     curious = {**POLICY.params, "curiosity": {"of": np.ones(2)}}
-    save_policy(path, POLICY._replace(params=curious))
+    save(path, POLICY._replace(params=curious))
     loaded = read_policy(path)
     assert loaded._replace(params=None) == POLICY._replace(params=None)
     assert_same(loaded.params, POLICY.params)
@@ -87,7 +87,7 @@ def header(iteration: int | str = 1, **settings):
     [
         *(
             (header, {}, "is not a file of arrays of this package")
-            for header in ({}, *({"json": text} for text in ("{", "[]", "[" * 100_000)))
+            for header in ({}, *({"json": text} for text in ("{", "[]")))
         ),
         ({"json": '{"config": []}'}, {}, "does not hold a policy of this version"),
         (header(iteration="x"), {}, "does not hold a policy of this version"),
@@ -96,11 +96,6 @@ def header(iteration: int | str = 1, **settings):
         (header(encoder="own"), {}, "unknown encoder 'own'.*--import MODULE"),
         (header(), {"heads/params/more": np.ones(1)}, "heads/params/more is not expected"),
         (header(), {"heads/params/value/bias": None}, "heads/params/value/bias is missing"),
-        (
-            header(),
-            {"heads/params/value/bias": np.array([np.nan], np.float32)},
-            "parameters that are not finite: heads/params/value/bias",
-        ),
     ],
 )
 def test_files_of_other_content_are_refused(stored, changes, message, tmp_path):
