@@ -148,7 +148,7 @@ def test_the_wheel_holds_the_environment_and_what_it_imports():
     assert build["build"]["targets"]["wheel"] == {"packages": ["trap_tube_jax"]}
     extras = project["optional-dependencies"]
     required = modules_of(project["dependencies"])
-    allowed = required | modules_of(extras["pictures"] + extras["interop"])
+    allowed = required | modules_of(extras["pictures"] + extras["gymnasium"] + extras["gymnax"])
     for own, names in IMPORTS.items():
         if own.split(".")[0] == "trap_tube_jax":
             used = {name.split(".")[0] for name in names} - {"trap_tube_jax"}

@@ -30,7 +30,7 @@ Pages in this folder: environment.md, own_tasks.md, graded.md, controls.md, prot
 
 # ruff: noqa: F401  the imports are the public names
 
-import importlib
+import importlib.util
 import sys
 import types
 import typing
@@ -63,15 +63,11 @@ from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 
 def _register_with_gymnasium() -> None:
     """Follows Gymnasium's convention: importing a package registers its environments."""
-    try:
-        importlib.import_module("gymnasium")
-    except ModuleNotFoundError as error:
-        if error.name == "gymnasium":
-            return
-        raise
+    if importlib.util.find_spec("gymnasium") is None:
+        return
     try:
         importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
-    except ImportError as error:  # an old version must not keep the environment from its users
+    except ImportError as error:  # an old or broken one must not keep the environment from users
         warnings.warn(f"no task set is registered with Gymnasium: {error}", stacklevel=2)
 
 

@@ -1,7 +1,7 @@
 """Controls of comparative psychology: layouts that tell understanding from rules of thumb.
 
 Each function lists the layouts of one control. Most layouts differ from the base task in one
-thing, for comparison in pairs. The rules of the environment are unchanged.
+respect, so that they can be compared in pairs. The rules of the environment are unchanged.
 
 Source: controls.md, with the studies in full.
 """
@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.objects import BOARD_SIZE, GROUND, OBJECT_CHARS
-from trap_tube_jax.prng import loop_free
+from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import State, check_state
-from trap_tube_jax.transfers import Transfer
 
 Cell = tuple[int, int]
 FIRST_ROW = 4  # of the base task's tube
@@ -25,7 +24,7 @@ FIRST_ROW = 4  # of the base task's tube
 def trap_turned() -> tuple[State, ...]:
     """The trap is in the wall, out of the food's way, and both ends are exits.
 
-    The short way goes past the trap. An agent that keeps away from it takes the long one.
+    The short way goes past the trap. An agent that avoids the trap takes the long way.
     Source: Visalberghi and Limongelli (1994), Reaux and Povinelli (2000): the inverted tube.
     """
     return (_layout("....1xx1....", "....eF.e....", "....e..e....", "....2222...."),)
@@ -113,26 +112,12 @@ def food_outside() -> tuple[State, ...]:
     return (_layout(*empty, food=(5, 10)), _layout(*empty, food=(5, 2)))
 
 
-def drawn_from(layouts: Callable[[], tuple[State, ...]]) -> Transfer:
-    """Returns the transfer that draws one of the layouts, each with equal chance.
-
-    The transfer keeps the state's palette, time and flags, and composes with the others.
-
-    Args:
-      layouts: a named function of no arguments that lists at least one layout, such as
-        `trap_turned`.
-
-    Raises:
-      ValueError: `layouts` is not a named function.
-    """
-    if not callable(layouts) or not hasattr(layouts, "__name__"):
-        raise ValueError(f"layouts must be a named function that lists states, got {layouts!r}")
-    return LayoutDraw(layouts)
-
-
 @dataclasses.dataclass(frozen=True)
 class LayoutDraw:
-    """The transfer of `drawn_from`."""
+    """The transfer that draws one of the states listed by `layouts`, each with equal chance.
+
+    It keeps the state's palette, time and flags, and composes with the others.
+    """
 
     layouts: Callable[[], tuple[State, ...]]
 
@@ -140,7 +125,7 @@ class LayoutDraw:
         """Draws a layout."""
         check_state(state)
         choices = self.layouts()
-        index = jax.random.randint(loop_free(key), (), 0, len(choices), jnp.int32)
+        index = jax.random.randint(threefry_key(key), (), 0, len(choices), jnp.int32)
         fields = ("board", "agent", "tool", "tool_extent", "food")
         tables = {name: [np.asarray(getattr(each, name)) for each in choices] for name in fields}
         return state.replace(

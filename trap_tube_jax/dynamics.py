@@ -21,8 +21,8 @@ def step(state: State, action: jax.Array) -> State:
 
     Args:
       state: one unbatched state.
-      action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. With any other
-        number the grasp holds nothing, or the move goes nowhere.
+      action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Any other number
+        grasps nothing or moves nowhere.
 
     Returns:
       The state after the step; `terminated` is set when agent and food share a cell.
@@ -61,12 +61,12 @@ def step(state: State, action: jax.Array) -> State:
 
 
 def holds_tool(state: State, direction: jax.Array | int) -> jax.Array:
-    """Tests whether the hand in a direction is at the tool, and the agent not on the tool."""
+    """Tests whether a grasp holds the tool: the next cell is the tool's, the agent's is not."""
     on_tool = functools.partial(bar_covers, state.tool, state.tool_extent)
     return on_tool(state.agent + unit_vector(direction)) & ~on_tool(state.agent)
 
 
 def static_object(board: jax.Array, cell: jax.Array) -> jax.Array:
-    """Returns the code i32[] of the static object at `cell` i32[2], -1 off the board u8[12, 12]."""
+    """Returns the code i32[] of the static object at `cell` i32[2] of u8[12, 12]; -1 off it."""
     row, column = jnp.clip(cell, 0, BOARD_SIZE - 1)
     return jnp.where(is_on_board(cell), board[row, column].astype(jnp.int32), -1)

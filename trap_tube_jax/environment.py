@@ -43,7 +43,7 @@ from trap_tube_jax.transfers import (
 
 LARGEST_TIME = 2**31 - 1  # `State.time` is an i32
 
-_PAPER_TRANSFERS = (perceptual, structural, symbolic)  # need no trial
+_PAPER_TRANSFERS = (perceptual, structural, symbolic)  # known to be valid, so never tried
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +99,6 @@ class Environment(ByValue):
         self.max_steps = check_integer("max_steps", max_steps, maximum=LARGEST_TIME)
         self.transfers = tuple(transfers)
         self.base = base_state() if base is None else _check_base(base)
-        self._draw = compose(*self.transfers)
         own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             state, key = self.base, jax.random.key(0)
@@ -119,16 +118,16 @@ class Environment(ByValue):
           ValueError: `key` is not one PRNG key.
         """
         # A copy: without transfers the base would be returned, and the caller may donate it.
-        state = self._draw(key, jax.tree.map(jnp.copy, self.base))
+        state = compose(*self.transfers)(key, jax.tree.map(jnp.copy, self.base))
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:
-        """Takes one action. Deterministic; a done state stays, with reward 0.
+        """Takes one action, deterministically. A finished state does not change and pays 0.
 
         Args:
           state: one unbatched state.
-          action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Under jit,
-            vmap and scan numbers are not checked: any other number is no direction.
+          action: integer[2] = (grasp, move), each 0 up, 1 down, 2 left, 3 right. Values are not
+            checked under jit, vmap or scan; there, any other value means no direction.
 
         Returns:
           The next state, and a timestep with reward 1 if this step solved the task.
@@ -190,7 +189,7 @@ def action_from_index(index: jax.typing.ArrayLike) -> jax.Array:
 def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
     """Converts actions integer[..., 2] to `4 * grasp + move`, i32[...] in 0 to 15.
 
-    A pair with another number than 0 to 3 becomes -1.
+    A pair with a value outside 0 to 3 becomes -1.
 
     Raises:
       ValueError: `action` does not hold pairs of integers.
@@ -204,7 +203,7 @@ def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
 
 
 def check_actions(actions: Any, shape: tuple[int, ...]) -> jax.Array:
-    """Returns actions as an integer array of any width after checking shape and numbers.
+    """Checks dtype, shape and concrete values, and returns the actions as an array.
 
     Raises:
       ValueError: the dtype or the shape [..., 2] is wrong, or a concrete number is no direction.

@@ -41,7 +41,7 @@ def save_gallery(
     Args:
       path: the file to write.
       ids: the task sets, at least one; the paper's eight if absent.
-      tasks: most tasks per set, 2 to 64: the first distinct ones of 64 draws.
+      tasks: maximum number of tasks per set, 2 to 64: the first distinct ones of 64 draws.
       seed: seed of the tasks, 0 to 2**32 - 1.
 
     Raises:

@@ -1,9 +1,9 @@
 """The perceptual and the structural transfer at strengths from 0 to 1.
 
 A strength bounds the distance of the draws: of layouts from the base task's, of features from the
-state's own. At strength 0 these are drawn themselves; strength 1 is the paper's transfer. Draws
-are nested: a layout, or a direction of a feature point, that is possible at one strength is
-possible at every higher one.
+state's own. Strength 0 draws exactly these; strength 1 is the paper's transfer. Draws are nested: a
+layout, or a direction of a feature point, that is possible at one strength is possible at every
+higher one.
 
 Source: graded.md; the paper, section "Structural", for interpolation on the sphere.
 """
@@ -137,7 +137,7 @@ def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Arr
 
 @functools.lru_cache(maxsize=64)
 def near_layouts(strength: float) -> LayoutTables:
-    """Builds the tables of a strength, and keeps them for the process."""
+    """Builds the tables of a strength; keeps those of the last 64."""
     full, base = layout_tables(), base_state()
     foods, tools, agents = [], [], []
     for frame in range(NUM_FRAMES):

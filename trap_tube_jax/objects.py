@@ -51,7 +51,7 @@ NUM_ACTIONS: Final = NUM_DIRECTIONS**2
 
 
 def base_palette(num_features: int = 3) -> np.ndarray:
-    """Features of every object before any transfer.
+    """Returns the features of every object before any transfer.
 
     Three features are the RGB colours of environment.md, "Board and objects". Two are the
     red and green channels. More than three repeat red, green and blue. One feature is the

@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import dataclasses
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 
@@ -38,11 +39,13 @@ HORIZONTAL_TOOL = "=="
 AGENT_SIGNS = ("/\\", "\\/", "<-", "->")  # by grasp direction
 
 CLEAR_SCREEN = "\x1b[2J\x1b[H"
+KEYS = re.compile(r"\x1b[\[O].|.", re.DOTALL)  # an arrow sends three characters
 ARROWS = {f"\x1b{mode}{code}": index for mode in "[O" for index, code in enumerate("ABDC")}
 MOVE_KEYS = ARROWS | {key: direction for direction, key in enumerate("kjhl")}
 GRASP_KEYS = {key: direction for direction, key in enumerate("wsad")}
-NEXT_TASK_KEYS = {"r": 0, "n": 1}  # by how much the seed grows
+NEXT_TASK_KEYS = {"r": 0, "n": 1}  # added to the seed
 HINT_KEY = "?"
+XTERM_LEVELS = np.array([0, 95, 135, 175, 215, 255])  # of red, green and blue
 HELP = (
     ("arrows, hjkl", "move"),
     ("w a s d", "turn the hand"),
@@ -183,7 +186,8 @@ def _board(game: Game) -> list[str]:
 
 def _colored(text: str, color: Sequence[int]) -> str:
     """Writes black or white on the nearest of xterm's 6 x 6 x 6 colours, 16 to 231."""
-    background = 16 + int(np.rint(np.array(color) / 51) @ (36, 6, 1))
+    nearest = np.abs(np.subtract.outer(color, XTERM_LEVELS)).argmin(axis=-1)
+    background = 16 + int(nearest @ (36, 6, 1))
     ink = 231 if np.dot(color, LUMA) < 128 else 16
     return f"\x1b[1;38;5;{ink};48;5;{background}m{text}\x1b[0m"
 
@@ -193,13 +197,15 @@ def _play(game: Game) -> None:
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ValueError("play needs a terminal; its input or output is not one")
     with _single_keys(sys.stdin.fileno()) as terminal, contextlib.suppress(KeyboardInterrupt):
-        key = " "
-        while key not in ("q", ""):  # nothing is read where the terminal is closed
+        while True:
             print(CLEAR_SCREEN + screen(game), flush=True)
-            key = os.read(terminal, 8).decode(errors="replace")
-            if key == HINT_KEY:
-                print("thinking ...", flush=True)  # the search takes a moment
-            game = press(game, key)
+            typed = os.read(terminal, 64).decode(errors="replace")
+            for key in KEYS.findall(typed) or ["q"]:  # a closed terminal reads as nothing
+                if key == "q":
+                    return
+                if key == HINT_KEY:
+                    print("thinking ...", flush=True)  # the search takes a moment
+                game = press(game, key)
 
 
 @contextlib.contextmanager

@@ -7,11 +7,11 @@ import dataclasses
 from collections.abc import Iterable
 
 from trap_tube_jax.checks import check_registered_name
-from trap_tube_jax.controls import CONTROLS, drawn_from
+from trap_tube_jax.controls import CONTROLS, LayoutDraw
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.state import State, base_state
-from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic, transfer_name
+from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,12 +36,13 @@ class TaskSet:
     def label(self) -> str:
         """Returns the paper's notation, such as "{P, St}" or, without transfers, "base".
 
-        A set with a base state or a step limit of its own has its short name as label.
+        A set with transfers, a base state or a step limit of its own is labelled by its short name.
         """
-        if self.base is not None or self.max_steps != MAX_STEPS:
-            return self.short
         symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
-        names = [symbols.get(each) or transfer_name(each) for each in self.transfers]
+        is_own = any(each not in symbols for each in self.transfers)
+        if is_own or self.base is not None or self.max_steps != MAX_STEPS:
+            return self.short
+        names = [symbols[each] for each in self.transfers]
         return "{" + ", ".join(names) + "}" if names else "base"
 
 
@@ -61,7 +62,7 @@ CONTROL_TASK_SETS = tuple(
     TaskSet(
         id="".join(word.capitalize() for word in layouts.__name__.split("_")) + "Control-v0",
         short=layouts.__name__.replace("_", "-"),
-        transfers=(drawn_from(layouts),),
+        transfers=(LayoutDraw(layouts),),
     )
     for layouts in CONTROLS
 )
@@ -99,8 +100,8 @@ def make(
 
     Args:
       name: an id such as "PerceptualTrapTube-v0", or its short name such as "p".
-      num_features: N >= 1, the feature channels of the base task; 3, RGB, if absent. A base
-        state has its own N.
+      num_features: N >= 1, number of feature channels of the base task; 3 (RGB) if absent. With
+        `base`, N is that of its palette.
       base: a base state in place of the set's.
       max_steps: a step limit in place of the set's.
 

@@ -46,7 +46,7 @@ GRID_OPACITY = 0.22
 TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
 TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
-FPS_RANGE = (0.1, 50)  # browsers slow down GIFs with shorter frames
+FPS_RANGE = (1, 50)  # browsers slow down GIFs with shorter frames
 LONGEST_HOLD = 100  # seconds; a GIF shows no picture longer than 655
 
 
@@ -125,7 +125,7 @@ def save_gif(
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1. Pictures of at most
         256 colours are stored exactly.
       path: the file to write.
-      fps: frames per second, 0.1 to 50.
+      fps: frames per second, 1 to 50.
       hold: seconds by which the last frame stays longer, 0 to 100.
 
     Raises:
@@ -155,20 +155,11 @@ def save_gif(
 @functools.partial(jax.jit, static_argnames="cell_size")
 def _episode_frames(state: State, actions: jax.Array, *, cell_size: int) -> jax.Array:
     actions = jnp.pad(actions, ((0, 1), (0, 0)), constant_values=NO_DIRECTION)
-    is_padding = jnp.all(actions == NO_DIRECTION, axis=1)
-    # Padding moves nothing: of several in a row the first is drawn, the others copy its picture.
-    is_drawn = ~is_padding | jnp.pad(~is_padding[:-1], (1, 0), constant_values=True)
 
-    def body(carry: tuple[State, jax.Array], at: tuple[jax.Array, jax.Array]) -> Any:
-        (state, picture), (action, is_drawn) = carry, at
-        picture = jax.lax.cond(
-            is_drawn, lambda: render(state, cell_size, grasp=action[0]), lambda: picture
-        )
-        return (step(state, action), picture), picture
+    def body(state: State, action: jax.Array) -> tuple[State, jax.Array]:
+        return step(state, action), render(state, cell_size, grasp=action[0])
 
-    nothing = jnp.zeros((BOARD_SIZE * cell_size, BOARD_SIZE * cell_size, 3), jnp.uint8)
-    _, frames = jax.lax.scan(body, (state, nothing), (actions, is_drawn))
-    return frames
+    return jax.lax.scan(body, state, actions)[1]
 
 
 @functools.partial(jax.jit, static_argnames=("cell_size", "grid"))
@@ -186,7 +177,7 @@ def _render(
         image = _blend(image, ink, _grid_lines(cell_size) * GRID_OPACITY)
     if grasp is not None and cell_size >= SMALLEST_SIGN:
         image = _draw_hand(image, state, jnp.asarray(grasp), cell_size)
-    return _to_pixels(image)
+    return jnp.round(image).astype(jnp.uint8)
 
 
 def _enlarge(cells: jax.Array, cell_size: int) -> jax.Array:
@@ -211,27 +202,21 @@ def _blend(image: Any, ink: Any, opacity: Any) -> Any:
     return image + (ink - image) * opacity[..., None]
 
 
-def _to_pixels(image: Any) -> jax.Array:
-    return jnp.round(image).astype(jnp.uint8)
-
-
 # A sign is a signed distance field over pixel centres, in units of a cell: negative
 # inside the shape. A ramp of one pixel at its edge keeps it smooth at every size.
 
 
 @functools.cache
 def _signs(cell_size: int) -> np.ndarray:
-    """Returns f32[8, s, s]: each object's sign as the covered part of each pixel, 0 to 1."""
+    """Returns f32[8, s, s]: each object's sign as the covered part of each pixel, but no tool."""
     y, x = _offsets((0.5, 0.5), 1, cell_size)
     distance = np.full((NUM_OBJECTS, cell_size, cell_size), np.inf, np.float32)
-    if cell_size >= SMALLEST_SIGN:
-        distance[TRAP] = _cross(y, x)
-        distance[EXIT] = abs(np.hypot(y, x) - 0.24) - 0.07
-        distance[TUBE1] = _hatching(x + y)
-        distance[TUBE2] = _hatching(x - y)
-        distance[FOOD] = _apple(y, x)
-        distance[TOOL] = np.hypot(np.maximum(abs(y) - TOOL_BAR_OVERHANG, 0), x) - TOOL_BAR_RADIUS
-        distance[AGENT] = _face(y, x)
+    distance[TRAP] = _cross(y, x)
+    distance[EXIT] = abs(np.hypot(y, x) - 0.24) - 0.07
+    distance[TUBE1] = _hatching(x + y)
+    distance[TUBE2] = _hatching(x - y)
+    distance[FOOD] = _apple(y, x)
+    distance[AGENT] = _face(y, x)
     return _coverage(distance, cell_size)
 
 

@@ -101,7 +101,7 @@ class State(ByValue, struct.PyTreeNode, eq=False):
         }
         fields = {name: _converted(name, value) for name, value in given.items()}
         start: Any = {"time": np.int32(0), "terminated": np.False_, "truncated": np.False_}
-        # A layout is concrete also where it is built inside a traced function.
+        # Keep the layout concrete, even inside a traced function.
         with jax.ensure_compile_time_eval():
             return jax.device_put(validate(cls(**fields, **start)))
 
@@ -118,9 +118,9 @@ class State(ByValue, struct.PyTreeNode, eq=False):
     ) -> Self:
         """Builds a state at time 0 from a picture of 12 rows of 12 characters.
 
-        `.` ground, `x` trap, `e` exit, `1` and `2` the tubes, `F` food, `T` tool, `A` agent.
-        Drawn food, tool and agent stand on ground. Give by keyword, and do not draw, what
-        covers another object.
+        `.` ground, `x` trap, `e` exit, `1` and `2` the tubes, `F` food, `T` tool, `A` agent. Cells
+        drawn as `F`, `T` or `A` have ground below. To place one on another object, leave it out of
+        the picture and pass its position by keyword.
 
         Args:
           rows: the picture, as one string (blank margins are dropped) or as rows.
@@ -210,7 +210,7 @@ def validate(state: State) -> State:
     check_state(state)
     for flag in ("terminated", "truncated"):
         if getattr(state, flag):
-            raise ValueError(f"the state is {flag}; allowed: one whose episode is not over")
+            raise ValueError(f"the state is {flag}; give a state whose episode is unfinished")
     fields = (state.board, state.tool, state.tool_extent)
     board, tool, extent = (np.asarray(field, np.int64) for field in fields)  # sums stay exact
     if board.max() > max(STATIC_OBJECTS):
@@ -316,8 +316,8 @@ def _parse_picture(rows: str | Sequence[str]) -> np.ndarray:
     if isinstance(rows, str):
         rows = [line.strip() for line in rows.strip().splitlines()]
     if not isinstance(rows, Sequence) or len(rows) != BOARD_SIZE:
-        found = len(rows) if isinstance(rows, Sequence) else type(rows).__name__
-        raise ValueError(f"the picture must be one string or {BOARD_SIZE} rows, got {found}")
+        found = f"{len(rows)} rows" if isinstance(rows, Sequence) else type(rows).__name__
+        raise ValueError(f"the picture must have {BOARD_SIZE} rows, got {found}")
     for index, line in enumerate(rows):
         if not isinstance(line, str) or len(line) != BOARD_SIZE:
             raise ValueError(f"row {index} must have {BOARD_SIZE} characters, got {line!r}")

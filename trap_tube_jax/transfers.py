@@ -30,7 +30,7 @@ from trap_tube_jax.objects import (
     TUBE1,
     TUBE2,
 )
-from trap_tube_jax.prng import fold_in, loop_free, typed_key
+from trap_tube_jax.prng import threefry_key, typed_key
 from trap_tube_jax.state import State, check_state, with_narrow_integers
 
 Transfer = Callable[[jax.Array, State], State]
@@ -75,7 +75,7 @@ class Composition:
         """Applies the transfers to `state`."""
         key = typed_key(key)
         for index, transfer in enumerate(self.transfers):
-            state = with_narrow_integers(transfer(fold_in(key, index), state))
+            state = with_narrow_integers(transfer(jax.random.fold_in(key, index), state))
             # Without the barrier XLA fuses a draw into each of its uses and repeats it there.
             state = jax.lax.optimization_barrier(state)
         return state
@@ -114,7 +114,7 @@ def draw_layout(key: jax.Array, state: State, layouts: LayoutTables) -> State:
     """Replaces the layout of `state` by one drawn from `layouts`; see `perceptual`."""
     check_state(state)
     tables = jax.tree.map(jnp.asarray, layouts)
-    layout, food, tool, agent = jax.random.bits(loop_free(key), (4,), jnp.uint32)
+    layout, food, tool, agent = jax.random.bits(threefry_key(key), (4,), jnp.uint32)
     frame, assignment = tables.layout[layout % len(tables.layout)]
     food %= tables.num_food[frame]
     tool %= tables.num_tools[frame]
@@ -154,7 +154,7 @@ def sphere_points(key: jax.Array, num_features: int) -> jax.Array:
 
     Points are uniform on the unit sphere. The rows of agent and food are not used.
     """
-    normal = jax.random.normal(loop_free(key), (5, num_features), jnp.float32)
+    normal = jax.random.normal(threefry_key(key), (5, num_features), jnp.float32)
     points = normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
     if num_features == 1:  # -1 and 1, which the rounded quotient may miss
         points = jnp.where(normal < 0, -1, 1).astype(jnp.float32)
@@ -194,7 +194,7 @@ def symbolic(key: jax.Array, state: State) -> State:
       ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
     """
     check_state(state)
-    choice = jax.random.randint(loop_free(key), (), 0, len(SYMBOLIC_OBJECTS), jnp.int32)
+    choice = jax.random.randint(threefry_key(key), (), 0, len(SYMBOLIC_OBJECTS), jnp.int32)
     return swap_with_tool(state, jnp.asarray(SYMBOLIC_OBJECTS)[choice])
 
 

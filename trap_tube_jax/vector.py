@@ -3,15 +3,13 @@
 `VectorEnvironment` equals `jax.vmap` of an `AutoReset`, bit for bit; read that first. Three
 differences make it fast:
 
-1. Auto-reset by selection draws a new task for every environment at every step. Here only the
-   finished environments start over, gathered into chunks of fixed size, as many chunks as it
-   takes.
-2. Board and palette are fixed within an episode, so their picture is drawn once, at the
-   reset. A step draws food, tool and agent over it.
-3. A picture is a flat vector of bytes, each compared with its own row and column. A loop over
-   12 * 12 * N neighbouring bytes vectorises; a loop whose innermost axis are three channels does
-   not. The pictures pass through the loop of the resets, which keeps XLA from fusing the later
-   reshape to [12, 12, N] into the loop over bytes.
+1. Auto-reset by selection draws a new task for every environment at every step. Here only finished
+environments start over, in as many chunks of fixed size as needed. 2. Board and palette are fixed
+within an episode, so their picture is drawn once, at the reset. A step draws food, tool and agent
+over it. 3. A picture is a flat vector of bytes, each compared with its own row and column. A loop
+over 12 * 12 * N neighbouring bytes vectorises; a loop whose innermost axis has three channels does
+not. The pictures pass through the loop of the resets, which keeps XLA from fusing the later reshape
+to [12, 12, N] into the loop over bytes.
 """
 
 import dataclasses
@@ -71,7 +69,7 @@ class VectorEnvironment:
 
     env: Environment
     chunk_size: int = dataclasses.field(default=32, kw_only=True)
-    starts_over: ClassVar = True
+    auto_resets: ClassVar = True
 
     def __post_init__(self):
         if type(self.env) is not Environment:
@@ -104,7 +102,7 @@ class VectorEnvironment:
             numbers are wrong.
         """
         stepped, timestep, final_picture = self._advance(state, actions)
-        state, picture = self._start_over(timestep.done, stepped, final_picture)
+        state, picture = self._reset_done(timestep.done, stepped, final_picture)
         return state, auto_reset_timestep(timestep, picture, final_picture)
 
     def _advance(
@@ -117,7 +115,7 @@ class VectorEnvironment:
         stepped = VectorState(AutoResetState(inner, state.episodes.key), state.background)
         return stepped, timestep, jax.vmap(draw_movable)(inner, state.background)
 
-    def _start_over(
+    def _reset_done(
         self, done: jax.Array, state: VectorState, picture: jax.Array
     ) -> tuple[VectorState, jax.Array]:
         """Replaces state and picture by those of a next episode where `done` bool[B]."""

@@ -1,7 +1,7 @@
 """Wrappers around an environment: pure, with the same `reset` and `step`.
 
-Wrappers are unbatched; `EpisodeStatistics` also wraps a `VectorEnvironment`. Specs are those of
-the wrapped `env`.
+Wrappers are unbatched; `EpisodeStatistics` also wraps a `VectorEnvironment`. The wrapped `env`
+holds the specs.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from trap_tube_jax.state import TimeStep
 class EnvironmentLike(Protocol):
     """An environment with a state of any type: wrapped by wrappers, and implemented by them.
 
-    An environment that resets itself has a true attribute `starts_over`.
+    An environment that resets itself has a true attribute `auto_resets`.
     """
 
     def reset(self, key: jax.Array, /) -> tuple[Any, TimeStep]:
@@ -37,7 +37,8 @@ class AutoResetState(ByValue, struct.PyTreeNode, eq=False):
 
     Attributes:
       inner: state of the wrapped environment.
-      key: typed PRNG key for the next episodes; Threefry if the first one was of `rbg`.
+      key: typed PRNG key that draws the next episodes; a Threefry key if `reset` was given one of
+        `rbg`.
     """
 
     inner: Any
@@ -45,7 +46,7 @@ class AutoResetState(ByValue, struct.PyTreeNode, eq=False):
 
 
 class AutoResetTimeStep(TimeStep, eq=False):
-    """A timestep whose observation is the next episode's first if this episode ended.
+    """A timestep that shows the first observation of the next episode if this step ended one.
 
     Attributes:
       final_observation: u8[12, 12, N], the observation after the action and before any
@@ -67,15 +68,15 @@ class AutoReset:
       env: an environment that does not reset itself.
 
     Raises:
-      ValueError: `env` resets itself, is an `EpisodeStatistics` or no environment.
+      ValueError: `env` resets itself, is an `EpisodeStatistics`, or is not an environment.
     """
 
     env: EnvironmentLike
-    starts_over: ClassVar = True
+    auto_resets: ClassVar = True
 
     def __post_init__(self):
         _check_environment(self.env)
-        if _starts_over(self.env):
+        if _auto_resets(self.env):
             raise ValueError(
                 f"{type(self.env).__name__} resets itself already; allowed: an environment that "
                 "does not, such as a trap_tube_jax.Environment"
@@ -141,7 +142,7 @@ class EpisodeStatisticsState(ByValue, struct.PyTreeNode, eq=False):
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeStatistics:
-    """Counts return and length of every episode of any environment, also a `VectorEnvironment`.
+    """Records the return and length of every episode. Also wraps a `VectorEnvironment`.
 
     Around a bare environment, steps after the end of the episode are not counted. For several
     episodes use `EpisodeStatistics(AutoReset(env))`, not the reverse.
@@ -159,9 +160,9 @@ class EpisodeStatistics:
         _check_environment(self.env)
 
     @property
-    def starts_over(self) -> bool:
+    def auto_resets(self) -> bool:
         """True if the wrapped environment resets itself."""
-        return _starts_over(self.env)
+        return _auto_resets(self.env)
 
     def reset(self, key: jax.Array) -> tuple[EpisodeStatisticsState, TimeStep]:
         """Starts the first episode with all counts at zero."""
@@ -198,7 +199,7 @@ class EpisodeStatistics:
             last_return=jnp.where(finished, running_return, state.last_return),
             last_length=jnp.where(finished, running_length, state.last_length),
             episodes=state.episodes + finished.astype(jnp.int32),
-            over=timestep.done & (not self.starts_over),
+            over=timestep.done & (not self.auto_resets),
         ), timestep
 
 
@@ -210,8 +211,8 @@ def _check_environment(env: Any) -> None:
         )
 
 
-def _starts_over(env: Any) -> bool:
-    return bool(getattr(env, "starts_over", False))
+def _auto_resets(env: Any) -> bool:
+    return bool(getattr(env, "auto_resets", False))
 
 
 def auto_reset_timestep(

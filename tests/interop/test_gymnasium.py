@@ -114,7 +114,6 @@ def test_make_vec_makes_the_compiled_batch():
     assert isinstance(envs.unwrapped, TrapTubeVectorEnv)
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     assert TrapTubeVectorEnv.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
-    assert envs.metadata["autoreset_modes"] == AUTORESET_MODES
 
 
 def test_steps_do_not_loop_over_environments():
@@ -277,7 +276,11 @@ def test_refused_actions(easy_env):
         (
             pairs,
             [[0, 0], [0, 0]],
-            [([0, 0], r"shape \(2, 2\), got int64 of"), ([[0, 0], [0, 4]], "from 0 to 3")],
+            [
+                ([0, 0], r"shape \(2, 2\), got int64 of"),
+                ([[0, 0], [0, 4]], "from 0 to 3"),
+                ((np.zeros((2, 2), int), None), "rectangular"),  # an action and a state
+            ],
         ),
     ):
         with pytest.raises(gymnasium.error.ResetNeeded):

@@ -75,5 +75,5 @@ def test_an_adapter_without_its_library_says_what_to_install(library, monkeypatc
     name = f"trap_tube_jax.adapters.to_{library}"
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(sys.modules, name, raising=False)
-    with pytest.raises(ImportError, match=r"pip install 'trap-tube-jax\[interop\]'"):
+    with pytest.raises(ImportError, match=rf"pip install 'trap-tube-jax\[{library}\]'"):
         importlib.import_module(name)

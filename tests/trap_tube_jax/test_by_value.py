@@ -11,7 +11,7 @@ import pytest
 import trap_tube_jax as tt
 from easy import COPIES, EASY
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
-from trap_tube_jax.controls import CONTROLS, drawn_from
+from trap_tube_jax.controls import CONTROLS, LayoutDraw
 
 OPTIMISED = False  # few steps
 KEY = jax.random.key(0)
@@ -33,7 +33,7 @@ ENVIRONMENTS: dict[str, Any] = {
 TRANSFERS: list[tt.Transfer] = [
     *(tt.perceptual, tt.structural, tt.symbolic, *GRADED, tt.graded_perceptual(0.75)),
     *(tt.compose(), tt.compose(tt.perceptual, *GRADED), tt.compose(tt.structural)),
-    *map(drawn_from, CONTROLS),
+    *map(LayoutDraw, CONTROLS),
 ]
 STATES = [
     *(

@@ -10,7 +10,7 @@ import numpy as np
 
 import trap_tube_jax as tt
 from easy import rows
-from trap_tube_jax.controls import CONTROLS, drawn_from
+from trap_tube_jax.controls import CONTROLS, LayoutDraw
 from trap_tube_jax.solver.search import replay
 
 PAGE = pathlib.Path(tt.__file__).parent / "controls.md"
@@ -55,14 +55,14 @@ def test_the_turned_trap_makes_the_other_way_longer():
 def test_ids_and_labels_are_those_of_the_functions():
     entry = tt.CONTROL_TASK_SETS[0]
     names = (entry.id, entry.short, entry.label)
-    assert names == ("TrapTurnedControl-v0", "trap-turned", "{trap turned}")
+    assert names == ("TrapTurnedControl-v0", "trap-turned", "trap-turned")
 
 
 def test_every_layout_is_drawn_as_often_and_as_it_is_in_the_states_colours():
     start, keys = tt.base_state(5), jax.random.split(jax.random.key(0), 400)
     for layouts in CONTROLS:
         choices = [state.replace(palette=start.palette) for state in layouts()]
-        drawn = jax.device_get(jax.jit(jax.vmap(drawn_from(layouts), (0, None)))(keys, start))
+        drawn = jax.device_get(jax.jit(jax.vmap(LayoutDraw(layouts), (0, None)))(keys, start))
         counts = Counter(rows(drawn, index) for index in range(len(keys)))
         assert counts.keys() == set(choices)
         assert all(abs(count - len(keys) / len(choices)) < 50 for count in counts.values())

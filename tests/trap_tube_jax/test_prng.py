@@ -1,4 +1,4 @@
-"""Loop-free draws against those of JAX, and the check of keys."""
+"""Keys: their kinds, and what is refused."""
 
 import jax
 import jax.numpy as jnp
@@ -8,46 +8,16 @@ import pytest
 import trap_tube_jax as tt
 from easy import assert_same, rows
 from refusal import assert_refused
-from trap_tube_jax.prng import fold_in, loop_free, typed_key
+from trap_tube_jax.prng import typed_key
 
 OPTIMISED = False  # few draws
 
-DRAWS = {
-    "bits": lambda key: jax.random.bits(key, (4,), jnp.uint32),
-    "bytes": lambda key: jax.random.bits(key, (3, 5), jnp.uint8),
-    "normal": lambda key: jax.random.normal(key, (5, 3), jnp.float32),
-    "randint": lambda key: jax.random.randint(key, (), 0, 5, jnp.int32),
-    "split": lambda key: jax.random.key_data(jax.random.split(key, 3)),
-    "chain": lambda key: jax.random.bits(
-        jax.random.fold_in(jax.random.split(key)[1], 3), (), jnp.uint32
-    ),
-}
-
-
-def all_draws(key):
-    return {name: draw(jax.random.clone(key)) for name, draw in DRAWS.items()}
-
-
-def test_draws_are_those_of_jax():
-    keys = jax.random.split(jax.random.key(7, impl="threefry2x32"), 100)
-    expected = jax.jit(jax.vmap(all_draws))(keys)
-    loopless = jax.jit(jax.vmap(lambda key: all_draws(loop_free(key))))(keys)
-    jax.tree.map(np.testing.assert_array_equal, loopless, expected)
-    assert all(len(np.unique(drawn, axis=0)) > 4 for drawn in expected.values())
-
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
-def test_keys_of_either_kind_fold_as_in_jax_and_draw_the_same_tasks(impl):
-    key = jax.random.key(5, impl=impl)
-    assert_same(fold_in(key, 3), jax.random.fold_in(key, 3))
+def test_keys_of_either_kind_draw_the_same_tasks(impl):
     reset = tt.make("pstsy").reset
+    key = jax.random.key(5, impl=impl)
     assert_same(reset(key), reset(jax.random.key(5, impl="threefry2x32")))
-
-
-def test_draws_of_another_order_than_jaxs_own_are_left_to_jax():
-    key = jax.random.key(5, impl="threefry2x32")
-    with jax.threefry_partitionable(False):
-        assert loop_free(key).dtype == key.dtype
 
 
 @pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
@@ -57,14 +27,6 @@ def test_tasks_of_rbg_keys_do_not_depend_on_the_batch(impl):
         batch = jax.vmap(env.reset)(keys)
         for index, key in enumerate(keys):
             assert_same(rows(batch, index), env.reset(key))
-
-
-@pytest.mark.parametrize("transfer", [tt.perceptual, tt.structural, tt.symbolic])
-def test_the_transfers_draw_without_loops(transfer):
-    """The environment's reset is as fast as its draws."""
-    env = tt.Environment((transfer,))
-    key = jax.random.key(0, impl="threefry2x32")
-    assert "while" not in jax.jit(env.reset).lower(key).as_text()
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])

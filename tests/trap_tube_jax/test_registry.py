@@ -45,7 +45,7 @@ def test_register_adds_a_set(own_task_sets):
     transfers = (tt.structural, to_the_top)
     entry = tt.register("Top-v0", (each for each in transfers))
     assert tt.registered_ids()[-1] == "Top-v0"
-    assert (entry.short, entry.label) == ("Top-v0", "{St, to_the_top}")
+    assert (entry.short, entry.label) == ("Top-v0", "Top-v0")
     assert tt.task_set("Top-v0") is entry
     assert tt.make("Top-v0").transfers == entry.transfers == transfers
 
@@ -123,7 +123,7 @@ BAD_SETS = [
     ("mine/Mine-v0", (), {}, ["letters, digits", "'mine/Mine-v0'"]),
     ("Mine-v0", (), {"short": "my set"}, ["letters, digits", "'my set'"]),
     ("Mine-v0", (Unhashable(3),), {}, ["hashable", "a frozen dataclass", "Unhashable(by=3)"]),
-    ("Mine-v0", (), {"base": SOLVED}, ["terminated", "not over"]),
+    ("Mine-v0", (), {"base": SOLVED}, ["terminated", "unfinished"]),
     ("Mine-v0", (), {"max_steps": None}, ["max_steps", "integer >= 1", "None"]),
 ]
 

@@ -164,16 +164,6 @@ def test_gif_holds_the_frames(tmp_path):
     assert durations == [100, 100, 600]
 
 
-def test_equal_frames_of_a_gif_become_one_and_others_do_not(tmp_path):
-    frames = np.zeros((68, 4, 4, 3), np.uint8)
-    frames[-1] = 255
-    frames[:2, 0] = 255
-    tt.save_gif(frames, tmp_path / "still.gif", fps=0.1, hold=0)
-    with Image.open(tmp_path / "still.gif") as gif:
-        durations = [gif.seek(index) or gif.info["duration"] for index in range(3)]
-    assert durations == [20_000, 650_000, 10_000]
-
-
 def test_gif_of_more_colors_than_it_can_hold(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3)).astype(np.uint8)
     tt.save_gif(noise, tmp_path / "noise.gif")
@@ -189,8 +179,8 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
         (np.zeros((2, 4, 4, 3), np.float32), {}, "got float32"),
         (np.zeros((0, 4, 4, 3), np.uint8), {}, "T >= 1, got uint8[0, 4, 4, 3]"),
         ("a.gif", {}, "frames must be uint8[T, height, width, 3]"),
-        (FRAMES, {"fps": 0}, "from 0.1 to 50, got 0"),
-        (FRAMES, {"fps": 51}, "from 0.1 to 50, got 51"),
+        (FRAMES, {"fps": 0}, "from 1 to 50, got 0"),
+        (FRAMES, {"fps": 51}, "from 1 to 50, got 51"),
         (FRAMES, {"hold": -1}, "from 0 to 100 seconds, got -1"),
         (FRAMES, {"hold": np.inf}, "got inf"),
     ],

@@ -129,7 +129,7 @@ def test_create_refuses(changes, words):
 
 # The picture, or rows of it that differ; keywords; and the message's words.
 BAD_PICTURES: list[tuple[Any, dict[str, Any], list[str]]] = [
-    (None, {}, ["one string or 12 rows", "NoneType"]),
+    (None, {}, ["must have 12 rows", "NoneType"]),
     (PICTURE[:11], {}, ["12 rows", "11"]),
     ("\n".join([*PICTURE, "." * 12]), {}, ["12 rows", "13"]),
     ({3: "." * 13}, {}, ["row 3", "12 characters", "'.............'"]),
@@ -166,8 +166,8 @@ BAD_FIELDS: list[tuple[dict[str, Any], list[str]]] = [
     ({"terminated": np.int32(0)}, ["state.terminated", "bool[]", "int32[]"]),
     ({"food": (5, 5)}, ["state.food", "array", "tuple"]),
     ({"palette": np.zeros(8, np.uint8)}, ["state.palette", "uint8[8, N]", "[8]"]),
-    ({"terminated": np.array(True)}, ["terminated", "not over"]),
-    ({"truncated": np.array(True)}, ["truncated", "not over"]),
+    ({"terminated": np.array(True)}, ["terminated", "unfinished"]),
+    ({"truncated": np.array(True)}, ["truncated", "unfinished"]),
     ({"tool": np.array((11, 11), np.int32)}, ["tool", "(11, 11)", "0 to 11"]),
     ({"food": np.array((5, 4), np.int32)}, ["food", "(5, 4)", "trap"]),
 ]

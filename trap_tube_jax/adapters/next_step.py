@@ -17,7 +17,7 @@ class NextStepVectorEnvironment(VectorEnvironment):
         """Takes one action i32[B, 2] in each, or starts it over if its episode has ended."""
         was_done = state.episodes.inner.terminated | state.episodes.inner.truncated
         stepped, timestep, final_picture = self._advance(state, actions)
-        state, picture = self._start_over(was_done, stepped, final_picture)
+        state, picture = self._reset_done(was_done, stepped, final_picture)
         timestep = timestep.replace(
             terminated=timestep.terminated & ~was_done,
             truncated=timestep.truncated & ~was_done,

@@ -9,6 +9,7 @@ Both take the keyword arguments of the classes below. The step limit is `max_ste
 """
 
 import functools
+import reprlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -17,17 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
-from trap_tube_jax.checks import check_integer
+from trap_tube_jax.checks import check_integer, integer_array
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe, render_ascii
 from trap_tube_jax.registry import make, registered_ids
 from trap_tube_jax.rendering import render
+from trap_tube_jax.state import take
 from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoReset, AutoResetState
 
-with needs_extra("interop"):
+with needs_extra("gymnasium"):
     import gymnasium  # pyright: ignore[reportMissingImports]
     from gymnasium import spaces  # pyright: ignore[reportMissingImports]
     from gymnasium.vector import AutoresetMode  # pyright: ignore[reportMissingImports]
@@ -70,8 +72,8 @@ class _Compiled:
 class TrapTubeEnv(_Compiled, gymnasium.Env):
     """One environment.
 
-    An episode truncates after `max_steps` by itself. After `reset(seed=s)` the task and all
-    following tasks are a function of `s`.
+    The environment truncates an episode after `max_steps` steps. After `reset(seed=s)` the task
+    and all following tasks are a function of `s`.
     """
 
     metadata = METADATA
@@ -125,10 +127,17 @@ class TrapTubeEnv(_Compiled, gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Draws the next task; `seed` restarts the sequence of tasks."""
+        """Draws the next task; `seed`, modulo 2**32, restarts the sequence of tasks.
+
+        Raises:
+          ValueError: `seed` is not an integer >= 0.
+        """
+        seed = None if seed is None else check_integer("seed", seed, minimum=0)
         super().reset(seed=seed)
         state = self._state
-        key = _keys([self.np_random_seed])[0] if seed is not None or state is None else state.key
+        if seed is None and state is None:
+            seed = int(self.np_random.integers(2**32))
+        key = state.key if seed is None else _keys([seed])[0]
         self._state, timestep = self._programs.reset(key)
         return np.array(timestep.observation), {}
 
@@ -172,7 +181,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
     equals `gymnasium.vector.SyncVectorEnv`, autoreset included.
     """
 
-    metadata = METADATA | {"autoreset_mode": AUTORESET_MODES[0], "autoreset_modes": AUTORESET_MODES}
+    metadata = METADATA | {"autoreset_mode": AUTORESET_MODES[0]}
 
     def __init__(
         self,
@@ -185,7 +194,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         """Checks the arguments; the first reset and step compile.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own.
+          task_set: registered id or short name, or an `Environment` of your own, not a subclass.
           num_envs: number of environments, at least 1.
           autoreset_mode: `AutoresetMode.NEXT_STEP` spends the step after the last on the
             reset; `SAME_STEP` resets within the last step and returns the last observation
@@ -221,8 +230,8 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         """Draws the next task of every environment, or of those in a mask.
 
         Args:
-          seed: restarts the sequences of tasks. Environment i takes `seed + i`, or the i-th of
-            several, where None continues its sequence.
+          seed: restarts the sequences of tasks, modulo 2**32. Environment i takes `seed + i`, or
+            the i-th of several, where None continues its sequence.
           options: `options["reset_mask"]`, bool[num_envs], selects the environments to reset;
             the others keep their episodes.
 
@@ -281,10 +290,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
             return None
         states = _started(self._state).episodes.inner
         if self.render_mode == "ansi":
-            return tuple(
-                render_ascii(jax.tree.map(lambda x, i=index: x[i], states))
-                for index in range(self.num_envs)
-            )
+            return tuple(render_ascii(take(states, index)) for index in range(self.num_envs))
         return tuple(np.array(jax.vmap(lambda state: render(state, self.cell_size))(states)))
 
     def _next_keys(self, seed: Any) -> jax.Array:
@@ -312,8 +318,8 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
 def register() -> None:
     """Registers every task set that `trap_tube_jax.make` knows and Gymnasium does not.
 
-    A registered name is looked up whenever an environment is made, so a task set that takes the
-    place of another one needs no further call.
+    Names are resolved when an environment is made, so a replaced task set needs no second call.
+    Gymnasium refuses an unversioned id beside a versioned one of the same name.
     """
     for name in registered_ids():
         id = f"{NAMESPACE}/{name}"
@@ -339,14 +345,14 @@ def _started(state: Any) -> Any:
 
 def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:
     """Returns i32[..., 2] of actions in the action space; raises ValueError for others."""
-    array, is_flat = np.asarray(actions), isinstance(space, spaces.Discrete)
+    array, is_flat = integer_array("actions", actions), isinstance(space, spaces.Discrete)
     shape, count = (*batch, *space.shape), NUM_ACTIONS if is_flat else NUM_DIRECTIONS
-    if array.shape != shape or array.dtype.kind not in "iu":
+    if array.shape != shape:
         raise ValueError(
             f"actions must be integers of shape {shape}, got {array.dtype} of shape {array.shape}"
         )
     if array.min() < 0 or array.max() >= count:
-        raise ValueError(f"actions must be from 0 to {count - 1}, got {actions!r}")
+        raise ValueError(f"actions must be from 0 to {count - 1}, got {reprlib.repr(actions)}")
     pairs = np.stack(np.divmod(array, NUM_DIRECTIONS), axis=-1) if is_flat else array
     return pairs.astype(np.int32)
 

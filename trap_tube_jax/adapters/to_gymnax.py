@@ -11,6 +11,7 @@ gymnax: `make` and `FiveValueTrapTube`. A step of gymnax 1.0 returns six values:
     observation, state, reward, terminated, truncated, info = env.step(...)
 """
 
+import copy
 import functools
 from typing import Any
 
@@ -20,7 +21,7 @@ import numpy as np
 from flax import struct
 from jax.core import Tracer
 
-from trap_tube_jax.environment import Environment, action_from_index
+from trap_tube_jax.environment import LARGEST_TIME, Environment, action_from_index
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import MAX_STEPS, NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
@@ -28,7 +29,7 @@ from trap_tube_jax.registry import make as make_environment
 from trap_tube_jax.registry import registered_ids
 from trap_tube_jax.state import State, TimeStep
 
-with needs_extra("interop"):
+with needs_extra("gymnax"):
     import gymnax  # pyright: ignore[reportMissingImports]
     from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
 
@@ -60,7 +61,7 @@ class _TrapTube(environment.Environment):
 
         Args:
           task_set: registered id or short name, or an `Environment` of your own, which has its own
-            number of features and, as the default parameter, step limit; not a subclass.
+            number of features and, as the default parameter, step limit.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `Tuple((Discrete(4), Discrete(4)))` or i32[2].
           num_features: N, the feature channels of the observation; see `trap_tube_jax.make`.
@@ -77,17 +78,11 @@ class _TrapTube(environment.Environment):
                 f"num_features={num_features} does not apply to an Environment of your own; "
                 "give it the base state you mean"
             )
-        elif type(task_set) is not Environment:
-            raise ValueError(
-                f"task_set must be an Environment itself, not a subclass, got {task_set!r}"
-            )
         else:
             self._name = repr(task_set)
         self._default_max_steps = task_set.max_steps
-        # The limit in the parameters replaces the environment's own.
-        self._env = Environment(
-            task_set.transfers, base=task_set.base, max_steps=np.iinfo(np.int32).max
-        )
+        self._env = copy.copy(task_set)
+        self._env.max_steps = LARGEST_TIME  # the limit in the parameters replaces it
         self.flat_actions = flat_actions
 
     @property

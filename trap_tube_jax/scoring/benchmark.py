@@ -57,7 +57,7 @@ class Policy(Protocol):
 
 
 class _Episodes(NamedTuple):
-    """B episodes in play. The flags say whether actions and memory have been sound so far."""
+    """B episodes in play. The flags say whether all actions and memory so far were valid."""
 
     time: jax.Array
     states: State
@@ -200,7 +200,7 @@ def blocks(total: int) -> list[np.ndarray]:
     """Returns the indices of `total` tasks in blocks i64[b] that are played at once.
 
     All blocks have one size, the smaller of `BLOCK` and `total`, so that they share a compilation.
-    After the last task the last block continues with the first ones.
+    The last block is filled up with the first tasks.
     """
     size = min(BLOCK, total)
     return [np.arange(start, start + size) % total for start in range(0, total, size)]
@@ -286,7 +286,10 @@ def _play_one(
 
 def _grasp_and_move(action: Any) -> np.ndarray:
     """Converts (grasp, move) or 4 * grasp + move to i32[2]; raises ValueError for the rest."""
-    array = np.asarray(action)
+    try:
+        array = np.asarray(action)
+    except ValueError:  # ragged
+        array = np.zeros(0)
     count = {1: NUM_ACTIONS, 2: NUM_DIRECTIONS}.get(array.size, 0)
     if not count or array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count:
         raise ValueError(

@@ -18,15 +18,15 @@ from trap_tube_jax.checks import MOST_TASKS, check_integer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
 from trap_tube_jax.state import State
-from trap_tube_jax.transfers import Transfer, compose
+from trap_tube_jax.transfers import Transfer, compose, perceptual
 
 Purpose = Literal["test", "validation"]
 
-# The version of the fixed tasks. Scores of different versions do not compare.
+# The version of the fixed tasks. Scores of different versions are not comparable.
 PROTOCOL = 1
 ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
 FEW_LAYOUTS = 5  # a set with at most as many layouts, colours aside, has few
-SETS_OF_FEW = ("base", "st", "sy", "stsy")  # among the paper's
+SETS_OF_FEW = tuple(x.short for x in PAPER_TASK_SETS if perceptual not in x.transfers)
 
 # "trap" and "tube", or "trap" and "vali". The first word of `jax.random.key(seed)` is 0 for every
 # seed from 0 to 2**32 - 1, so no seed of training leads here.
@@ -79,7 +79,7 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
 def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax.Array:
     """Returns the PRNG keys [B] of the evaluation tasks of the set with this id.
 
-    More tasks begin with the same ones. No key serves two purposes or sets.
+    The first keys do not depend on `num_tasks`. Keys differ between sets and purposes.
 
     Raises:
       ValueError: `purpose` is neither "test" nor "validation".

@@ -40,19 +40,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m trap_tube_jax.solver",
-        description=DESCRIPTION,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+    parser = argparse.ArgumentParser(prog="python -m trap_tube_jax.solver", description=DESCRIPTION)
     add = parser.add_argument
-    add("--sets", nargs="+", default=["base", "sy", "p", "psy"], metavar="SET", help="task sets")
-    add("--tasks", type=int, default=1000, help="tasks to solve per set")
-    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1")
+    add(
+        "--sets",
+        nargs="+",
+        default=["base", "sy", "p", "psy"],
+        metavar="SET",
+        help="task sets, by default %(default)s",
+    )
+    add("--tasks", type=int, default=1000, help="tasks to solve per set, by default 1000")
+    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1, by default 0")
     modes = parser.add_mutually_exclusive_group()
     modes.add_argument("--show", metavar="SET", help="plan one task, as text and GIF")
     modes.add_argument("--distances", metavar="SET", help="draw distances to the goal in one task")
-    add("--output", type=Path, help="file to write, shortest_plans.png, plan.gif or distances.png")
+    add(
+        "--output",
+        type=Path,
+        help="file to write, by default shortest_plans.png, plan.gif or distances.png",
+    )
     add_import_option(parser)
     return parser
 
@@ -103,10 +109,11 @@ def _distances(options: argparse.Namespace) -> None:
     plan, found = solve(state), distances(state)
     path = options.output or Path("distances.png")
     save_distances(state, plan, found, path)
-    print(f"length of the plan: {plan.length}")
+    print(f"length of the plan: {plan.length if plan.solvable else 'unsolvable'}")
     print(f"reachable states: {found.num_reachable}")
     print(f"with a way to the goal: {np.count_nonzero(found.to_goal >= 0)}")
-    print(f"farthest from the goal: {found.to_goal.max()}")
+    if plan.solvable:
+        print(f"farthest from the goal: {found.to_goal.max()}")
     print(f"picture: {path}", file=sys.stderr)
 
 

@@ -18,9 +18,9 @@ UNKNOWN = -1
 class Distances(ByValue, struct.PyTreeNode, eq=False):
     """Shortest distances in one task, in steps. NumPy arrays.
 
-    The indices of both are row and column of the food, of the tool's top-left cell and of the
-    agent: `to_goal[(*state.food, *state.tool)]` is i16[12, 12] over the agent's cells. The
-    distances hold for the task's board and tool alone.
+    Both arrays are indexed by the row and column of the food, then of the tool's top-left cell,
+    then of the agent: `to_goal[(*state.food, *state.tool)]` is i16[12, 12] over the agent's cells.
+    The distances are valid for this board and this size of tool only.
 
     Attributes:
       from_start: i16[12, 12, 12, 12, 12, 12], steps from the task's first state; -1 for

@@ -26,8 +26,9 @@ def save_distances(
 ) -> None:
     """Writes a PNG of the distance to the goal over the board, at moments of a plan.
 
-    Tool and food stay in place within a picture. The number in a cell counts the steps that are
-    left if the agent is there. The agent cannot be in a cell without a number.
+    Tool and food stay in place within a picture. Each number is the distance to the goal with the
+    agent in that cell. The agent's own cell has none, nor have cells that are unreachable or have
+    no way to the goal.
 
     Args:
       state: the task's first state.

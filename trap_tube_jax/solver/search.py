@@ -27,7 +27,7 @@ CHUNK_SIZES = (256, 1024, 4096)
 
 
 class Plan(ByValue, struct.PyTreeNode, eq=False):
-    """A shortest plan, or proof that none exists. NumPy arrays.
+    """A shortest plan in NumPy arrays, or the proof that none exists.
 
     Ties go to the first plan in the order of action indices (4 * grasp + move), compared step by
     step.
@@ -65,7 +65,7 @@ class Level(NamedTuple):
 def solve(state: State) -> Plan:
     """Finds the shortest plan of one task, exactly, for any valid state.
 
-    Runs on the host, outside jit and vmap. Colours and the step limit play no part.
+    Runs on the host, outside jit and vmap. Ignores colours and the step limit.
 
     Args:
       state: one unbatched state, at any time of an unfinished episode.

@@ -275,7 +275,7 @@ def test_refusals(near):
     assert_refused(words, evaluation_keys, "TrapTube-v0", 1, purpose)
 
 
-@pytest.mark.parametrize("action", [16, -1, (0, 4), (0, 1, 2), (), 0.0, "up", None])
+@pytest.mark.parametrize("action", [16, -1, (0, 4), (0, 1, 2), (), 0.0, "up", None, ((0, 3), None)])
 def test_single_actions_are_checked(action):
     words = ["(grasp, move)", "0 to 3", "0 to 15", repr(action)]
     assert_refused(words, tt.score_gymnasium, Single(action), ["base"])

@@ -1,6 +1,5 @@
 """The command line of the solver."""
 
-import subprocess
 import sys
 
 import jax
@@ -30,6 +29,8 @@ def test_command_line_surveys_task_sets(tmp_path, capsys):
     assert "| base |    12 | 100.00 % | 11.0 |  11 |" in text
     with Image.open(picture) as image:
         assert image.format == "PNG"
+    main(["--distances", "too-short-tool", "--output", str(picture)])
+    assert "length of the plan: unsolvable" in capsys.readouterr().out.splitlines()
 
 
 def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypatch):
@@ -86,10 +87,3 @@ def test_command_line_draws_distances(tmp_path, capsys):
 )
 def test_command_line_refuses(arguments, message, capsys):
     assert message in refused(capsys, main, *arguments)
-
-
-def test_runs_as_a_module_without_warnings():
-    command = [sys.executable, "-W", "error", "-m", "trap_tube_jax.solver", "--help"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (result.returncode, result.stderr) == (0, "")
-    assert "--distances" in result.stdout
