@@ -135,9 +135,10 @@ class TrapTubeEnv(_Compiled, gymnasium.Env):
         seed = None if seed is None else check_integer("seed", seed, minimum=0)
         super().reset(seed=seed)
         state = self._state
-        if seed is None and state is None:
-            seed = int(self.np_random.integers(2**32))
-        key = state.key if seed is None else _keys([seed])[0]
+        if seed is None and state is not None:
+            key = state.key
+        else:
+            key = _keys([int(self.np_random.integers(2**32)) if seed is None else seed])[0]
         self._state, timestep = self._programs.reset(key)
         return np.array(timestep.observation), {}
 
@@ -345,7 +346,8 @@ def _started(state: Any) -> Any:
 
 def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:
     """Returns i32[..., 2] of actions in the action space; raises ValueError for others."""
-    array, is_flat = integer_array("actions", actions), isinstance(space, spaces.Discrete)
+    array = np.asarray(integer_array("actions", actions))
+    is_flat = isinstance(space, spaces.Discrete)
     shape, count = (*batch, *space.shape), NUM_ACTIONS if is_flat else NUM_DIRECTIONS
     if array.shape != shape:
         raise ValueError(
