@@ -16,7 +16,7 @@ from rich.table import Table
 
 from agents import Config, make_train
 from agents.acting.encodings import encode_episodes
-from agents.acting.episodes import take
+from agents.acting.episodes import Episodes, take
 from agents.acting.rollout import Trajectory
 from agents.command_line import parse
 from agents.curiosity import Experience
@@ -81,7 +81,8 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     trajectory = jax.jit(play)(state)
     rewards, _ = jax.jit(learner.intrinsic_reward)(state, trajectory)
     batch, _ = jax.jit(learner.make_batch)(state, trajectory, rewards)
-    params, features = state.params, trajectory.features
+    params = state.params
+    features = jax.jit(functools.partial(encode, learner))(params, batch.episodes)
     encoder = functools.partial(encoder_gradients, learner)
     core = functools.partial(core_gradients, learner)
     parts: list[tuple[str, Callable[..., Any], tuple[Any, ...]]] = [
@@ -99,16 +100,17 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     return results
 
 
+def encode(learner: Learner, params: Params, episodes: Episodes) -> jax.Array:
+    """Encodes all observations of episodes to f32[T + 1, B, F]."""
+    read, chunk = {"encoder": params["encoder"]}, learner.config.encode_chunk_size
+    return encode_episodes(learner.agent.encode_rows, read, episodes, chunk=chunk)
+
+
 def encoder_gradients(learner: Learner, params: Params, batch: Batch) -> Params:
     """Sums the encoder's gradients over all minibatches, for some loss of its features."""
 
     def loss(params: Params, part: Batch) -> jax.Array:
-        features = encode_episodes(
-            learner.agent.encode_rows,
-            {"encoder": params["encoder"]},
-            part.episodes,
-            chunk=learner.config.encode_chunk_size,
-        )
+        features = encode(learner, params, part.episodes)
         return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
 
     def gradient(places: jax.Array) -> Params:
@@ -132,16 +134,11 @@ def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax
 
 def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batch) -> jax.Array:
     """Returns the sum of squares of everything that the loss terms are computed from."""
-    agent, curiosity = learner.agent, learner.curiosity
-    episodes, both = part.episodes, curiosity.needs_next_embedding
-    embedding, following = agent.unroll(
-        params, features, episodes.action, episodes.reward, both=both
-    )
-    own = {}
-    if both:
-        actions = agent.embed_action(params, episodes.action)
-        experience = Experience(episodes, features[..., :0], embedding, following, actions)
-        own = curiosity.losses(params["curiosity"], experience)
+    agent, curiosity, episodes = learner.agent, learner.curiosity, part.episodes
+    embedding, following = agent.unroll(params, features, episodes.action, episodes.reward)
+    actions = agent.embed_action(params, episodes.action)
+    experience = Experience(episodes, features[..., :0], embedding, following, actions)
+    own = curiosity.losses(params["curiosity"], experience)
     everything = jax.tree.leaves((agent.policy_and_value(params, embedding), own))
     return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 

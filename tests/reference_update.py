@@ -35,10 +35,10 @@ PARAMETER_NAMES = {
     "heads/grasp": "move_logits",
     "heads/move": "grasp_logits",
     "heads/value": "values_logits",
-    "curiosity/forward/Dense_0": "dense_forward",
-    "curiosity/inverse/Dense_0": "dense_inverse",
-    "curiosity/inverse/grasp": "dense_inverse_move",
-    "curiosity/inverse/move": "dense_inverse_grasp",
+    "curiosity/forward": "dense_forward",
+    "curiosity/inverse": "dense_inverse",
+    "curiosity/inverse_grasp": "dense_inverse_move",
+    "curiosity/inverse_move": "dense_inverse_grasp",
 }
 
 
@@ -125,8 +125,6 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
             mask=jnp.asarray(recording.steps("batch/weight")),
             observation_id=jnp.asarray(observation_id.reshape(images.shape[:2]), jnp.int32),
         ),
-        features=features,
-        embedding=embedding,
         log_prob=actions.log_prob(action),
         value=jnp.concatenate([value, jnp.full_like(value[:1], 1e9)]),
     )

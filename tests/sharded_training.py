@@ -12,7 +12,6 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import trap_tube_jax as tt
-from agents.acting.episodes import along_episodes
 from agents.arrays import key_data, to_arrays
 from agents.parallel.devices import EPISODES, ONE_DEVICE, Placement, become_devices
 from agents.ppo.learner import make_train
@@ -83,10 +82,9 @@ def gradient_gap():
     def gradient(params, batch):
         return placement.axis.mean(jax.grad(learner.loss, has_aux=True)(params, batch)[0])
 
-    def spec(axis, _) -> Any:
-        return PartitionSpec(*[None] * axis, EPISODES)
-
-    halves = along_episodes(spec, batch)
+    halves: Any = jax.tree.map(lambda _: PartitionSpec(None, EPISODES), batch)
+    layout = jax.tree.map(lambda _: PartitionSpec(EPISODES), batch.episodes.layout)
+    halves = halves._replace(episodes=halves.episodes._replace(layout=layout))
     whole = PartitionSpec()
     shared = jax.shard_map(
         gradient,
@@ -127,7 +125,6 @@ def main():
     steps = sum(row["episode_length"] for row in rows) * CONFIG.episodes_per_iteration
     report = {
         "unequal_copies": unequal_copies(shared),
-        "is_finite": [float(row["is_finite"]) for row in rows],
         "iteration": int(state["iteration"]),
         "transitions": int(state["transitions"]),
         "steps_played": round(float(steps)),

@@ -1,6 +1,5 @@
 """The record of episodes that acting and learning share."""
 
-from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -54,19 +53,12 @@ class Episodes(NamedTuple):
         return jax.vmap(one_time, in_axes=(None, 0))(self.layout, self.cells)
 
 
-def along_episodes(function: Callable[[int, jax.Array], jax.Array], record: Record) -> Record:
-    """Applies `function(axis, array)` to the arrays of a record, `axis` being that of episodes.
-
-    A record is `Episodes`, or a tree of them and arrays [T, B, ...]. `axis` is 0 in a field named
-    `layout`, else 1.
-    """
-    layout = jax.tree_util.GetAttrKey("layout")
-    return jax.tree.map_with_path(lambda path, x: function(0 if layout in path else 1, x), record)
-
-
 def take(record: Record, places: jax.Array) -> Record:
-    """Returns the episodes at `places` i32[M] of a record; see `along_episodes`."""
-    return along_episodes(lambda axis, x: x[places] if axis == 0 else x[:, places], record)
+    """Returns the episodes at `places` i32[M] of a tree of `Episodes` and arrays [T, B, ...]."""
+    layout = jax.tree_util.GetAttrKey("layout")  # arrays [B, ...]
+    return jax.tree.map_with_path(
+        lambda path, x: x[places] if layout in path else x[:, places], record
+    )
 
 
 def place(layout: State, cells: jax.Array) -> State:

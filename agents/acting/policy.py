@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from agents.acting.frames import Frame
-from agents.acting.repeats import Repeats, board_ids
+from agents.acting.repeats import Repeats
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.objects import BOARD_SIZE
@@ -100,8 +100,7 @@ class Policy(NamedTuple):
         elif repeats is None:
             action = actions.mode()
         else:
-            seen = board_ids(observation)
-            action = actions.mode(self.config.repeat_penalty * repeats.counts(seen))
-            repeats = repeats.add(seen, action)
+            penalty = self.config.repeat_penalty
+            action, repeats = repeats.choose(actions, penalty, observation)
         after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first), repeats)
         return jax.vmap(Frame.original_action)(frame, action), after

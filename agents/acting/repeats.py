@@ -16,7 +16,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from agents.networks.actions import ActionDistribution
 from agents.networks.grouping import hash_rows
+from trap_tube_jax.environment import action_to_index
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 
 MEMORY = 64  # steps
@@ -26,11 +28,11 @@ class Repeats(NamedTuple):
     """The last observations of B episodes and the actions taken there, newest first.
 
     Attributes:
-      observation: i32[MEMORY, B], see `board_ids`.
+      board: i32[MEMORY, B], hashes of the observations.
       action: i32[MEMORY, B], 4 * grasp + move; -1 before the first step.
     """
 
-    observation: jax.Array
+    board: jax.Array
     action: jax.Array
 
     @staticmethod
@@ -39,19 +41,17 @@ class Repeats(NamedTuple):
         nothing = jnp.full((MEMORY, batch), -1, jnp.int32)
         return Repeats(nothing, nothing)
 
-    def counts(self, observation: jax.Array) -> jax.Array:
-        """Returns how often each action was taken at the observations i32[B], f32[B, 4, 4]."""
-        is_same = (self.observation == observation[None]).astype(jnp.float32)
+    def choose(
+        self, actions: ActionDistribution, penalty: float, observation: jax.Array
+    ) -> tuple[jax.Array, "Repeats"]:
+        """Returns the best actions i32[B, 2] at boards u8[B, 12, 12, N], and the next memory."""
+        # Different observations hardly ever have the same hash.
+        board = hash_rows(observation.reshape(len(observation), -1)).astype(jnp.int32)
+        is_same = (self.board == board[None]).astype(jnp.float32)
         taken = jax.nn.one_hot(self.action, NUM_ACTIONS, dtype=jnp.float32)
         counts = jnp.einsum("tb,tba->ba", is_same, taken)
-        return counts.reshape(-1, NUM_DIRECTIONS, NUM_DIRECTIONS)
-
-    def add(self, observation: jax.Array, action: jax.Array) -> "Repeats":
-        """Adds a step with observations i32[B] and actions i32[B, 2]."""
-        newest = Repeats(observation, action[:, 0] * NUM_DIRECTIONS + action[:, 1])
-        return jax.tree.map(lambda x, old: jnp.concatenate([x[None], old[:-1]]), newest, self)
-
-
-def board_ids(observation: jax.Array) -> jax.Array:
-    """Hashes observations u8[B, 12, 12, N] to i32[B]; different ones hardly ever agree."""
-    return hash_rows(observation.reshape(len(observation), -1)).astype(jnp.int32)
+        counts = counts.reshape(-1, NUM_DIRECTIONS, NUM_DIRECTIONS)
+        action = actions.mode(penalty * counts)
+        newest = Repeats(board, action_to_index(action))
+        add = lambda x, old: jnp.concatenate([x[None], old[:-1]])  # noqa: E731
+        return action, jax.tree.map(add, newest, self)

@@ -22,8 +22,7 @@ class Experience(NamedTuple):
       episodes: B episodes of T steps.
       features: f32[T + 1, B, F], the observations encoded by `Curiosity.encode`.
       embedding: f32[T, B, H], the GRU's output h at the step.
-      next_embedding: f32[T, B, H], h', its output after the step; None unless
-        `Curiosity.needs_next_embedding`.
+      next_embedding: f32[T, B, H], h', its output after the step, in a second pass.
       action_embedding: f32[T, B, E], the policy's embedding of the action.
     """
 
@@ -38,12 +37,7 @@ class Curiosity:
     """An intrinsic reward. This base class pays 0 and has no parameters and no memory.
 
     All methods are pure functions of arrays. Attributes are settings and modules, never arrays.
-
-    Attributes:
-      needs_next_embedding: asks for `Experience.next_embedding`, a second pass of the GRU.
     """
-
-    needs_next_embedding = False
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws parameters, trained together with the policy's; {} if there are none.

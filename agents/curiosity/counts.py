@@ -7,12 +7,9 @@ import jax
 import jax.numpy as jnp
 
 import trap_tube_jax as tt
-from agents.acting.encodings import layout_content
-from agents.acting.episodes import Episodes, place
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.networks.grouping import hash_rows, slots
+from agents.networks.grouping import slots
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.positions import position_id
 
 VISIT_BITS = 20  # hash bits; the table of visits has a slot for each value
 
@@ -44,16 +41,9 @@ class Counts(Curiosity):
         self, params: Params, memory: jax.Array, experience: Experience
     ) -> tuple[jax.Array, jax.Array]:
         """Returns the bonus of the next observation, and the visits so far."""
-        slot = observation_slots(experience.episodes)[1:]
+        boards = experience.episodes.observations()[1:]
+        slot = slots(boards.reshape(*boards.shape[:2], -1), VISIT_BITS)
         return visit_bonus(memory, slot, experience.episodes.mask)
-
-
-def observation_slots(episodes: Episodes) -> jax.Array:
-    """Returns the slot i32[T + 1, B] of every observation."""
-    states = jax.vmap(jax.vmap(place), in_axes=(None, 0))(episodes.layout, episodes.cells)
-    position = jax.vmap(jax.vmap(position_id))(states).astype(jnp.uint32)
-    layout = jnp.broadcast_to(hash_rows(layout_content(episodes.layout)), position.shape)
-    return slots(jnp.stack([layout, position], axis=-1), VISIT_BITS)
 
 
 def visit_bonus(visits: jax.Array, slot: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -20,19 +20,13 @@ class E3B(DetachedICM):
     f_i are features of the episode's observation i, by an encoder that the inverse loss trains.
     """
 
-    def init_models(self, key: jax.Array, features: jax.Array) -> Params:
-        """Returns parameters of the inverse model alone."""
-        return {"inverse": self._inverse.init(key, features, features)}
-
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns the bonus of every next observation."""
         return elliptical_bonus(experience.features)[1:], memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
-        """Returns -log p(action) under the inverse model."""
-        features = experience.features
-        action: Any = self._inverse.apply(params["inverse"], features[:-1], features[1:])
-        return {"inverse_loss": -action.log_prob(experience.episodes.action)}
+        """Returns -log p(action) under the inverse model; the forward model is not trained."""
+        return {"inverse_loss": super().losses(params, experience)["inverse_loss"]}
 
 
 def elliptical_bonus(features: jax.Array) -> jax.Array:

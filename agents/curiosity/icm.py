@@ -12,31 +12,35 @@ import jax.numpy as jnp
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.networks.actions import ActionDistribution
-from agents.networks.layers import dense, draw, output_dense
+from agents.networks.layers import dense, init_module, output_dense
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
-class ForwardModel(nn.Module):
-    """Predicts the next embedding from the present one and the action: h + dense([h, action])."""
+class Models(nn.Module):
+    """A forward model h + dense([h, a]) of h', and an inverse model of one layer and two heads.
 
-    @nn.compact
-    def __call__(self, embedding: jax.Array, action: jax.Array) -> jax.Array:
-        """Maps f32[..., H] and f32[..., E] to f32[..., H]."""
-        x = jnp.concatenate([embedding, action], axis=-1)
-        return embedding + output_dense(embedding.shape[-1])(x)
-
-
-class InverseModel(nn.Module):
-    """Predicts the action between two embeddings, by one layer of `hidden` units and two heads."""
+    If `detached`, no gradient of the forward model's error reaches h and h'.
+    """
 
     hidden: int
+    detached: bool = False
 
     @nn.compact
-    def __call__(self, embedding: jax.Array, next_embedding: jax.Array) -> ActionDistribution:
-        """Maps two embeddings f32[..., H] to the distribution of the action."""
-        x = nn.swish(dense(self.hidden)(jnp.concatenate([embedding, next_embedding], axis=-1)))
-        grasp = output_dense(NUM_DIRECTIONS, name="grasp")(x)
-        return ActionDistribution(grasp, output_dense(NUM_DIRECTIONS, name="move")(x))
+    def __call__(self, h: jax.Array, after: jax.Array, action: jax.Array) -> Any:
+        """Returns the squared errors f32[..., H] of predicted h', and the inferred action.
+
+        Args:
+          h: f32[..., H], an embedding before a step.
+          after: f32[..., H], h', the one after it.
+          action: f32[..., E], the embedded action.
+        """
+        x = nn.swish(dense(self.hidden, name="inverse")(jnp.concatenate([h, after], axis=-1)))
+        heads = ("inverse_grasp", "inverse_move")
+        logits = [output_dense(NUM_DIRECTIONS, name=name)(x) for name in heads]
+        if self.detached:
+            h, after = jax.lax.stop_gradient((h, after))
+        change = output_dense(h.shape[-1], name="forward")(jnp.concatenate([h, action], axis=-1))
+        return jnp.square(h + change - after), ActionDistribution(jnp.stack(logits, axis=-2))
 
 
 class ICM(Curiosity):
@@ -45,20 +49,14 @@ class ICM(Curiosity):
     No gradient is stopped, so both losses train the policy's encoder.
     """
 
-    needs_next_embedding = True
-
     def __init__(self, config: Config):
-        self._forward, self._inverse = ForwardModel(), InverseModel(config.hidden)
-        self._widths = (config.hidden, 2 * config.embedding)
+        self._models: Any = Models(config.hidden)
+        self._widths = (config.hidden, config.hidden, 2 * config.embedding)
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws the parameters of both models."""
-        embedding, action = (jnp.zeros((1, width), jnp.float32) for width in self._widths)
-        params = {
-            "forward": self._forward.init(key, embedding, action),
-            "inverse": self._inverse.init(key, embedding, embedding),
-        }
-        return draw(key, params)
+        inputs = [jnp.zeros((1, width), jnp.float32) for width in self._widths]
+        return init_module(self._models, key, *inputs)
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns the sum over units of the forward model's squared errors."""
@@ -75,7 +73,5 @@ class ICM(Curiosity):
 
     def predict(self, params: Params, experience: Experience) -> Any:
         """Returns the squared errors f32[T, B, H] of predicted h', and the inferred action."""
-        here, there = experience.embedding, experience.next_embedding
-        predicted: Any = self._forward.apply(params["forward"], here, experience.action_embedding)
-        inferred = self._inverse.apply(params["inverse"], here, there)
-        return jnp.square(predicted - there), inferred
+        embeddings = experience.embedding, experience.next_embedding
+        return self._models.apply(params, *embeddings, experience.action_embedding)

@@ -162,11 +162,11 @@ class PlainPPO:
         reset_key, key = jax.random.split(key)
         state, timestep = self.env.reset(reset_key)
 
-        def step(carry: Any, data: jax.Array) -> Any:
+        def step(carry: Any, time: jax.Array) -> Any:
             state, mask, inputs = carry
             hidden, logits, value = self.network.apply(params, *inputs, method="act")
-            key = jax.random.wrap_key_data(data)
-            action = jax.random.categorical(key, logits).astype(jnp.int32)
+            drawn = jax.random.categorical(jax.random.fold_in(key, time), logits)
+            action = drawn.astype(jnp.int32)
             state, timestep = self.env.step(state, action)
             reward = mask * timestep.reward
             record = (inputs[1], action, reward, mask, log_prob(logits, action), value)
@@ -175,9 +175,8 @@ class PlainPPO:
 
         start, nothing = params["params"]["initial"], (jnp.zeros(2, jnp.int32), jnp.zeros(1))
         first = (state, jnp.ones(()), (start, timestep.observation, *nothing))
-        # As data: under `jax.vmap`, `jax_debug_key_reuse` takes scanned keys for used.
-        keys = jax.random.key_data(jax.random.split(key, self.env.max_steps))
-        (_, _, inputs), record = jax.lax.scan(step, first, keys)
+        times = jnp.arange(self.env.max_steps)
+        (_, _, inputs), record = jax.lax.scan(step, first, times)
         return Episode(jnp.concatenate([record[0], inputs[1][None]]), *record[1:])
 
     def prepare(self, state: TrainState, episode: Episode) -> tuple[jax.Array, Batch]:

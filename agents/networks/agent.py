@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -29,15 +30,11 @@ class Agent:
         self.heads: Any = Heads(config.num_value_heads)
 
     def init(self, key: jax.Array) -> Params:
-        """Draws the parameters; raises ValueError unless the encoder's features are [M, F]."""
+        """Draws the parameters."""
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         # Only layers of Flax, in an encoder of your own, use the folded key; see `draw`.
         features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
-        if features.ndim != 2:
-            raise ValueError(
-                f"encoder {self.config.encoder!r} must map observations [M, 12, 12, N] to features "
-                f"[M, F], got {list(features.shape)} for M = 1"
-            )
+        chex.assert_shape(features, (1, None))  # an encoder of your own must return [M, F]
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
         params = {
@@ -63,11 +60,9 @@ class Agent:
         """Returns the GRU's state f32[..., hidden] after a step; `inputs` are those of `Core`."""
         return self.core.apply(params["core"], state, *inputs)
 
-    def unroll(
-        self, params: Params, *inputs: jax.Array, both: bool = False
-    ) -> tuple[jax.Array, jax.Array | None]:
-        """Returns the GRU's outputs h at every step, and h' or None; see `Core.unroll`."""
-        return self.core.apply(params["core"], *inputs, both=both, method=Core.unroll)
+    def unroll(self, params: Params, *inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the GRU's outputs h at every step, and h' after it; see `Core.unroll`."""
+        return self.core.apply(params["core"], *inputs, method=Core.unroll)
 
     def policy_and_value(
         self, params: Params, state: jax.Array
@@ -78,8 +73,3 @@ class Agent:
     def embed_action(self, params: Params, action: jax.Array) -> jax.Array:
         """Embeds actions i32[..., 2] to f32[..., 2 * embedding]."""
         return self.core.apply(params["core"], action, method=Core.embed_action)
-
-
-def num_parameters(params: Params) -> int:
-    """Returns the number of scalars in `params`."""
-    return sum(leaf.size for leaf in jax.tree.leaves(params))

@@ -14,6 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from trap_tube_jax.state import take
+
 REMEMBERED_BYTES = 2**26  # by one `map_rows`; affects speed alone
 
 RowFn = Callable[[Any, Any, Any], tuple[Any, Any]]  # see `map_rows`
@@ -42,12 +44,12 @@ def _map_rows_forward(
     fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array
 ) -> tuple[Any, Any]:
     parts, num_chunks, chunk = _cut(rows, chunk)
-    shapes = jax.eval_shape(fn, params, _at(parts, 0), None)
+    shapes = jax.eval_shape(fn, params, take(parts, 0), None)
     num_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes[1]))
     num_remembered = min(REMEMBERED_BYTES // max(num_bytes, 1), num_chunks)
 
     def body(index: jax.Array, tables: tuple[Any, Any]) -> tuple[Any, Any]:
-        features, memory = fn(params, _at(parts, index), None)
+        features, memory = fn(params, take(parts, index), None)
         place = jnp.minimum(index, num_remembered)  # the last place is for all others
         return _put(tables[0], index, features), _put(tables[1], place, memory)
 
@@ -66,13 +68,13 @@ def _map_rows_backward(
     num_remembered = min((len(kept) - 1 for kept in jax.tree.leaves(memory)), default=math.inf)
 
     def body(index: jax.Array, gradient: Any) -> Any:
-        part, remembered = _at(parts, index), _at(memory, index)
+        part, remembered = take(parts, index), take(memory, index)
         if num_remembered < num_chunks:
             remembered = jax.lax.cond(
                 index < num_remembered, lambda: remembered, lambda: fn(params, part, None)[1]
             )
         _, pullback = jax.vjp(lambda p: fn(p, part, remembered)[0], params)
-        return jax.tree.map(jnp.add, gradient, *pullback(_at(cotangents, index)))
+        return jax.tree.map(jnp.add, gradient, *pullback(take(cotangents, index)))
 
     zero = jax.tree.map(jnp.zeros_like, params)
     return jax.lax.fori_loop(0, _num_chunks(count, chunk), body, zero), None, None
@@ -124,10 +126,6 @@ def _cut(rows: Any, chunk: int) -> tuple[Any, int, int]:
         return x.reshape(num_chunks, chunk, *x.shape[1:])
 
     return jax.tree.map(cut, rows), num_chunks, chunk
-
-
-def _at(tree: Any, index: jax.Array | int) -> Any:
-    return jax.tree.map(lambda x: x[index], tree)
 
 
 def _put(table: Any, place: jax.Array, rows: Any) -> Any:

@@ -88,33 +88,28 @@ class Core(nn.Module):
         return update * state + (1 - update) * candidate
 
     def unroll(
-        self, features: jax.Array, action: jax.Array, reward: jax.Array, *, both: bool
-    ) -> tuple[jax.Array, jax.Array | None]:
+        self, features: jax.Array, action: jax.Array, reward: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """Runs the GRU over episodes, from the initial state.
 
         Args:
           features: f32[T + 1, B, F], the encoded observations.
           action: i32[T, B, 2], (grasp, move).
           reward: f32[T, B].
-          both: computes h', too.
 
         Returns:
-          h at every step, f32[T, B, hidden], and h' after it or None. h' starts from the initial
-          state at the second observation (agents/agent.md, "Curiosity").
+          h at every step, f32[T, B, hidden], and h' after it. h' starts from the initial state at
+          the second observation (agents/agent.md, "Curiosity"); unused, it is not computed.
         """
         tm1 = [jnp.concatenate([jnp.zeros_like(x[:1]), x]) for x in (action, reward)]
         inputs = self.inputs(features, *tm1)
-        inputs = jnp.concatenate([inputs[:-1], inputs[1:]], axis=1) if both else inputs[:-1]
 
         def body(state: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
             state = self.advance(state, x)
             return state, state
 
-        _, output = jax.lax.scan(body, self.initial_state(inputs.shape[1]), inputs)
-        if not both:
-            return output, None
-        now, after = jnp.split(output, 2, axis=1)
-        return now, after
+        start = self.initial_state(inputs.shape[1])
+        return jax.lax.scan(body, start, inputs[:-1])[1], jax.lax.scan(body, start, inputs[1:])[1]
 
 
 class Heads(nn.Module):
@@ -125,7 +120,6 @@ class Heads(nn.Module):
     @nn.compact
     def __call__(self, state: jax.Array) -> tuple[ActionDistribution, jax.Array]:
         """Maps f32[..., hidden] to the distribution of actions and the values f32[..., V]."""
-        grasp = output_dense(NUM_DIRECTIONS, name="grasp")(state)
-        move = output_dense(NUM_DIRECTIONS, name="move")(state)
+        logits = [output_dense(NUM_DIRECTIONS, name=name)(state) for name in ("grasp", "move")]
         value = output_dense(self.num_values, name="value")(state)
-        return ActionDistribution(grasp, move), value
+        return ActionDistribution(jnp.stack(logits, axis=-2)), value

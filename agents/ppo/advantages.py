@@ -31,8 +31,6 @@ INTRINSIC_RETURN_STD = 0.3
 # Added to the variance of advantages, so that those of a nearly constant reward stay small.
 VARIANCE_FLOOR = 4e-4
 
-RewardVariances = tuple[returns.RunningVariance, returns.RunningVariance]  # extrinsic, intrinsic
-
 
 def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
     """Returns the intrinsic reward's weight by iteration: constant, or decaying geometrically."""
@@ -43,19 +41,25 @@ def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
     return optax.exponential_decay(start, steps, end / start, end_value=end)
 
 
-def update_variances(
-    config: Config, variances: RewardVariances, episodes: Episodes, intrinsic_reward: jax.Array
-) -> RewardVariances:
-    """Updates the variances by B episodes with intrinsic rewards f32[T, B].
+def update_variance(
+    config: Config,
+    variance: jax.Array,
+    iteration: jax.Array,
+    episodes: Episodes,
+    intrinsic_reward: jax.Array,
+) -> jax.Array:
+    """Moves the variances f32[2] of both rewards towards those of B episodes with f32[T, B].
 
-    With separate value heads, the second variance is that of discounted intrinsic returns.
+    Iteration 0 replaces them. With separate value heads, the second is of the discounted intrinsic
+    returns.
     """
     if config.value_heads == "separate":
-        intrinsic_reward = returns.discounted_returns(intrinsic_reward, config.discount)
-    extrinsic, intrinsic = variances
-    mask, decay = episodes.mask, config.reward_ema_decay
-    extrinsic = extrinsic.update(episodes.reward, mask, decay)
-    return extrinsic, intrinsic.update(intrinsic_reward, mask, decay)
+        discount = jnp.full_like(intrinsic_reward, config.discount)
+        intrinsic_reward = returns.discounted_sum(intrinsic_reward, discount)
+    rewards = (episodes.reward, intrinsic_reward)
+    new = jnp.stack([jnp.var(reward, where=episodes.mask > 0) for reward in rewards])
+    keep = jnp.where(iteration == 0, jnp.float32(0), jnp.float32(config.reward_ema_decay))
+    return keep * variance + (1 - keep) * new
 
 
 def estimate(
@@ -64,7 +68,7 @@ def estimate(
     intrinsic_reward: jax.Array,
     intrinsic_coef: jax.typing.ArrayLike,
     value: jax.Array,
-    variances: RewardVariances,
+    variance: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Estimates the advantages of both rewards together.
 
@@ -75,22 +79,22 @@ def estimate(
       intrinsic_coef: weight of the intrinsic reward.
       value: f32[T + 1, B, V], values of all observations. With separate value heads the first is
         of the extrinsic reward, the second of the intrinsic one; V = 1 without a curiosity.
-      variances: variances as returned by `update_variances`.
+      variance: f32[2], as returned by `update_variance`; the deviation 0 counts as 1.
 
     Returns:
       Advantages f32[T, B] and value targets f32[T, B, V].
     """
-    mask, (extrinsic, intrinsic) = episodes.mask, variances
-    reward = episodes.reward
+    mask, reward = episodes.mask, episodes.reward
+    extrinsic_std, intrinsic_std = jnp.where(variance > 0, jnp.sqrt(variance), 1.0)
     if config.value_heads == "shared":
-        reward = reward / extrinsic.std + intrinsic_coef * intrinsic_reward / intrinsic.std
+        reward = reward / extrinsic_std + intrinsic_coef * intrinsic_reward / intrinsic_std
     task, task_target = advantages_and_targets(config, reward, episodes, value[..., 0])
     if config.num_value_heads == 1:
         return task, task_target[..., None]
     continues = jnp.concatenate([mask, jnp.zeros_like(mask[:1])]) > 0
     own = jnp.where(continues, value[..., 1], jnp.mean(value[0, :, 1]))
     discount = jnp.full_like(intrinsic_reward, config.discount)
-    reward = INTRINSIC_RETURN_STD * intrinsic_reward / intrinsic.std
+    reward = INTRINSIC_RETURN_STD * intrinsic_reward / intrinsic_std
     curiosity = returns.generalized_advantages(reward, discount, own, mask, config.gae_lambda)
     advantage = returns.normalize(task, mask, VARIANCE_FLOOR)
     advantage += intrinsic_coef * returns.normalize(curiosity, mask, VARIANCE_FLOOR)
@@ -112,13 +116,13 @@ def advantages_and_targets(
       episodes: B episodes of T steps.
       value: f32[T + 1, B], values of all observations.
     """
-    gamma, discount = config.discount, config.discount * episodes.discount
+    discount = config.discount * episodes.discount
     if config.bootstrap == "baseline":
         value = jnp.concatenate([value[:-1], value[-2:-1]])
-        discount = jnp.full_like(reward, gamma)
+        discount = jnp.full_like(reward, config.discount)
     advantage = returns.generalized_advantages(
         reward, discount, value, episodes.mask, config.gae_lambda
     )
     if config.bootstrap == "baseline":
-        return advantage, returns.discounted_returns(reward, gamma)
+        return advantage, returns.discounted_sum(reward, discount)
     return advantage, advantage + value[:-1]

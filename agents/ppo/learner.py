@@ -10,6 +10,7 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -41,25 +42,21 @@ class TrainState(NamedTuple):
       params: parameters by part: `encoder`, `core`, `heads` of the policy network, `curiosity`, and
         `motion` if `motion_coef` is above 0.
       opt_state: state of the optimizer.
-      extrinsic: variance of the extrinsic reward.
-      intrinsic: variance of the intrinsic reward, or of its returns with separate value heads.
+      reward_variance: f32[2], moving averages; see `agents.ppo.advantages.update_variance`.
       memory: memory of the curiosity.
       task_replay: failed tasks to replay.
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
-      episodes: i32[], episodes played.
       transitions: i32[], environment steps taken.
     """
 
     params: Params
     opt_state: Any
-    extrinsic: returns.RunningVariance
-    intrinsic: returns.RunningVariance
+    reward_variance: jax.Array
     memory: Any
     task_replay: TaskReplay
     key: jax.Array
     iteration: jax.Array
-    episodes: jax.Array
     transitions: jax.Array
 
 
@@ -106,36 +103,32 @@ class Learner:
         """Returns the first state."""
         config = self.config
         params_key, replay_key, key = jax.random.split(key, 3)
-        agent_key, curiosity_key = jax.random.split(params_key)
+        agent_key, curiosity_key, motion_key = jax.random.split(params_key, 3)
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
         curiosity = self.curiosity.init(curiosity_key, board)
         params = {**self.agent.init(agent_key), "curiosity": curiosity}
         if config.motion_coef:
             embedding = jnp.zeros((1, config.hidden), jnp.float32)
             action = self.agent.embed_action(params, jnp.zeros((1, 2), jnp.int32))
-            motion_key = jax.random.fold_in(jax.random.clone(params_key), 2)
             params["motion"] = init_module(MotionHead(), motion_key, embedding, action)
         zero = jnp.zeros((), jnp.int32)
         return TrainState(
             params=params,
             opt_state=self.optimizer.init(params),
-            extrinsic=returns.RunningVariance.zero(),
-            intrinsic=returns.RunningVariance.zero(),
+            reward_variance=jnp.zeros(2, jnp.float32),
             memory=self.curiosity.memory(),
             task_replay=TaskReplay.untried(
                 replay_key, len(config.replay_fractions), config.replay_capacity
             ),
             key=key,
             iteration=zero,
-            episodes=zero,
             transitions=zero,
         )
 
     def iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Plays one iteration's episodes and learns from them.
 
-        Returns the next state, and the iteration's metrics, f32[] each. `is_finite` is
-        1 unless a parameter or another metric is infinite or NaN.
+        Returns the next state, and the iteration's metrics, f32[] each.
         """
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
         reset_keys = self.draw_tasks(state.task_replay, reset_key)
@@ -143,23 +136,20 @@ class Learner:
             state.params, self.axis.part(reset_keys), self.axis.own_key(action_key)
         )
         intrinsic_reward, memory = self.intrinsic_reward(state, trajectory)
-        batch, (extrinsic, intrinsic) = self.make_batch(state, trajectory, intrinsic_reward)
+        batch, reward_variance = self.make_batch(state, trajectory, intrinsic_reward)
         params, opt_state, update_metrics = self.update(state, batch, update_key)
 
         solved = self.axis.gather(trajectory.episodes.solved)
         steps = jnp.sum(self.axis.gather(trajectory.episodes.length), dtype=jnp.int32)
         metrics = self.play_metrics(trajectory.episodes, intrinsic_reward, solved) | update_metrics
-        metrics["is_finite"] = _is_finite((params, metrics))
         next_state = TrainState(
             params=params,
             opt_state=opt_state,
-            extrinsic=extrinsic,
-            intrinsic=intrinsic,
+            reward_variance=reward_variance,
             memory=self.axis.mean(memory),
             task_replay=state.task_replay.remember(reset_keys, ~solved, self.config.num_replayed),
             key=key,
             iteration=state.iteration + 1,
-            episodes=state.episodes + self.config.episodes_per_iteration,
             transitions=state.transitions + steps,
         )
         return next_state, metrics
@@ -181,42 +171,32 @@ class Learner:
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
         """Computes the curiosity's reward of every step, under the parameters that acted.
 
-        Returns:
-          The reward f32[T, B], 0 after an episode's end, and the curiosity's new memory.
-
-        Raises:
-          ValueError: the curiosity returns another shape or dtype.
+        Returns the reward f32[T, B], 0 after an episode's end, and the curiosity's new memory.
         """
-        experience = self.experience(state.params, trajectory.episodes, trajectory)
-        result = self.curiosity.reward(state.params["curiosity"], state.memory, experience)
-        mask = trajectory.episodes.mask
-        wanted, found = _shapes((mask, state.memory)), _shapes(result)
-        if wanted != found:
-            raise ValueError(
-                f"curiosity {self.config.curiosity!r}: reward must return (reward, memory) "
-                f"{wanted}, got {found}"
-            )
-        reward, memory = result
+        experience = self.experience(state.params, trajectory.episodes)
+        mask, params = trajectory.episodes.mask, state.params["curiosity"]
+        reward, memory = self.curiosity.reward(params, state.memory, experience)
+        chex.assert_trees_all_equal_shapes_and_dtypes((reward, memory), (mask, state.memory))
         return jnp.where(mask > 0, reward, 0.0), memory
 
     def make_batch(
         self, state: TrainState, trajectory: Trajectory, intrinsic_reward: jax.Array
-    ) -> tuple[Batch, advantages.RewardVariances]:
+    ) -> tuple[Batch, jax.Array]:
         """Computes advantages and value targets, by intrinsic rewards f32[T, B].
 
-        Returns the batch, and the variances of both rewards; see `agents.ppo.advantages`.
+        Returns the batch, and the variances f32[2] of both rewards; see `agents.ppo.advantages`.
         """
         config, episodes = self.config, trajectory.episodes
-        variances = advantages.update_variances(
-            config, (state.extrinsic, state.intrinsic), episodes, intrinsic_reward
+        variance = advantages.update_variance(
+            config, state.reward_variance, state.iteration, episodes, intrinsic_reward
         )
-        variances = self.axis.mean(variances)
+        variance = self.axis.mean(variance)
         coef = advantages.intrinsic_coef_schedule(config)(state.iteration)
         advantage, target = advantages.estimate(
-            config, episodes, intrinsic_reward, coef, trajectory.value, variances
+            config, episodes, intrinsic_reward, coef, trajectory.value, variance
         )
         advantage = returns.normalize(advantage, episodes.mask)
-        return Batch(episodes, trajectory.log_prob, advantage, target), variances
+        return Batch(episodes, trajectory.log_prob, advantage, target), variance
 
     def update(
         self, state: TrainState, batch: Batch, key: jax.Array
@@ -256,8 +236,7 @@ class Learner:
           L f32[] and metrics: its terms as weighted in L, and the mean entropy of a step.
 
         Raises:
-          ValueError: a loss of the curiosity has the name of another term, not `..._loss`, or
-            another shape.
+          ValueError: a loss of the curiosity has the name of another term, or not `..._loss`.
         """
         config, mask = self.config, batch.episodes.mask
         experience = self.experience(params, batch.episodes)
@@ -285,49 +264,23 @@ class Learner:
                     f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
                     f"differ from {', '.join(terms)}; got {name!r}"
                 )
-            if term.shape != mask.shape:
-                raise ValueError(
-                    f"curiosity {config.curiosity!r}: {name} must be a number per step, "
-                    f"{_shapes(mask)}, got {_shapes(term)}"
-                )
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         total = sum(terms.values(), jnp.zeros((), jnp.float32))
         mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
         return total, {**terms, "loss": total, "entropy": mean_entropy}
 
-    def experience(
-        self, params: Params, episodes: Episodes, played: Trajectory | None = None
-    ) -> Experience:
-        """Returns the curiosity's view of episodes under `params`, differentiable by them.
-
-        If `params` acted, `played` is the trajectory, whose features and outputs of the GRU are
-        not computed again.
-        """
+    def experience(self, params: Params, episodes: Episodes) -> Experience:
+        """Returns the curiosity's view of episodes under `params`, differentiable by them."""
         read = {name: params[name] for name in ("encoder", "curiosity")}
 
         def encode(params: Params, rows: jax.Array, remembered: Any) -> Any:
-            own = self.curiosity.encode(params["curiosity"], rows)
-            if played is not None:
-                return (None, own), None
             features, remembered = self.agent.encode_rows(params, rows, remembered)
-            return (features, own), remembered
+            return (features, self.curiosity.encode(params["curiosity"], rows)), remembered
 
         features, own = encode_episodes(encode, read, episodes, chunk=self.config.encode_chunk_size)
-        features = features if played is None else played.features
-        embedding, next_embedding = self.agent.unroll(
-            params,
-            features,
-            episodes.action,
-            episodes.reward,
-            both=self.curiosity.needs_next_embedding,
-        )
-        return Experience(
-            episodes=episodes,
-            features=own,
-            embedding=embedding if played is None else played.embedding,
-            next_embedding=next_embedding,
-            action_embedding=self.agent.embed_action(params, episodes.action),
-        )
+        embeddings = self.agent.unroll(params, features, episodes.action, episodes.reward)
+        action_embedding = self.agent.embed_action(params, episodes.action)
+        return Experience(episodes, own, *embeddings, action_embedding)
 
     def play_metrics(
         self, episodes: Episodes, intrinsic_reward: jax.Array, solved: jax.Array
@@ -389,13 +342,3 @@ def make_train(
             "memory, so its arrays must be floats"
         )
     return Learner(config, env, Agent(config), curiosity, make_optimizer(config), axis)
-
-
-def _shapes(tree: Any) -> str:
-    described = jax.tree.map(lambda x: f"{jnp.dtype(x.dtype).name}{list(x.shape)}", tree)
-    return str(described).replace("'", "")
-
-
-def _is_finite(tree: Any) -> jax.Array:
-    finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]
-    return jnp.all(jnp.stack(finite)).astype(jnp.float32)

@@ -20,7 +20,7 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets
 from agents.acting.policy import Policy
 from agents.arrays import from_arrays
-from agents.networks.agent import PARTS, num_parameters
+from agents.networks.agent import PARTS
 from agents.parallel import processes
 from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_train
@@ -140,9 +140,10 @@ class Session:
         self.folder.page.unlink(missing_ok=True)  # it would show the run as it was
         note_provenance(self.folder.provenance, str(self.placement))
         config = self.run.config
+        count = sum(leaf.size for leaf in jax.tree.leaves(self.state.params))
         self.console.out(
             f"{self.folder.path}: {tt.task_set(config.env_id).id}, curiosity {config.curiosity}, "
-            f"seed {self.run.seed}, {num_parameters(self.state.params):,} parameters, on "
+            f"seed {self.run.seed}, {count:,} parameters, on "
             f"{self.placement}. Compiling ...",
         )
         advance = self.placement.shard(make_advance(self.learner))
@@ -194,10 +195,11 @@ class Session:
         self.state, metrics = advance(self.state)
         host = jax.tree.map(np.asarray, self.placement.local(metrics))
         taken = time.perf_counter() - started
-        steps, is_finite, iteration = host.pop("steps"), host.pop("is_finite"), self.iteration + 1
-        if not is_finite:
+        steps, iteration = host.pop("steps"), self.iteration + 1
+        # A parameter is infinite or NaN only if the norm of a gradient is.
+        if not all(np.isfinite(metric).all() for metric in host.values()):
             raise ValueError(
-                f"training diverged in iteration {iteration}: a loss or a parameter is not "
+                f"training diverged in iteration {iteration}: a loss or a gradient is not "
                 f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
             )
         host["evaluation"] = host["evaluation"].mean()  # in float64, to compare with thresholds
@@ -283,7 +285,7 @@ def make_advance(learner: Learner) -> Advance:
         return after, {
             **metrics,
             "evaluation": outcome.solved,
-            "episodes": after.episodes,
+            "episodes": after.iteration * config.episodes_per_iteration,
             "transitions": after.transitions,
             "steps": after.transitions - state.transitions,
         }

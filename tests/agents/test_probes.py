@@ -63,7 +63,7 @@ def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajecto
     )
     tasks, _ = jax.vmap(env.reset)(jax.random.split(reset_key, 32))
     played = rollout(train.agent, state.params, env, tasks, key=None)
-    return 1 / state.extrinsic.std, played
+    return 1 / jnp.sqrt(state.reward_variance[0]), played
 
 
 def test_value_of_a_certain_reward(learn):

@@ -70,9 +70,21 @@ def played(make_play):
 
 
 @jax.jit
-def encode(params, episodes):
-    """Encodes all observations u8[T + 1, B, 12, 12, N], each by itself."""
-    return jax.vmap(functools.partial(Agent(CONFIG).encode, params))(episodes.observations())
+def expected(params, episodes):
+    """Values and log-probabilities, all observations being encoded by themselves and in order."""
+    agent, again = Agent(CONFIG), lambda x: jnp.concatenate([x, x[-1:]])
+    features = jax.vmap(functools.partial(agent.encode, params))(episodes.observations())
+    action, reward = again(episodes.action), again(episodes.reward)
+    embedding, _ = agent.unroll(params, again(features), action, reward)
+    actions, value = agent.policy_and_value(params, embedding)
+    return value, actions.log_prob(action)[:-1]
+
+
+def check_outputs(params, trajectory):
+    """Values are of all observations, the last one included."""
+    value, log_prob = expected(params, trajectory.episodes)
+    np.testing.assert_allclose(trajectory.value, value, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(trajectory.log_prob, log_prob, rtol=1e-4, atol=1e-4)
 
 
 def test_episodes_follow_the_environment(played):
@@ -132,28 +144,7 @@ def test_every_observation_is_encoded_once(played, make_play, bits, monkeypatch)
         counts.clear()
         trajectory = play(params, layouts)
         jax.effects_barrier()
-        plain = encode(params, trajectory.episodes)
-        np.testing.assert_allclose(trajectory.features, plain, rtol=1e-4, atol=1e-5)
+        check_outputs(params, trajectory)
         distinct = check_ids(trajectory.episodes)
         assert len(counts) == len(trajectory.episodes.cells)
         assert sum(counts) == distinct if bits else sum(counts) > distinct
-
-
-def test_the_network_saw_the_episodes_in_order(played):
-    """Values are of all observations, the last one included."""
-    _, agent, params, _, _, trajectory = played
-
-    @jax.jit
-    def expected(params, trajectory):
-        episodes = trajectory.episodes
-        shown = jnp.concatenate([trajectory.features, trajectory.features[-1:]])
-        action = jnp.concatenate([episodes.action, episodes.action[-1:]])
-        reward = jnp.concatenate([episodes.reward, episodes.reward[-1:]])
-        embedding, _ = agent.unroll(params, shown, action, reward)
-        actions, value = agent.policy_and_value(params, embedding)
-        return embedding[:-1], value, actions.log_prob(action)[:-1]
-
-    embedding, value, log_prob = expected(params, trajectory)
-    np.testing.assert_allclose(trajectory.embedding, embedding, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(trajectory.value, value, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(trajectory.log_prob, log_prob, rtol=1e-4, atol=1e-4)

@@ -12,7 +12,6 @@ from agents import make_train
 from agents.acting.episodes import Episodes
 from agents.curiosity import Curiosity, Experience
 from agents.networks import make_encoder
-from agents.networks.layers import draw
 from agents.registry import curiosities
 from easy import COPIES
 from small_runs import small_config
@@ -93,8 +92,8 @@ def test_rnd_trains_the_predictor_alone():
 def test_the_forward_loss_trains_the_features_of_ride_alone(name, trained):
     curiosity = make(name)
     action = jnp.zeros((2, 1, 2), jnp.int32)
-    features = jax.random.normal(jax.random.key(0), (3, 1, 3))
-    params = draw(jax.random.key(1), curiosity.init_models(jax.random.key(2), features[:1, 0]))
+    params = curiosity.init(jax.random.key(1), BOARD)
+    features = jax.random.normal(jax.random.key(0), (3, 1, 2))
     episodes = Episodes(tt.base_state(), *[action] * 6)
 
     def loss(features, name):

@@ -23,8 +23,8 @@ CONFIG = Config(
 
 def plain_params(params):
     """The parameters of `agents.ppo` under the names of the plain network."""
-    encoder, core, heads = (params[name]["params"] for name in ("encoder", "core", "heads"))
-    forward, inverse = (params["curiosity"][name]["params"] for name in ("forward", "inverse"))
+    names = ("encoder", "core", "heads", "curiosity")
+    encoder, core, heads, icm = (params[name]["params"] for name in names)
     update, reset, candidate = zip(
         *(jnp.split(core[name], 3, axis=-1) for name in ("input_kernel", "state_kernel", "bias")),
         strict=True,
@@ -34,8 +34,8 @@ def plain_params(params):
     gru |= {f"h{g}": {"kernel": h} for g, (_, h, _) in gates.items()}
     gru["hn"]["bias"] = candidate[2][1]
 
-    def pair(layers):
-        grasp, move = layers["grasp"], layers["move"]
+    def pair(layers, prefix=""):
+        grasp, move = layers[f"{prefix}grasp"], layers[f"{prefix}move"]
         return {name: jnp.stack([grasp[name], move[name]], axis=-2) for name in ("kernel", "bias")}
 
     blocks = [encoder[block][conv] for block in ("block1", "block2") for conv in ("conv1", "conv2")]
@@ -51,8 +51,8 @@ def plain_params(params):
             "gru": gru,
             "policy": pair(heads),
             "critic": heads["value"],
-            "forward": forward["Dense_0"],
-            "inverse": {"layers_0": inverse["Dense_0"], "layers_2": pair(inverse)},
+            "forward": icm["forward"],
+            "inverse": {"layers_0": icm["inverse"], "layers_2": pair(icm, "inverse_")},
         }
     }
 
@@ -89,9 +89,9 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
     variance, (episode, advantage, target) = plain.prepare(plain_state, plain_ppo.Episode(*steps))
     total, terms = plain.loss(translated(now), (episode, advantage, target))
     chex.assert_trees_all_close(
-        [*variance, advantage.T, target.T[..., None], {**terms, "loss": total}],
+        [variance, advantage.T, target.T[..., None], {**terms, "loss": total}],
         [
-            *[each.variance for each in moments],
+            moments,
             batch.advantage,
             batch.value_target,
             {name: expected[name] for name in ("loss", *terms)},

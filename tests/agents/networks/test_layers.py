@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from agents import Config
-from agents.curiosity.icm import ForwardModel, InverseModel
+from agents.curiosity.icm import Models
 from agents.networks import make_encoder
 from agents.networks.core import Core, Heads
 from agents.networks.layers import dense, draw, init_module, output_dense
@@ -38,14 +38,14 @@ def test_every_layer_has_the_scale_of_the_table_in_agent_md():
     board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
     core = scales(Core(64, 8), h, h, jnp.zeros((1, 2), jnp.int32), jnp.zeros(1))
     encoder = scales(make_encoder(Config()), board)
-    forward, inverse = scales(ForwardModel(), h, a), scales(InverseModel(64), h, h)
+    icm, heads = scales(Models(64), h, h, a), scales(Heads(), h)
     biases = ("bias", "initial")
-    for part in (core, encoder, forward, inverse, heads := scales(Heads(), h)):
+    for part in (core, encoder, icm, heads):
         for name in [name for name in part if name.endswith(biases)]:
             assert part.pop(name) == 0
     assert set(core.values()) == set(encoder.values()) == {1.4142}
-    assert set(heads.values()) == set(forward.values()) == {1}
-    assert list(inverse.values()) == [1.4142, 1, 1]
+    assert set(heads.values()) == {1}
+    assert list(icm.values()) == [1, 1.4142, 1, 1]  # forward, inverse and its heads
 
 
 def test_parameters_of_the_same_shape_differ():

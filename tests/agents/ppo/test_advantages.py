@@ -7,7 +7,7 @@ import numpy as np
 import trap_tube_jax as tt
 from agents import Config, make_train
 from agents.acting.episodes import Episodes
-from agents.ppo import advantages, returns
+from agents.ppo import advantages
 from easy import assert_same
 
 
@@ -60,9 +60,8 @@ def test_two_streams_step_by_step():
     arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
     zero = jnp.zeros(())
     episodes = Episodes(tt.base_state(), zero, zero, *arrays, zero)  # pyright: ignore
-    old = returns.RunningVariance(jnp.float32(4), jnp.int32(3))
-    intrinsic_reward = jnp.float32(novelty)
-    moments = advantages.update_variances(config, (old, old), episodes, intrinsic_reward)
+    old, intrinsic_reward = jnp.full(2, 4.0), jnp.float32(novelty)
+    moments = advantages.update_variance(config, old, jnp.int32(3), episodes, intrinsic_reward)
     advantage, target = advantages.estimate(
         config, episodes, intrinsic_reward, 0.7, jnp.float32(value), moments
     )
@@ -70,7 +69,7 @@ def test_two_streams_step_by_step():
         (advantage, normal(task, mask) + 0.7 * normal(curiosity, mask)),
         (target[..., 0], task + value[:-1, :, 0]),
         (target[..., 1], curiosity + own[:-1]),
-        (moments[1].variance, variance),
+        (moments[1], variance),
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
@@ -82,7 +81,21 @@ def test_without_curiosity_the_task_has_the_only_value():
     value = jax.random.normal(jax.random.key(2), (7, 8, 1))
     ones = jnp.ones((6, 8))
     episodes = Episodes(tt.base_state(), *[ones] * 6)
-    moments = (returns.RunningVariance.zero(), returns.RunningVariance.zero())
-    found = advantages.estimate(config, episodes, jnp.zeros((6, 8)), 3.0, value, moments)
+    found = advantages.estimate(config, episodes, jnp.zeros((6, 8)), 3.0, value, jnp.zeros(2))
     expected = advantages.advantages_and_targets(config, ones, episodes, value[..., 0])
     assert_same((found[0], found[1][..., 0]), expected)
+
+
+def test_variances_are_moving_averages():
+    config, rng, variance, expected = Config(), np.random.default_rng(1), jnp.zeros(2), np.zeros(2)
+    for index in range(6):
+        rewards, mask = rng.normal(3, 2, (2, 4, 5)), rng.integers(0, 2, (4, 5))
+        arrays = (jnp.float32(x) for x in (rewards[0], mask, mask))
+        zero = jnp.zeros(())
+        episodes = Episodes(tt.base_state(), zero, zero, *arrays, zero)  # pyright: ignore
+        variance = advantages.update_variance(
+            config, variance, jnp.int32(index), episodes, jnp.float32(rewards[1])
+        )
+        keep = 0.9 if index else 0.0
+        expected = keep * expected + (1 - keep) * rewards[:, mask > 0].var(axis=1)
+        np.testing.assert_allclose(variance, expected, rtol=1e-5)

@@ -63,9 +63,8 @@ class Scripted(Learner):
         value = jax.random.normal(
             jax.random.key(3), (STEPS + 1, EPISODES, self.config.num_value_heads)
         )
-        nothing = jnp.zeros((*shape, 0))
         frame = Frame.of(jnp.zeros(len(reset_keys), jnp.int32))
-        return Trajectory(frame, episodes, nothing, nothing, jnp.zeros(shape), value)
+        return Trajectory(frame, episodes, jnp.zeros(shape), value)
 
     def intrinsic_reward(self, state, trajectory):
         return jax.random.uniform(jax.random.key(4), (STEPS, EPISODES)), state.memory
@@ -117,8 +116,7 @@ def test_an_iteration_remembers_failed_tasks_and_counts_what_was_played(scripted
     assert float(metrics["replayed_success"]) == 3 / 4
     assert float(metrics["episode_length"]) == STEPS
     after, _ = iterate(after)
-    counts = [int(x) for x in (after.iteration, after.episodes, after.transitions)]
-    assert counts == [2, 2 * EPISODES, 2 * EPISODES * STEPS]
+    assert (int(after.iteration), int(after.transitions)) == (2, 2 * EPISODES * STEPS)
 
 
 @pytest.mark.parametrize(("iteration", "coef"), [(0, 3.0), (4, 0.3), (8, 0.03), (9, 0.03)])
@@ -127,11 +125,11 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, c
     _, metrics = iterate(state._replace(iteration=jnp.int32(iteration)))
     trajectory = scripted.play(None, reset_keys(), None)
     reward, _ = scripted.intrinsic_reward(state, trajectory)
-    moments = advantages.update_variances(
-        BEST, (state.extrinsic, state.intrinsic), trajectory.episodes, reward
+    variance = advantages.update_variance(
+        BEST, state.reward_variance, jnp.int32(iteration), trajectory.episodes, reward
     )
     expected, _ = advantages.estimate(
-        BEST, trajectory.episodes, reward, coef, trajectory.value, moments
+        BEST, trajectory.episodes, reward, coef, trajectory.value, variance
     )
     # Normalised once more.
     expected = (expected - expected.mean()) / expected.std()
@@ -174,7 +172,7 @@ def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
     updates = BEST.gradient_steps
     counting = Counting(**{**vars(make_train(BEST)), "optimizer": recorder(updates)})
     params = jnp.zeros(EPISODES)
-    state = TrainState(params, counting.optimizer.init(params), *[None] * 8)  # pyright: ignore
+    state = TrainState(params, counting.optimizer.init(params), *[None] * 6)  # pyright: ignore
     number: Any = jnp.arange(EPISODES)[None]
     batch = learner.Batch(*[number] * 4)
     after, (count, seen), _ = counting.update(state, batch, jax.random.key(0))
@@ -208,19 +206,10 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
     with jax.debug_key_reuse(True):
         after, metrics = iterate(state)
         iterate(after)
-    assert float(metrics["is_finite"]) == 1
     assert all(np.isfinite(float(value)) for value in metrics.values())
     before, after = to_arrays(state.params), to_arrays(after.params)
     same = [name for name in before if np.array_equal(before[name], after[name])]
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
-
-
-def test_divergence_is_a_metric(scripted):
-    _, state, iterate = scripted
-    assert float(iterate(state)[1]["is_finite"]) == 1
-    broken = jax.tree.map(jnp.copy, state.params)
-    broken["heads"]["params"]["value"]["bias"] = jnp.full(2, jnp.inf)
-    assert float(iterate(state._replace(params=broken))[1]["is_finite"]) == 0
 
 
 class Returning(Curiosity):
@@ -242,7 +231,7 @@ class Returning(Curiosity):
 class Known(Learner):
     """Has seen an episode of two steps, of which the second is padding."""
 
-    def experience(self, params, episodes, played=None):
+    def experience(self, params, episodes):
         hidden, width = self.config.hidden, 2 * self.config.embedding
         outputs = (jnp.zeros((2, 1, hidden)), None, jnp.zeros((2, 1, width)))
         return Experience(episodes, jnp.zeros((3, 1, 0)), *outputs)
@@ -287,33 +276,29 @@ def with_curiosity(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("returned", "words"),
+    ("returned", "error", "message"),
     [
-        (
-            {"reward": jnp.zeros(3, jnp.float32)},
-            ["reward must return", "float32[6, 2]", "float32[3]"],
-        ),
-        ({"reward": jnp.zeros((6, 2), jnp.int32)}, ["float32[6, 2]", "int32[6, 2]"]),
-        ({"given": jnp.zeros(2, jnp.float32)}, ["int32[]", "float32[2]"]),
-        ({"losses": ["policy_loss"]}, ["losses must end in '_loss'", "got 'policy_loss'"]),
-        ({"losses": ["mine"]}, ["policy_loss, value_loss, entropy_loss", "got 'mine'"]),
-        ({"losses": {"my_loss": jnp.ones(3)}}, ["my_loss must be a number per step", "float32[3]"]),
+        ({"reward": jnp.zeros(3, jnp.float32)}, AssertionError, r"\(3,\) != \(6, 2\)"),
+        ({"reward": jnp.zeros((6, 2), jnp.int32)}, AssertionError, "int32 != float32"),
+        ({"given": jnp.zeros(2, jnp.int32)}, AssertionError, r"\(2,\) != \(\)"),
+        ({"losses": ["policy_loss"]}, ValueError, "must end in '_loss' .* got 'policy_loss'"),
+        ({"losses": ["mine"]}, ValueError, "'none': .* entropy_loss; got 'mine'"),
+        ({"losses": {"my_loss": jnp.ones(3)}}, AssertionError, r"\(3,\)"),
     ],
 )
-def test_a_curiosity_that_breaks_its_contract_is_named(with_curiosity, returned, words):
+def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returned, error, message):
     own = with_curiosity(Returning(**returned))
-    with pytest.raises(ValueError, match="curiosity 'none'") as error:
+    with pytest.raises(error, match=message):
         jax.eval_shape(own.iterate, own.init(jax.random.key(0)))
-    assert all(word in str(error.value) for word in words)
 
 
-def test_an_encoder_of_maps_is_named(monkeypatch):
+def test_an_encoder_of_maps_is_refused(monkeypatch):
     class Maps(nn.Module):
         def __call__(self, observation):
             return observation.astype(jnp.float32)
 
     monkeypatch.setitem(encoders, "maps", lambda config: Maps())
-    with pytest.raises(ValueError, match=r"encoder 'maps' must map .* got \[1, 12, 12, 3\] for M"):
+    with pytest.raises(AssertionError, match=r"\(1, 12, 12, 3\)"):
         make_train(Config(encoder="maps")).init(jax.random.key(0))
 
 

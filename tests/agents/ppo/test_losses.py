@@ -27,7 +27,7 @@ def softmax(logits: np.ndarray) -> np.ndarray:
 
 def distribution(logits: jax.Array) -> ActionDistribution:
     """Grasp by these logits, move by the same in reverse order."""
-    return ActionDistribution(logits, logits[..., ::-1])
+    return ActionDistribution(jnp.stack([logits, logits[..., ::-1]], axis=-2))
 
 
 def test_log_prob_and_entropy_of_actions(cases):

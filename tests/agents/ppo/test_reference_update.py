@@ -9,7 +9,6 @@ import pytest
 
 from agents import Config
 from agents.curiosity.icm import ICM
-from agents.networks.agent import num_parameters
 from agents.ppo.learner import make_train
 from paths import DATA
 from reference_update import Recording, make_trajectory
@@ -32,15 +31,15 @@ def ours(recording: Recording) -> dict[str, Any]:
     @jax.jit
     def run(params):
         trajectory = make_trajectory(learner.agent, params, recording)
-        experience = learner.experience(params, trajectory.episodes, trajectory)
+        experience = learner.experience(params, trajectory.episodes)
         assert isinstance(learner.curiosity, ICM)
         prediction = learner.curiosity.predict(params["curiosity"], experience)
         before = state._replace(params=params)
         raw, _ = learner.intrinsic_reward(before, trajectory)
         batch, moments = learner.make_batch(before, trajectory, raw)
-        return trajectory, experience.next_embedding, prediction, raw, batch, moments
+        return trajectory, experience, prediction, raw, batch, moments
 
-    names = ("trajectory", "next_embedding", "prediction", "raw", "batch", "moments")
+    names = ("trajectory", "experience", "prediction", "raw", "batch", "moments")
     return {"learner": learner, "params": params, **dict(zip(names, run(params), strict=True))}
 
 
@@ -75,7 +74,7 @@ def assert_close(actual: Any, expected: Any) -> None:
 
 
 def test_parameter_count(ours):
-    assert num_parameters(ours["params"]) == 202_113
+    assert sum(leaf.size for leaf in jax.tree.leaves(ours["params"])) == 202_113
 
 
 def test_replayed_boards_are_the_recorded_ones(recording, ours):
@@ -85,27 +84,28 @@ def test_replayed_boards_are_the_recorded_ones(recording, ours):
 
 def test_network_outputs(recording, ours):
     trajectory, (error, inferred) = ours["trajectory"], ours["prediction"]
-    actions, _ = ours["learner"].agent.policy_and_value(ours["params"], trajectory.embedding)
-    assert_close(trajectory.embedding, recording.steps("out/embedding"))
+    embedding = ours["experience"].embedding
+    actions, _ = ours["learner"].agent.policy_and_value(ours["params"], embedding)
+    assert_close(embedding, recording.steps("out/embedding"))
     assert_close(trajectory.log_prob, recording.steps("out/log_probs"))
     assert_close(actions.entropy(), recording.steps("out/entropy"))
     assert_close(trajectory.value[:-1, :, 0], recording.steps("out/values"))
-    assert_close(ours["next_embedding"], recording.steps("out/embedding_next"))
+    assert_close(ours["experience"].next_embedding, recording.steps("out/embedding_next"))
     expected = recording.steps("out/embedding_next_pred") - recording.steps("out/embedding_next")
     assert_close(error, np.square(expected))
-    assert_close(jax.nn.softmax(inferred.grasp_logits), recording.steps("out/move_pred"))
-    assert_close(jax.nn.softmax(inferred.move_logits), recording.steps("out/grasp_pred"))
+    predicted = [recording.steps(f"out/{name}_pred") for name in ("move", "grasp")]
+    assert_close(jax.nn.softmax(inferred.logits), np.stack(predicted, axis=-2))
 
 
 def test_rewards_and_targets(recording, ours):
-    extrinsic, intrinsic = ours["moments"]
+    extrinsic_std, intrinsic_std = np.sqrt(ours["moments"])
     mask = recording.steps("batch/weight")
     raw = ours["raw"]
     assert_close(raw * mask, recording.steps("reward/intrinsic") * mask)
-    assert_close(extrinsic.std, recording["reward/extrinsic_std"])
-    assert_close(intrinsic.std, recording["reward/intrinsic_std"])
-    reward = ours["trajectory"].episodes.reward / extrinsic.std
-    reward = reward + CONFIG.intrinsic_coef * raw * mask / intrinsic.std
+    assert_close(extrinsic_std, recording["reward/extrinsic_std"])
+    assert_close(intrinsic_std, recording["reward/intrinsic_std"])
+    reward = ours["trajectory"].episodes.reward / extrinsic_std
+    reward = reward + CONFIG.intrinsic_coef * raw * mask / intrinsic_std
     assert_close(reward, recording.steps("reward/total") * mask)
     assert_close(ours["batch"].advantage, recording.steps("target/advantages") * mask)
     assert_close(
