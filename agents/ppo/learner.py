@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from agents.acting.encodings import encode_episodes
@@ -29,7 +30,7 @@ from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
 from agents.registry import curiosities
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import BOARD_SIZE
+from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, base_palette
 from trap_tube_jax.registry import make
 
 Metrics = dict[str, jax.Array]
@@ -322,6 +323,13 @@ def make_train(
                 f"the environment's {name} is {getattr(env, name)}, the config's "
                 f"{getattr(config, name)}; they must agree"
             )
+    palettes = (env.base.palette, base_palette(env.num_features))
+    own, known = (np.asarray(palette)[[AGENT, FOOD]].tolist() for palette in palettes)
+    if (config.align_to_food or config.encoder == "objects") and own != known:
+        raise ValueError(
+            "align_to_food and encoder='objects' know agent and food by the colours of the base "
+            f"task, {known}; this environment's are {own}"
+        )
     longest = config.episodes_per_iteration * env.max_steps
     if config.max_transitions is not None and config.max_transitions < longest:
         raise ValueError(

@@ -4,31 +4,14 @@ import runpy
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.acting.episodes import Episodes
-from agents.curiosity import Experience
-from agents.examples import custom_curiosity, custom_transfer, oracle
-from small_runs import small_config
+from agents.examples import custom_transfer
 
 
-def test_a_custom_curiosity_pays_moves_of_the_tool():
-    column = jnp.array([[0, 4], [0, 4], [1, 5], [2, 6]])  # of the tool, at 4 times in 2 episodes
-    cells = jnp.zeros((4, 2, 3, 2), jnp.uint8).at[:, :, 1, 1].set(column.astype(jnp.uint8))
-    mask = jnp.array([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
-    nothing = jnp.zeros((3, 2))
-    episodes = Episodes(tt.base_state(), cells, nothing, nothing, nothing, mask, nothing)
-    experience = Experience(episodes, jnp.zeros((4, 2, 0)))
-    curiosity = custom_curiosity.ToolMoves()
-    pay, moves = curiosity.reward({}, jnp.float32(6.0), experience)
-    np.testing.assert_allclose(pay, [[0, 0], [1 / 3, 1 / 3], [1 / 3, 0]], rtol=1e-6)
-    assert moves == 9
-
-
-@pytest.mark.parametrize("name", ["custom_curiosity", "custom_transfer", "oracle", "plain_ppo"])
+@pytest.mark.parametrize("name", ["custom_transfer", "plain_ppo"])
 def test_help_explains_a_program_instead_of_running_it(name, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     monkeypatch.delitem(sys.modules, f"agents.examples.{name}", raising=False)
@@ -36,15 +19,6 @@ def test_help_explains_a_program_instead_of_running_it(name, monkeypatch, capsys
         runpy.run_module(f"agents.examples.{name}", run_name="__main__")
     assert stopped.value.code == 0
     assert "usage:" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_custom_curiosity_is_trained_with(capsys):
-    config = small_config(curiosity="tool-moves", max_steps=20)
-    state, metrics = custom_curiosity.main(config, iterations=2)
-    assert state.memory > 0
-    assert metrics["intrinsic_reward"] > 0
-    assert capsys.readouterr().out.count("moves of the tool") == 2
 
 
 def test_a_custom_transfer():
@@ -59,11 +33,3 @@ def test_a_custom_transfer():
     scores = custom_transfer.main(tasks=64)
     assert scores["base"].solved == 1
     assert scores["mirrored"].percent < 80
-
-
-def test_the_oracle_bounds_an_agent(capsys):
-    bounds = oracle.main(sets=("base", "sy"), tasks=10)
-    assert bounds == {"base": 100.0, "sy": 100.0}
-    shown = capsys.readouterr().out
-    assert "base: 100.0 % can be solved, in 11.0 steps" in shown
-    assert "optimality" in shown

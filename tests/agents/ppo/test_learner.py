@@ -38,6 +38,7 @@ BEST = Config.preset(
 )
 PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
 STEPS, EPISODES = 6, 8
+OWN_COLORS = tt.Environment(base=tt.base_state().replace(palette=255 - tt.base_state().palette))
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
 
@@ -313,6 +314,8 @@ def test_devices_average_floats_only(with_curiosity):
         ({"max_steps": 10_000}, None, r"2,560,000,000 steps; allowed: at most 2,147,483,647"),
         ({"max_steps": 7}, tt.Environment(max_steps=6), "max_steps is 6, the config's 7"),
         ({}, tt.make("base", num_features=4), "num_features is 4, the config's 3"),
+        ({"encoder": "objects"}, OWN_COLORS, "know agent and food by the colours"),
+        ({"align_to_food": True}, OWN_COLORS, "know agent and food by the colours"),
     ],
 )
 def test_settings_that_cannot_be_trained_with_are_refused(settings, env, message):
