@@ -52,7 +52,7 @@ def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
         axis.set_xlabel("iterations")
-    figure.supylabel("solved, %", fontsize=10)
+    figure.supylabel("solved, % (thin: a seed, thick: their mean)", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -73,6 +73,8 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
             if column in tables.PAPER_SETS:
                 place = tables.PAPER_SETS.index(column)
                 axis.barh(row, means[place], xerr=sds[place], color="#BBBBBB", error_kw={"lw": 1})
+                if not means[place]:
+                    axis.text(0, row, "0", va="center", fontsize="small")
             else:
                 axis.text(0, row, "not reported", va="center", fontsize="small")
         axis.set_xlim(-6, 106)

@@ -35,15 +35,15 @@ def save_success(profile: pd.DataFrame, path: Path) -> None:
         for index, (policy, own) in enumerate(profile.groupby("policy", sort=False)):
             groups = own.query("part == @part")
             x = groups["plan"] if part == "plan-length" else groups["level"].astype(float)
-            share = groups["solved"] / groups["tasks"]
+            percent = 100 * groups["solved"] / groups["tasks"]
             style = {"color": COLORS[index % 7], "marker": MARKERS[index % 7], "label": policy}
-            axis.errorbar(x, share, _margins(groups), capsize=2, clip_on=False, **style)
-        axis.set(xlabel=PANELS[part], ylim=(0, 1))
+            axis.errorbar(x, percent, _margins(groups), capsize=2, clip_on=False, **style)
+        axis.set(xlabel=PANELS[part], ylim=(0, 100))
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(parts) :]:
         axis.set_visible(False)
     for axis in axes[:, 0]:
-        axis.set_ylabel("success rate")
+        axis.set_ylabel("solved, %")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
     figure.savefig(path, format="png")
@@ -80,7 +80,7 @@ def save_controls(profile: pd.DataFrame, path: Path) -> None:
 
 
 def _margins(groups: pd.DataFrame) -> np.ndarray:
-    """Returns f64[2, G], from success rates to the ends of their 95 % Wilson intervals.
+    """Returns f64[2, G], from percent solved to the ends of their 95 % Wilson intervals.
 
     Groups of a single task have no interval.
     """
@@ -88,4 +88,4 @@ def _margins(groups: pd.DataFrame) -> np.ndarray:
         binomtest(solved, tasks).proportion_ci(method="wilson") if tasks > 1 else 2 * (solved,)
         for solved, tasks in zip(groups["solved"], groups["tasks"], strict=True)
     ]
-    return np.abs(np.transpose(ends) - (groups["solved"] / groups["tasks"]).to_numpy())
+    return 100 * np.abs(np.transpose(ends) - (groups["solved"] / groups["tasks"]).to_numpy())

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from agents.profiles import figures
 
 
-def test_success_is_drawn_from_0_to_1_with_a_colour_for_each_policy(tmp_path, monkeypatch):
+def test_success_is_drawn_from_0_to_100_with_a_colour_for_each_policy(tmp_path, monkeypatch):
     groups = [
         {"policy": policy, "part": part, "level": "0.5", "tasks": 4, "solved": 4, "plan": 9.0}
         for part in ("perceptual", "plan-length", "both")
@@ -17,9 +17,9 @@ def test_success_is_drawn_from_0_to_1_with_a_colour_for_each_policy(tmp_path, mo
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     figures.save_success(pd.DataFrame(groups), tmp_path / "x.png")
     shown = [axis for axis in drawn[0].axes if axis.get_visible()]
-    assert all(axis.get_ylim() == (0, 1) for axis in shown)
+    assert all(axis.get_ylim() == (0, 100) for axis in shown)
     assert shown[0].get_ylabel()
     colours = [[lines.lines[0].get_color() for lines in axis.containers] for axis in shown]
     assert colours == [list(figures.COLORS[:2])] * 3
     bar = shown[0].containers[0].lines[2][0].get_segments()[0][:, 1]
-    np.testing.assert_allclose(bar, [0.5101, 1], atol=1e-3)  # Wilson, 4 of 4
+    np.testing.assert_allclose(bar, [51.01, 100], atol=0.1)  # Wilson, 4 of 4
