@@ -30,11 +30,11 @@ def collect(root: Path, command: str) -> None:
     configs = [read_json(folder.config)["config"] for folder in folders]
     noted = [read_json(folder.provenance) for folder in folders if folder.provenance.exists()]
     machines, first = list(itertools.chain(*noted)), configs[0]
-    train_set = task_set(first["env_id"])
+    train_sets = [task_set(name) for name in dict.fromkeys(own["env_id"] for own in configs)]
     about = {
-        "title": f"{root.name}: trained on {train_set.label}",
+        "title": f"{root.name}: trained on {' or '.join(each.label for each in train_sets)}",
         "command": command,
-        "train_set": train_set.short,
+        "train_set": train_sets[0].short if len(train_sets) == 1 else "training set",
         "threshold": first["stop_when_solved"] or 1.0,
         "settings": {k: v for k, v in first.items() if all(own[k] == v for own in configs)},
         "machines": [each for place, each in enumerate(machines) if each not in machines[:place]],

@@ -8,7 +8,11 @@ import pytest
 from PIL import Image
 
 from agents.experiments import figures, report, tables
+from agents.files import read_json
+from agents.runs.folder import Run, RunFolder
+from agents.runs.metrics import append_rows
 from paths import ROOT
+from small_runs import small_config
 
 RESULTS = ROOT / "benchmarks" / "results"
 RECORDS = ("exp2_best", "exp2_curiosities", "exp2_long", "exp2_paper_encoder", "fast_base")
@@ -129,3 +133,14 @@ def test_the_tables_of_the_records_fit_a_terminal(record, tmp_path):
     shown = report.write(copy)
     assert "**Test tasks solved, %**" in (copy / "table.md").read_text()
     assert max(map(len, shown.splitlines()[:-5])) <= report.WIDTH
+
+
+def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
+    for name in ("base", "sy"):
+        folder = RunFolder(tmp_path / name)
+        folder.note(Run(small_config(env_id=name)))
+        append_rows(folder.metrics, curves(evaluations=((0, 1),)).to_dict("records"))
+    report.collect(tmp_path, "")
+    about = read_json(tmp_path / "grid.json")
+    assert about["title"].endswith(": trained on base or {Sy}")
+    assert about["train_set"] == "training set"
