@@ -30,8 +30,7 @@ def step(state: State, action: jax.Array) -> State:
     board, agent, food, tool = state.board, state.agent, state.food, state.tool
     extent = state.tool_extent
     on_tool = functools.partial(bar_covers, tool, extent)
-    is_over = state.terminated | state.truncated
-    move = jnp.where(is_over, 0, unit_vector(action[1]))
+    move = jnp.where(state.done, 0, unit_vector(action[1]))
 
     grasped = holds_tool(state, action[0])
     agent_free = static_object(board, agent + move) == GROUND

@@ -138,7 +138,7 @@ class Environment(ByValue):
         """
         check_state(state)
         action = check_actions(action, (2,))
-        was_done = state.terminated | state.truncated
+        was_done = state.done
         state = dynamics.step(state, action)
         time = jnp.where(was_done, state.time, state.time + 1)
         truncated = state.truncated | (~state.terminated & (time >= self.max_steps))

@@ -105,7 +105,7 @@ def press(game: Game, key: str) -> Game:
     if key not in MOVE_KEYS and key != HINT_KEY:
         return game
     state = game.state
-    if state.terminated | state.truncated:
+    if state.done:
         message = "the episode is over: r restart, n next task"
     elif key == HINT_KEY:
         message = _hint(state)

@@ -64,6 +64,11 @@ class State(ByValue, struct.PyTreeNode, eq=False):
     terminated: jax.Array
     truncated: jax.Array
 
+    @property
+    def done(self) -> jax.Array:
+        """Returns bool[]: the episode is over, terminated or truncated."""
+        return self.terminated | self.truncated
+
     @classmethod
     def create(
         cls,

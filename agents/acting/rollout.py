@@ -69,7 +69,7 @@ def rollout(
             "action": action,
             "reward": timestep.reward,
             "discount": timestep.discount,
-            "mask": (~(state.terminated | state.truncated)).astype(jnp.float32),
+            "mask": (~state.done).astype(jnp.float32),
         }
         outputs = (cells_of(state), value, taken, actions.log_prob(action))
         return (after, embedding, action, timestep.reward, repeats, cache), outputs

@@ -15,7 +15,7 @@ class NextStepVectorEnvironment(VectorEnvironment):
 
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes one action i32[B, 2] in each, or starts it over if its episode has ended."""
-        was_done = state.episodes.inner.terminated | state.episodes.inner.truncated
+        was_done = state.episodes.inner.done
         stepped, timestep, final_picture = self._advance(state, actions)
         state, picture = self._reset_done(was_done, stepped, final_picture)
         timestep = timestep.replace(

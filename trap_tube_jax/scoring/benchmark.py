@@ -66,10 +66,6 @@ class _Episodes(NamedTuple):
     in_range: jax.Array
     is_number: jax.Array
 
-    @property
-    def over(self) -> jax.Array:
-        return self.states.terminated | self.states.truncated
-
 
 def score(
     policy: Policy,
@@ -227,7 +223,7 @@ def _play(
             states=states,
             observation=timestep.observation,
             carry=carry,
-            in_range=now.in_range & jnp.all(in_range | now.over),
+            in_range=now.in_range & jnp.all(in_range | now.states.done),
             is_number=now.is_number & ~_has_nan(carry),
         )
 
@@ -239,7 +235,7 @@ def _play(
         in_range=jnp.array(True),
         is_number=jnp.array(True),
     )
-    last = jax.lax.while_loop(lambda now: ~jnp.all(now.over), step, first)
+    last = jax.lax.while_loop(lambda now: ~jnp.all(now.states.done), step, first)
     return last.states.terminated, last.states.time, last.in_range, last.is_number
 
 
@@ -274,7 +270,7 @@ def _play_one(
     if callable(getattr(agent, "reset", None)):
         agent.reset()
     observation, memory = np.array(observe(state)), None
-    while not (state.terminated or state.truncated):
+    while not state.done:
         if "state" in known:
             action, memory = act(observation, state=memory, **options)
         else:
