@@ -23,7 +23,7 @@ SUFFIX = ".safetensors"
 
 
 def to_arrays(tree: Any) -> Arrays:
-    """Copies every leaf to a NumPy array, named by its path in `tree`; keys become their data."""
+    """Copies every leaf to a NumPy array named by its path; PRNG keys become their key data."""
     leaves, _ = jax.tree.flatten_with_path(tree)
     # A copy: on a CPU the array could be a view of memory that is donated next.
     return {_name(path): np.array(key_data(leaf)) for path, leaf in leaves}

@@ -1,4 +1,4 @@
-"""Command lines from dataclasses: one option a field, documented by the class's docstring."""
+"""Builds command lines from dataclasses: one option per field, with help from the docstring."""
 
 import argparse
 import dataclasses
@@ -20,8 +20,8 @@ def option(default: Any, group: str | None = None, **metadata: Any) -> Any:
     Args:
       default: its default.
       group: title under which help lists it.
-      metadata: `append=True`: a tuple that grows by one value each time the option is given;
-        `flags`: further spellings.
+      metadata: `append=True` collects one value in a tuple each time the option is given; `flags`
+        lists alternative spellings.
     """
     return dataclasses.field(default=default, metadata={"group": group, **metadata})
 
@@ -46,7 +46,7 @@ def parse_all(
         describes the command.
       arguments: those of the process if None.
       prog: the command.
-      partly: passes over options of none of them, and over --help.
+      partly: ignores unknown options and --help.
 
     Raises:
       SystemExit: the command line is invalid, or asks for help.
@@ -112,7 +112,7 @@ def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: An
 
 
 def _values(kind: Any) -> dict[str, Any]:
-    """Returns how argparse reads values of an annotated type."""
+    """Returns the `add_argument` options for values of an annotated type."""
     if get_origin(kind) in (Union, types.UnionType):
         return _values(next(each for each in get_args(kind) if each is not types.NoneType))
     if get_origin(kind) is Literal:

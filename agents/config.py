@@ -54,7 +54,7 @@ class Config:
         `baseline`, as in the paper's published baseline: the value of the final board after
         termination, the last step's own value after truncation; the value target is the
         discounted sum of rewards.
-      clip_eps: half-width of the interval of ratios.
+      clip_eps: half-width of PPO's clipping interval.
       value_coef: weight of the squared value error.
       entropy_coef: weight of the entropy bonus. Entropy is summed over grasp and move.
       motion_coef: weight of the motion-prediction loss. 0 trains without its head
@@ -74,20 +74,21 @@ class Config:
       value_heads: one for all rewards, or one each. `shared`: rewards are divided by their standard
         deviation and added, and one head values the sum. `separate`: each reward has its own head,
         and the normalised advantages are added (`agents.ppo.advantages`).
-      reward_ema_decay: decay of the rewards' moving variances. They normalise both rewards; the
-        rates of `effects` decay alike.
+      reward_ema_decay: decay of the rewards' moving variances. These variances normalise both
+        rewards; the rates of `effects` use the same decay.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
-      replay_capacity: newest failed tasks kept for each of them.
+      replay_capacity: newest failed tasks kept per replay fraction.
       align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
       repeat_penalty: penalty on repeats in greedy play. An action loses this many nats for each of
         the last 64 steps that took it at the same observation (`agents.acting.repeats`).
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
       filters: channels of the first and of later convolutions; layer widths of `objects`.
-      hidden: units of the GRU. The layer before it and the inverse model have as many.
+      hidden: units of the GRU. The layer before the GRU and the inverse model have the same number
+        of units.
       embedding: units of each embedding of actions and reward.
-      recurrent: keeps the GRU's state between steps; without it the agent remembers its previous
-        action and reward only.
+      recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
+        previous action and reward.
       encode_chunk_size: distinct observations encoded at once; affects speed, and results only
         through the order of float32 sums.
     """
@@ -137,7 +138,7 @@ class Config:
     encode_chunk_size: int = _network(64, 1, 1_000_000)
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a setting that is not allowed, with its value and what is."""
+        """Raises ValueError for an invalid setting, naming its value and the allowed ones."""
         for field in dataclasses.fields(self):
             value = _plain(getattr(self, field.name))
             object.__setattr__(self, field.name, value)
@@ -277,7 +278,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def _plain(value: Any) -> Any:
-    """Returns NumPy scalars as Python's, and lists, as JSON has them, as tuples."""
+    """Converts NumPy scalars to Python scalars, and lists, as read from JSON, to tuples."""
     if isinstance(value, np.generic):
         return value.item()
     return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
@@ -306,6 +307,6 @@ def _check_value(field: dataclasses.Field, value: Any) -> None:
     numbers: tuple[Any, ...] = value if isinstance(value, tuple) and is_tuple else (value,)
     if isinstance(value, tuple) != is_tuple or len(numbers) != (length or len(numbers)):
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
-    for number in numbers:  # bool is no number
+    for number in numbers:  # `type` rejects bool, a subclass of int
         if type(number) not in types or not math.isfinite(number) or not low <= number <= high:
             raise ValueError(f"{field.name} must be {wanted}, got {value!r}")

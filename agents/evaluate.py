@@ -43,7 +43,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if None."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     with plain_errors():
         options = parse(Options, arguments, "python -m agents.evaluate")
         compilation.enable_cache()

@@ -44,7 +44,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if None."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     with plain_errors():
         options = parse(Options, arguments, "python -m agents.profile")

@@ -15,7 +15,7 @@ class Registry(dict[str, Callable[..., Any]]):
         self.own: set[str] = set()
 
     def register(self, name: str, factory: Callable[..., Any]) -> None:
-        """Adds a factory of yours, or replaces the one that you registered under this name.
+        """Registers a factory, or replaces one registered earlier under the same name.
 
         Raises:
           ValueError: the name is built in or has characters other than letters, digits, "_", "."

@@ -90,7 +90,7 @@ def launch(
                 calls[executor.submit(train_logged, path, run, options, stop_file)] = path
             for count, call in enumerate(_ended(calls), 1):
                 if request() and isinstance(executor, ProcessPerCall):
-                    for each in calls:  # of Dask this would also forget running ones
+                    for each in calls:  # on Dask this would also drop running calls
                         each.cancel()
                 if call.cancelled():
                     continue
@@ -98,7 +98,7 @@ def launch(
                 log = f"; see {log_of(path)}" if outcome.startswith("failed") else ""
                 console.out(f"[{count}/{len(runs)}] {path.name}: {outcome}{log}")
                 failed += [] if outcome == "done" else [path]
-        except BaseException:  # not even the current iteration is waited for
+        except BaseException:  # do not even wait for the current iteration
             stop_file.touch()
             for call in calls:
                 call.cancel()
@@ -112,9 +112,9 @@ def launch(
 
 
 def _ended(calls: Iterable[Future]) -> Iterator[Future]:
-    """Yields calls as they end, those that end together in their order.
+    """Yields calls as they end; calls that end together keep their order.
 
-    A wait without a limit, as of `as_completed`, would miss a signal that arrives just before it.
+    A wait without a timeout, as in `as_completed`, would miss a signal that arrives just before it.
     """
     pending = set(calls)
     while pending:

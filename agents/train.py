@@ -36,8 +36,8 @@ class Options:
       resume: folder of a run to continue with its options. Of its settings only --iterations,
         --max-transitions and --stop-when-solved may change.
       imports: module to import first. It may register curiosities, encoders and task sets.
-      distributed: trains with the other processes of a job of Slurm, Open MPI, Kubernetes or a
-        Cloud TPU, or else of HOST:PORT PROCESSES NUMBER.
+      distributed: trains with the other processes of a Slurm, Open MPI, Kubernetes or Cloud TPU
+        job, or else of a job at HOST:PORT PROCESSES NUMBER.
     """
 
     preset: str = option("fast", "run")
@@ -50,7 +50,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if None."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     with plain_errors():
         train(*parse(arguments))
 

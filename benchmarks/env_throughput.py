@@ -1,7 +1,7 @@
 """Environment steps per second: `python -m benchmarks.env_throughput`.
 
-Environments take random actions and start over by themselves, each time with a new task. In every
-step a pattern consumes the observations, as a user's program would.
+Environments take random actions and reset automatically, each time with a new task. In every step,
+a pattern consumes the observations, as a user's program would.
 """
 
 import dataclasses
@@ -80,7 +80,8 @@ class Subject:
     Attributes:
       name: name in tables.
       reset: keys [B] -> (state, timestep).
-      step: (state, actions [B, ...]) -> (state, timestep); starts over after an episode's end.
+      step: (state, actions [B, ...]) -> (state, timestep); resets automatically after an episode's
+        end.
       sample_actions: (key, shape) -> actions [*shape, ...].
       observe: timestep -> observations [B, ...]; by default the timestep itself.
     """
@@ -231,9 +232,9 @@ def measure_throughput(
 
 
 def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]:
-    """Returns a function that runs on every device by itself.
+    """Returns a function that runs independently on every device.
 
-    Its arguments and results have the devices as an additional first axis.
+    Arguments and results have an additional first axis for the devices.
     """
 
     def own(*arrays: Any) -> Any:

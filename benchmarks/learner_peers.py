@@ -8,8 +8,8 @@ with fewer episodes and epochs. There are two networks:
     dense   encoder and GRU of 128 units, as in PureJaxRL's recurrent PPO; the plain program plays
             through the gymnax adapter, which needs the extra `[interop]`
 
-`plain` is one compiled program, as is usual in JAX. `plain-by-step` is a call from Python for each
-gradient step: XLA's CPU backend is slow at the derivatives of convolutions in a loop.
+`plain` is one compiled program, as is usual in JAX. `plain-by-step` calls each gradient step from
+Python, because XLA's CPU backend is slow at derivatives of convolutions in a loop.
 """
 
 import dataclasses
@@ -179,7 +179,7 @@ def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
 
 
 def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed]:
-    """Measures our program and the plain ones in turn, after a round to warm up."""
+    """Times our program and the plain ones in alternating calls, after a warm-up round."""
     config = options.config(task_set, network)
     env, encoder = None, None
     if network == "dense":

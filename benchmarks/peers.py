@@ -1,8 +1,8 @@
 """This environment and other JAX gridworlds: `python -m benchmarks.peers`.
 
-All take random actions and start over by themselves in one process, and a user's program consumes
-every byte of every observation. The peers come with the extra `[bench]`. A peer that cannot be
-imported or fails is skipped, and the reason is printed.
+All environments run in one process, take random actions and reset automatically, and every byte of
+every observation is consumed, as in a user's program. The extra `[bench]` installs the peers. A
+peer that cannot be imported or fails is skipped, and the reason is printed.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from trap_tube_jax.command_line import plain_errors
 
 
 def gymnax_breakout() -> Subject:
-    """Returns MinAtar Breakout of gymnax; its step starts over by itself and takes a key."""
+    """Returns gymnax's MinAtar Breakout, whose step resets automatically and takes a key."""
     env, params = importlib.import_module("gymnax").make("Breakout-MinAtar")
 
     def reset(keys: jax.Array) -> Any:
@@ -59,7 +59,7 @@ def pgx_breakout() -> Subject:
 
 
 def navix_doorkey() -> Subject:
-    """Returns DoorKey-8x8 of Navix, which starts over by itself."""
+    """Returns Navix's DoorKey-8x8, which resets automatically."""
     env = importlib.import_module("navix").make("Navix-DoorKey-8x8-v0")
     reset, step = jax.vmap(env.reset), jax.vmap(env.step)
     return _stateless("Navix DoorKey-8x8", reset, step, len(env.action_set))

@@ -20,7 +20,7 @@ with needs_extra("pictures"):
 FIGURES = Path(__file__).parent / "results" / "figures"
 DPI = 200  # twice the pixels of a page that shows 830
 CELL = 40  # pixels of a cell before scaling
-# Okabe and Ito's colours, told apart by all kinds of colour vision, by object code.
+# Okabe and Ito's colour-blind-safe palette, by object code.
 PALETTE = jnp.array(
     [
         (221, 221, 221),  # ground: grey
@@ -102,7 +102,7 @@ PICTURES = {"board": draw_board, "symbolic": draw_symbolic}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if None."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.pictures", description="Draw board.png and symbolic.png."
     )

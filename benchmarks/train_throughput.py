@@ -126,7 +126,8 @@ def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax
         by_params, by_features = jax.grad(_core_loss, (1, 2))(
             learner, params, features[:, places], take(batch, places)
         )
-        # The derivative by the features is part of the work, so something must need it.
+        # The gradient with respect to the features is part of the work, so the result must depend
+        # on it.
         return jax.tree.map(lambda x: x + 1e-30 * jnp.sum(by_features), by_params)
 
     return _sum_over_minibatches(learner.config, gradient, params)

@@ -70,7 +70,7 @@ def save_gallery(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if absent."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     parser = argparse.ArgumentParser(
         prog="python -m trap_tube_jax.gallery",
         description="Draw the eight task sets.",

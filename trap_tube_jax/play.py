@@ -132,7 +132,7 @@ def screen(game: Game) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if absent."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     parser = argparse.ArgumentParser(
         prog="python -m trap_tube_jax.play", description="Play a task set in the terminal."
     )

@@ -1,7 +1,7 @@
 """Fast path: features of all observations of episodes, each distinct observation encoded once.
 
-`Cache` encodes observations while episodes are played, and finds those that any of them has met
-before. `encode_episodes` encodes episodes that have been played.
+`Cache` encodes observations while episodes are played, and reuses the features of observations that
+any episode has met before. `encode_episodes` encodes finished episodes.
 """
 
 from typing import Any, NamedTuple

@@ -1,8 +1,8 @@
 """Frames of reference: the board turned and mirrored so that the food is ahead.
 
-The rules are the same under the eight symmetries of the board, so an agent may see an image of the
-board and act in it. If the image depends on the direction of the food at the first observation, an
-eighth of the situations is left to learn. The frame holds for the whole episode.
+The rules are invariant under the eight symmetries of the board, so an agent may see an image of the
+board and act in that image. Choosing the image by the direction of the food at the first
+observation leaves an eighth of the situations to learn. The frame is fixed for the whole episode.
 
 Source: own; Puny et al. (2022) average over frames, and choose them.
 """
@@ -20,7 +20,8 @@ from trap_tube_jax.state import State, base_state
 class Frame(NamedTuple):
     """One of the eight images of the board.
 
-    The flags bool[] mirror the board at the main diagonal, then upside down, then left to right.
+    The flags bool[] mirror the board along the main diagonal, then top to bottom, then left to
+    right.
     """
 
     transposed: jax.Array

@@ -33,8 +33,8 @@ class Carry(NamedTuple):
 class Policy(NamedTuple):
     """A trained network that acts from observations alone.
 
-    Start every episode with `initial`. The network's input of the previous reward is 0, as it is
-    in training until an episode ends.
+    Start every episode with `initial`. The network always gets a previous reward of 0, as in
+    training until an episode ends.
 
     Attributes:
       name: the policy's name in tables.

@@ -1,12 +1,12 @@
 """Repeats: how often an episode has taken each action at the present observation.
 
-The environment is deterministic: an action that is repeated at the same observation has the same
-effect again, and a policy that always takes the most probable action may walk in circles. With
+The environment is deterministic, so repeating an action at the same observation has the same
+effect. A policy that always takes the most probable action may therefore walk in circles. With
 `Config.repeat_penalty`, greedy play takes the action of the highest
 
   log p(a | o, h) - repeat_penalty * n(o, a),
 
-n counting those of the last 64 steps of the episode that took this action at this observation.
+where n counts how many of the episode's last 64 steps took this action at this observation.
 
 Source: own.
 """

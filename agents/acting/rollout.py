@@ -25,7 +25,7 @@ class Trajectory(NamedTuple):
       frame: B frames in which the episodes were played.
       episodes: B episodes of T steps, in these frames.
       log_prob: f32[T, B], of the actions.
-      value: f32[T + 1, B, V], of every observation, the last one included, by value head.
+      value: f32[T + 1, B, V], one value per head for every observation, including the last.
     """
 
     frame: Frame
@@ -82,7 +82,7 @@ def rollout(
         Repeats.empty(batch) if penalty and key is None else None,
         Cache.empty(agent, params, initial, env.max_steps),
     )
-    # One more step than the episode has, for the last observation; states do not change any more.
+    # One extra step records the last observation; states no longer change in this step.
     times = jnp.arange(env.max_steps + 1, dtype=jnp.int32)
     (*_, cache), (cells, value, *outputs) = jax.lax.scan(step, first, times)
     taken, log_prob = jax.tree.map(lambda x: x[:-1], outputs)

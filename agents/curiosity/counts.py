@@ -18,11 +18,12 @@ class Counts(Curiosity):
     """reward: n^(-1/2), n the visits of the next observation so far, this iteration's included.
 
     Visits are counted in a table of 2^20 slots by a hash of the observation. Observations of one
-    hash share a count: a new one does with probability n / 2^20 if n are known, 5 % at 50,000.
+    hash share a count. With n known observations, a new observation collides with probability n /
+    2^20: 5 % at 50,000.
 
     Raises:
-      ValueError: `env` has transfers other than `symbolic`. They draw so many tasks that hardly
-        any observation returns, and the table would fill up.
+      ValueError: `env` has transfers other than `symbolic`. Such transfers draw so many tasks that
+        observations hardly ever recur, and the table would fill up.
     """
 
     def __init__(self, env: Environment):

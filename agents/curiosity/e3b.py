@@ -1,4 +1,4 @@
-"""E3B: the reward is the dissimilarity of an observation's features to the episode's so far.
+"""E3B: rewards observations whose features differ from the episode's earlier features.
 
 Source: Henaff et al. (2022).
 """

@@ -52,9 +52,9 @@ class Effects(Curiosity):
 def new_effects(episodes: Episodes) -> jax.Array:
     """Returns f32[3, T, B], 1 where a step has an effect that is new to the episode.
 
-    Food and tool: it moves to a cell where it has not been. The tool is all that moves besides
-    agent and food, so its cell is new exactly where the board without these two has not looked the
-    same before in the episode, unless it has the colour of what it moves over.
+    Food and tool: the object moves to a cell where it has not been. Only agent, food and tool move.
+    So the tool's cell is new exactly where the board without agent and food looks new in the
+    episode, unless the tool has the colour of the cells that it covers.
 
     Grasp: the grasped cell has a colour that the episode has not grasped before.
     """

@@ -1,7 +1,7 @@
-"""ICM with an encoder of its own, which the inverse loss alone trains.
+"""ICM with a separate encoder that only the inverse loss trains.
 
-So the features cannot collapse to easily predicted ones, and the policy's encoder serves the
-policy only. Source: own; Burda et al. (2019a) discuss which features to predict.
+So the features cannot collapse to easily predicted ones, and the policy's encoder serves only the
+policy. Source: own; Burda et al. (2019a) discuss which features to predict.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
 class DetachedICM(ICM):
-    """Forward and inverse models over features of its own; reward and losses are those of `ICM`."""
+    """Forward and inverse models over a separate encoder's features; reward and losses of `ICM`."""
 
     detached = True  # as in `Models`
 
@@ -35,7 +35,7 @@ class DetachedICM(ICM):
         return draw(key, {"encoder": encoder, "models": models})
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Encodes observations by its own encoder to f32[M, F]."""
+        """Encodes observations with the separate encoder to f32[M, F]."""
         return self._encoder.apply(params["encoder"], observation)
 
     def predict(self, params: Params, experience: Experience) -> Any:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 
 def visits(identity: jax.Array) -> jax.Array:
-    """Counts the visits f32[T, B] so far, the present one included, of i32[T, B] in its column."""
+    """Returns f32[T, B], how often each i32[T, B] has occurred in its column up to its own row."""
     time = jnp.arange(len(identity), dtype=jnp.int32)
     same = identity[:, None] == identity[None]
     so_far = (time[:, None] >= time[None])[..., None]

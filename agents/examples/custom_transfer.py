@@ -1,4 +1,4 @@
-"""A transfer of your own, and the score of an agent that was trained without it.
+"""Registers a custom transfer, and scores an agent that was trained without this transfer.
 
 python -m agents.examples.custom_transfer
 """

@@ -189,7 +189,7 @@ class PlainPPO:
         variance = keep * state.variance + (1 - keep) * fresh
         scale = jnp.array([1, config.intrinsic_coef]) / jnp.where(variance > 0, variance, 1) ** 0.5
         reward = jnp.tensordot(scale, rewards, axes=1)
-        # As in the published baseline, the last step's own value follows it.
+        # As in the published baseline, the last step bootstraps from its own value.
         following = jnp.concatenate([episode.value[:, 1:], episode.value[:, -1:]], axis=1)
         delta = mask * (reward + config.discount * following - episode.value)
         advantage = discounted_sum(delta, config.discount * config.gae_lambda)

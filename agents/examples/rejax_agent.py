@@ -15,7 +15,7 @@ from trap_tube_jax.adapters import to_gymnax
 
 
 class Policy:
-    """Adapts to `tt.score` a function from u8[12, 12, N] and a key to 4 * grasp + move."""
+    """Wraps a function of (u8[12, 12, N], key) that returns 4 * grasp + move, for `tt.score`."""
 
     def __init__(self, act: Callable[[jax.Array, jax.Array], jax.Array]):
         self._act = act
@@ -34,7 +34,7 @@ class Policy:
 
 
 def main(total_timesteps: int = 8_192) -> tt.Scores:
-    """Trains where food is near, and scores there and on base, which was not trained."""
+    """Trains on `NEAR_FOOD`; scores on this set and on base, which training never plays."""
     env, params = to_gymnax.make(NEAR_FOOD.id)
     ppo = rejax.PPO.create(
         env=env,

@@ -14,7 +14,7 @@ from trap_tube_jax.adapters.to_gymnasium import TrapTubeEnv
 
 
 def main(total_timesteps: int = 3_000) -> tt.Scores:
-    """Trains where food is near, and scores there and on base, which was not trained."""
+    """Trains on `NEAR_FOOD`; scores on this set and on base, which training never plays."""
     torch.set_num_threads(1)  # otherwise its threads and JAX's wait for each other
     env = TrapTubeEnv(NEAR_FOOD.id)
     model = stable_baselines3.PPO(

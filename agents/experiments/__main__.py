@@ -10,7 +10,7 @@ PROGRAM = "python -m agents.experiments"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if None."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ("",)
     if name not in GRIDS:
         asked = name in ("-h", "--help")

@@ -13,7 +13,7 @@ from trap_tube_jax.scoring.tasks import label
 
 WIDTH = 8.3  # inches, as in a page 830 pixels wide
 DPI = 150
-# Okabe and Ito's palette, told apart by all kinds of colour vision.
+# Okabe and Ito's palette, which is colour-blind safe.
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 
 
@@ -105,7 +105,7 @@ def _panels(
 
 
 def _draw_seeds(axis: Any, rows: Frame, color: str, name: str) -> None:
-    """Draws a line per seed, and the mean of several that all end together."""
+    """Plots a line per seed, and the mean of several seeds if all end at the same iteration."""
     values = 100 * rows.pivot_table(index="iteration", columns="seed", values="value")
     with_mean = values.shape[1] > 1 and bool(values.iloc[-1].notna().all())
     for count, seed in enumerate(values):

@@ -21,9 +21,9 @@ COMMA = re.compile(r",(?![^\[]*\])")  # but not those of a list
 class Options:
     """Trains every point of a grid of settings with every seed, several runs at a time.
 
-    Each run is a folder as agents.train makes it. Next to these folders are results.csv, with a
-    row per run, evaluation and task set, table.md and figures. Ctrl-C saves all runs, and the same
-    command continues. More seeds or values of a setting extend the grid.
+    Each run has a folder like those of agents.train. The grid's folder also holds results.csv, with
+    a row per run, evaluation and task set, table.md and figures. Ctrl-C saves all runs; repeating
+    the command resumes them. Adding seeds or values of a setting extends the grid.
 
     Attributes:
       settings: settings of all runs as NAME=VALUE, or of a grid as NAME=VALUE,VALUE.

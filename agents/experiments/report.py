@@ -2,7 +2,7 @@
 
 A grid's folder holds results.csv (rows of `agents.results`), curves.csv (metrics by iteration) and
 grid.json (title, command, settings that all runs share, machines). table.md and the figures are
-drawn from these three alone.
+made from only these three files.
 """
 
 import itertools

@@ -102,7 +102,7 @@ def success_table(tested: Frame, with_paper: bool) -> Frame:
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:
-    """Returns the mean of the known values and, of several, its interval within [0, high]."""
+    """Formats the mean of known values and, for several, its 95 % interval within [0, high]."""
     values = values[~np.isnan(values)]
     if len(values) < 2:
         return format(values[0], form) if len(values) else NOTHING

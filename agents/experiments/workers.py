@@ -1,4 +1,4 @@
-"""Executors of a grid's runs, and the call that trains one in their processes."""
+"""Executors for a grid's runs, and the function that trains one run in a worker process."""
 
 import contextlib
 import multiprocessing

@@ -16,5 +16,5 @@ encoders["objects"] = lambda config: ObjectEncoder(config.filters)
 
 
 def make_encoder(config: Config) -> nn.Module:
-    """Makes an encoder of the kind `config.encoder`."""
+    """Builds the encoder that `config.encoder` names."""
     return encoders.factory(config.encoder)(config)

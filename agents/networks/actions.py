@@ -9,7 +9,7 @@ from trap_tube_jax.environment import action_from_index
 
 
 class ActionDistribution(NamedTuple):
-    """Two independent categorical distributions, of grasp and move; leading axes are free.
+    """Two independent categorical distributions, over grasp and move, with any leading axes.
 
     Attributes:
       logits: f32[..., 2, 4].

@@ -32,9 +32,9 @@ class Agent:
     def init(self, key: jax.Array) -> Params:
         """Draws the parameters."""
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
-        # Only layers of Flax, in an encoder of your own, use the folded key; see `draw`.
+        # Only Flax's own layers, in a registered encoder, use the folded key; see `draw`.
         features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
-        chex.assert_shape(features, (1, None))  # an encoder of your own must return [M, F]
+        chex.assert_shape(features, (1, None))  # a registered encoder must return [M, F]
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
         params = {
@@ -45,7 +45,7 @@ class Agent:
         return draw(key, params)
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
-        """Encodes observations u8[M, 12, 12, N] to f32[M, F]; reads `params["encoder"]` alone."""
+        """Encodes observations u8[M, 12, 12, N] to f32[M, F]; reads only `params["encoder"]`."""
         return self.encoder.apply(params["encoder"], observation)
 
     def encode_rows(self, params: Params, observation: jax.Array, remembered: Any = None) -> Any:

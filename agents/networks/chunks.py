@@ -1,9 +1,10 @@
-"""Fast path: a function of the first rows alone, chunk by chunk, and its gradient.
+"""Fast path: applies a function to only the first rows, chunk by chunk, and differentiates it.
 
 Observations repeat, and encoding them takes nearly all of the time. So distinct observations are
-put first, and only those are encoded, in chunks of fixed size whose number depends on the data.
-JAX does not differentiate loops of varying length; `map_rows` does, and remembers for the gradient
-results that are costly to compute (20 % of a gradient step).
+put first, and only distinct observations are encoded. Chunks have a fixed size; their number
+depends on the data. JAX does not differentiate loops of varying length, but `map_rows` does.
+`map_rows` also keeps results for the gradient that are expensive to recompute (20 % of a gradient
+step).
 """
 
 import functools
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 
 from trap_tube_jax.state import take
 
-REMEMBERED_BYTES = 2**26  # by one `map_rows`; affects speed alone
+REMEMBERED_BYTES = 2**26  # per call of `map_rows`; affects only speed
 
 RowFn = Callable[[Any, Any, Any], tuple[Any, Any]]  # see `map_rows`
 
@@ -26,9 +27,9 @@ def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) ->
     """Applies `fn` to the first `count` rows, a chunk at a time; differentiable by `params` only.
 
     Args:
-      fn: maps (params, rows, remembered), rows being arrays [chunk, ...], to features, a pytree of
-        arrays [chunk, ...], and to what to remember of these rows, a pytree of arrays or None.
-        `remembered` is None, or an earlier result for the same arguments, to `recall`.
+      fn: maps (params, rows, remembered) to (features, memory). Rows and features are pytrees of
+        arrays [chunk, ...]. The memory to keep of these rows is a pytree of arrays or None.
+        `remembered` is None, or the memory of an earlier call with the same arguments, to `recall`.
       chunk: rows per call of `fn`; M where there are fewer.
       params: any pytree.
       rows: pytree of arrays [M, ...].

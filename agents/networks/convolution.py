@@ -1,7 +1,7 @@
 """Fast path: convolutions as matrix products of patches with the kernel, and max pooling.
 
-On a CPU they are faster than XLA's convolutions, whose derivatives are slow. Results are those of
-Flax's convolutions up to rounding.
+On a CPU, matrix products are faster than XLA's convolutions, whose derivatives are slow. Results
+equal those of Flax's convolutions up to rounding.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from agents.networks.layers import as_row, hidden_init
 
 
 class Conv(nn.Module):
-    """A square convolution of stride 1 to `features` channels, by kernels of height `size`.
+    """A convolution with `size` x `size` kernels, stride 1 and `features` output channels.
 
     Padding keeps the board's size; even kernels pad more below and to the right.
     """
@@ -63,8 +63,8 @@ def add_patches(x: jax.Array, size: int) -> jax.Array:
 def convolve(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """Convolves f32[M, H, W, C_in] with f32[k, k, C_in, C_out], padded with zeros, to C_out.
 
-    Both derivatives are products with the patches of the cotangent. JAX's own would add up k * k
-    overlapping parts for the one and cut the patches of x again for the other.
+    Both derivatives are matrix products with patches of the cotangent. JAX's derivatives would
+    instead add up k * k overlapping parts for `x` and cut the patches of `x` again for `kernel`.
     """
     return padded_patches(x, len(kernel)) @ kernel.reshape(-1, kernel.shape[-1])
 

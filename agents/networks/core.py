@@ -1,7 +1,7 @@
 """The recurrent core and the heads of the policy network.
 
-They are apart from the encoder because it runs once per distinct observation, the core once per
-step, and the heads where an action or a value is needed.
+The encoder is separate because it runs once per distinct observation, the core once per step, and
+the heads where an action or a value is needed.
 
 Source: paper, section "Results"; agents/agent.md, "Network".
 """
@@ -98,8 +98,9 @@ class Core(nn.Module):
           reward: f32[T, B].
 
         Returns:
-          h at every step, f32[T, B, hidden], and h' after it. h' starts from the initial state at
-          the second observation (agents/agent.md, "Curiosity"); unused, it is not computed.
+          h at every step, f32[T, B, hidden], and h' after every step. h' starts from the initial
+          state at the second observation (agents/agent.md, "Curiosity"). An unused h' is not
+          computed.
         """
         tm1 = [jnp.concatenate([jnp.zeros_like(x[:1]), x]) for x in (action, reward)]
         inputs = self.inputs(features, *tm1)

@@ -15,7 +15,8 @@ from trap_tube_jax.objects import BOARD_SIZE
 class Encoder(nn.Module):
     """Two convolutions, two residual blocks, each after a max pool, and a global max pool.
 
-    Batched, as convolutions are. Every convolution pads to keep the size.
+    Takes a batch of observations, as convolutions do. Every convolution pads to keep its input's
+    size.
 
     Attributes:
       filters: channels of the first convolution, and of all later ones.

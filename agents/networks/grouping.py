@@ -12,7 +12,7 @@ GROUPING_BITS = 16  # hash bits; the table of `group_rows` has a slot for each v
 
 
 class Groups(NamedTuple):
-    """Elements gathered by equality.
+    """A partition of M elements into groups of equal elements.
 
     Attributes:
       number: i32[M], the group of every element, counted from 0.
@@ -42,7 +42,7 @@ def group(*keys: jax.Array) -> Groups:
 
 
 def group_rows(content: jax.Array) -> Groups:
-    """Groups rows integer[M, K] that agree everywhere, faster than `group` but not completely.
+    """Groups equal rows integer[M, K], faster than `group` but not always completely.
 
     Each row is compared with one row of the same hash, and joins its group if the two are equal.
     Different rows are never in one group. Equal rows may be in two if hashes collide.
@@ -62,7 +62,7 @@ def group_rows(content: jax.Array) -> Groups:
 
 
 def slots(content: jax.Array, bits: int) -> jax.Array:
-    """Hashes rows integer[..., K] to i32[...] below 2**bits, places in a table."""
+    """Hashes rows integer[..., K] to table indices i32[...] below 2**bits."""
     return (hash_rows(content) >> np.uint32(32 - bits)).astype(jnp.int32)
 
 

@@ -1,9 +1,9 @@
 """Layers that all networks share, and the sampling of their kernels.
 
-XLA compiles every draw of random numbers by itself, which takes 37 s for the paper's network with
-ICM if each kernel is drawn apart. So kernels of these layers initialise to NumPy arrays of their
-standard deviation, and `draw` samples all of them at once, in 3 s. Flax's own layers initialise
-JAX arrays, which `draw` leaves as they are.
+XLA compiles every random draw separately. Drawing each kernel by itself takes 37 s for the paper's
+network with ICM. So these layers initialise kernels to NumPy arrays of their standard deviation,
+and `draw` samples all kernels at once, in 3 s. Flax's own layers initialise parameters to JAX
+arrays, which `draw` leaves unchanged.
 
 Source: agents/agent.md, "Network".
 """
@@ -21,7 +21,7 @@ TRUNCATED_STD = 0.87962566103423978  # a standard normal variable's, truncated a
 
 
 def variance_scaling(scale: float) -> Callable[..., np.ndarray]:
-    """Returns an initialiser to the standard deviation sqrt(scale / fan-in), for `draw`."""
+    """Returns an initialiser that fills kernels with sqrt(scale / fan-in), for `draw` to sample."""
 
     def init(key: jax.Array, shape: Sequence[int], dtype: Any = np.float32) -> np.ndarray:
         return np.full(shape, np.sqrt(scale / np.prod(shape[:-1])), dtype)
@@ -46,7 +46,7 @@ def draw(key: jax.Array, params: Any) -> Any:
 
 
 def init_module(module: nn.Module, key: jax.Array, *inputs: Any) -> Any:
-    """Returns parameters of a module of any layers, given the inputs of its call."""
+    """Initialises the parameters of any module, given example inputs of its call."""
     # Only layers of Flax use the folded key.
     return draw(key, module.init(jax.random.fold_in(key, 0), *inputs))
 

@@ -1,11 +1,12 @@
-"""An encoder of objects, wherever they are and whatever their colour.
+"""An encoder that treats the board as objects, wherever they are and whatever their colours.
 
 An object is all cells of one colour. Agent and food are known by their colours, which no transfer
 changes. Every other object is described by its cells, on the board and relative to agent and food,
-and by its size. Its colour is left out, since it says nothing where every task has new colours.
+and by its size. Colours of other objects are left out, because they say nothing if every task draws
+new ones.
 
-The description is computed from the observation alone. A small network reads it at a fraction of
-the cost of convolutions over 144 cells.
+The description depends only on the observation. A small network reads this description at a
+fraction of the cost of convolutions over 144 cells.
 
 Source: own; objects share a network and are pooled after Zaheer et al. (2017).
 """
@@ -27,7 +28,7 @@ NOWHERE = -1e3  # below every activation
 
 
 class ObjectEncoder(nn.Module):
-    """Maps every object by itself, then in view of all, and pools over objects.
+    """Encodes each object by itself, then in the context of the scene, and pools over objects.
 
     Layers before the objects are pooled into a scene have `filters[0]` units, later ones
     `filters[1]`.
@@ -59,10 +60,10 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     At most 6 objects besides agent and food are described; any further ones are left out.
 
     Returns:
-      f32[M, 6, 173]: flags of the rows and columns that hold cells of the object, 12 + 12; the
-      same relative to the agent, 23 + 23, and of the object's cells among the 5x5 around the
-      agent, 25; these three for the food; all 0 where agent or food is not visible; flags of the
-      sizes 0 to 4; the size / 20, and log(1 + size) / 3.
+      f32[M, 6, 173]: flags of the rows and columns that the object occupies, 12 + 12; flags of the
+        same rows and columns relative to the agent, 23 + 23, and of the object's cells in the 5x5
+        square around the agent, 25; the same three for the food; flags of the sizes 0 to 4; size /
+        20 and log(1 + size) / 3. Flags relative to an invisible agent or food are 0.
       bool[M, 6]: whether there is such an object.
       f32[M, 94]: flags of the agent's row and column, 12 + 12, the food's, 12 + 12, and the food's
       relative to the agent, 23 + 23.
@@ -90,14 +91,14 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     return features, size > 0, places
 
 
-# Places in a row or column are the bits of one integer: integers shift, join and count fast, where
-# arrays of flags need gathers and reductions, which do not vectorise.
+# Positions in a row or column are the bits of one integer. Integers are fast to shift, merge and
+# count; arrays of flags need gathers and reductions, which do not vectorise.
 
 
 def _objects(color: jax.Array, left: jax.Array) -> jax.Array:
-    """Returns the columns u32[M, 6, 12], in every row, of the first six colours u32[M, 12, 12].
+    """Returns the columns u32[M, 6, 12], row by row, of the first six colours in u32[M, 12, 12].
 
-    Looks at cells that are left, bool[M, 12, 12].
+    Considers only the cells flagged in `left`, bool[M, 12, 12].
     """
     count = len(color)
     color, left = color.reshape(count, -1), left.reshape(count, -1)

@@ -1,10 +1,10 @@
 """Fast path: same features and gradient as encoder.py, its first layers once per distinct window.
 
-Up to its first pooling, the encoder maps a 4x4 window of the observation to the features of one
-2x2 block of the board. An observation is 36 windows, most of which repeat: one step changes a
-handful. So each distinct window of a batch goes through the first two convolutions once. The third
-one is linear, so a window's contribution to each of the cells around it is computed once, too.
-These contributions are added up, and all later layers computed, observation by observation.
+Up to its first pooling, the encoder maps a 4x4 window of the observation to the features of one 2x2
+block of the board. An observation is 36 windows, most of which repeat: one step changes a handful.
+So each distinct window of a batch goes through the first two convolutions once. The third
+convolution is linear, so each window's contributions to the cells around it are also computed once.
+Contributions are added up, and later layers applied, observation by observation.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ from trap_tube_jax.objects import BOARD_SIZE
 
 WINDOW = 4  # height and width of a window, in cells
 BLOCKS = BOARD_SIZE // 2
-WINDOW_CHUNK = 128  # distinct windows encoded at once; affects results by rounding alone
+WINDOW_CHUNK = 128  # distinct windows encoded at once; affects results only by rounding
 
 Weights = Any  # nested dictionaries of arrays: the parameters of `Encoder`, or of a layer in it
 
@@ -34,10 +34,11 @@ def encode_rows(
     """Encodes observations u8[M, 12, 12, N], by windows if the encoder is the paper's.
 
     Returns:
-      The features f32[M, F], by windows differentiable by `params` alone, and what to remember for
-      `chunks.map_rows`: results of matrix products, or None with another encoder.
+      The features f32[M, F], and the memory for `chunks.map_rows`: results of matrix products, or
+      None with another encoder. Features by windows are differentiable only with respect to
+      `params`.
     """
-    if type(encoder) is not Encoder:  # one derived from it may compute something else
+    if type(encoder) is not Encoder:  # a subclass may compute something else
         return encoder.apply(params, observation), None
     weights = params["params"]
     window = cut_into_windows(observation)

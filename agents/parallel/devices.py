@@ -37,7 +37,7 @@ class EpisodeAxis:
     size: int = 1
 
     def mean(self, tree: Tree) -> Tree:
-        """Averages floats over the devices; integers are the same on all and stay."""
+        """Averages floats over the devices; returns integers, which are equal on all, unchanged."""
         if self.size == 1:
             return tree
         is_float = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
@@ -61,13 +61,13 @@ ONE_DEVICE = EpisodeAxis()
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """The devices of a run, a mesh along `EPISODES`; None for the default device alone."""
+    """The devices of a run: a mesh along `EPISODES`, or None for only the default device."""
 
     mesh: Mesh | None = None
 
     @classmethod
     def of(cls, devices: int | None, config: Config) -> Self:
-        """Chooses a number of devices; None is one, or all of several processes.
+        """Chooses the devices; None means one device, or all devices of a job of several processes.
 
         Raises:
           ValueError: the devices do not exist, or do not divide the minibatches.

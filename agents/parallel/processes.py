@@ -12,8 +12,8 @@ def join(distributed: Sequence[str] | None) -> None:
     """Waits for the other processes of this job; call it before JAX starts.
 
     Args:
-      distributed: None to train alone, nothing if a launcher describes the job; else HOST:PORT of
-        the first process, the number of processes, and the number of this one from 0.
+      distributed: None for a single process; empty if a launcher describes the job; else HOST:PORT
+        of the first process, the number of processes, and this process's index from 0.
 
     Raises:
       ValueError: the other processes are not found.
@@ -33,7 +33,7 @@ def join(distributed: Sequence[str] | None) -> None:
 
 
 def agree(number: int | None) -> int | None:
-    """Returns the largest number of any process, None if all have None or 0; all must call it."""
+    """Returns the maximum over processes, None if all pass None or 0; each process must call it."""
     if jax.process_count() == 1:
         return number
     return int(np.max(multihost_utils.process_allgather(np.int32(number or 0)))) or None

@@ -7,10 +7,10 @@ standard deviation, and estimates the advantages of the sum:
 
 `separate` estimates the advantages of each reward, normalises them and adds them. In a sum of
 rewards the one of higher variance dominates: once easy tasks pay, the intrinsic reward vanishes in
-their variance (Burda et al., 2019b). The extrinsic reward, at most 1 an episode, is not scaled. The
-intrinsic one is scaled so that the standard deviation of its returns is `INTRINSIC_RETURN_STD`. Its
-stream continues after an episode's end with the next episode, which is worth the mean of v_0, so
-finishing a task early forgoes no novelty.
+their variance (Burda et al., 2019b). The extrinsic reward, at most 1 per episode, is not scaled.
+The intrinsic reward is scaled so that its returns have the standard deviation
+`INTRINSIC_RETURN_STD`. Intrinsic returns are non-episodic: the next episode follows an episode's
+end and is worth the mean of v_0. So finishing a task early forgoes no novelty.
 
 Source: Schulman et al. (2016); Burda et al. (2019b), "Combining intrinsic and extrinsic returns";
 agents/agent.md, "PPO".
@@ -50,8 +50,8 @@ def update_variance(
 ) -> jax.Array:
     """Moves the variances f32[2] of both rewards towards those of B episodes with f32[T, B].
 
-    Iteration 0 replaces them. With separate value heads, the second is of the discounted intrinsic
-    returns.
+    Iteration 0 replaces the variances. With separate value heads, the second variance is that of
+    the discounted intrinsic returns.
     """
     if config.value_heads == "separate":
         discount = jnp.full_like(intrinsic_reward, config.discount)
@@ -77,8 +77,8 @@ def estimate(
       episodes: B episodes of T steps.
       intrinsic_reward: f32[T, B], 0 after an episode's end.
       intrinsic_coef: weight of the intrinsic reward.
-      value: f32[T + 1, B, V], values of all observations. With separate value heads the first is
-        of the extrinsic reward, the second of the intrinsic one; V = 1 without a curiosity.
+      value: f32[T + 1, B, V], values of all observations. With separate value heads, the first head
+        values the extrinsic reward and the second the intrinsic reward; V = 1 without a curiosity.
       variance: f32[2], as returned by `update_variance`; the deviation 0 counts as 1.
 
     Returns:
@@ -106,9 +106,9 @@ def advantages_and_targets(
 ) -> tuple[jax.Array, jax.Array]:
     """Estimates advantages and value targets, f32[T, B] each, by the rule of `config.bootstrap`.
 
-    `value`: gamma is 0 where a step terminates, the value of the last observation follows a
-    truncated episode, and the target is A_t + v_t. `baseline`: gamma is the same everywhere, the
-    last step's own value follows it, and the target is the discounted sum of rewards.
+    `value`: gamma is 0 where a step terminates, a truncated episode bootstraps from the value of
+    its last observation, and the target is A_t + v_t. `baseline`: gamma is constant, the last
+    step bootstraps from its own value, and the target is the discounted sum of rewards.
 
     Args:
       config: settings.

@@ -237,7 +237,8 @@ class Learner:
           L f32[] and metrics: its terms as weighted in L, and the mean entropy of a step.
 
         Raises:
-          ValueError: a loss of the curiosity has the name of another term, or not `..._loss`.
+          ValueError: the name of a curiosity's loss is that of another term or does not end in
+            `_loss`.
         """
         config, mask = self.config, batch.episodes.mask
         experience = self.experience(params, batch.episodes)

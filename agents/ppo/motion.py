@@ -1,8 +1,8 @@
 """Auxiliary loss: predicts which things an action moves.
 
-Reward and curiosity tell little about which of several objects is the tool. The motion of every
-step does, and its prediction trains the GRU and the encoder. Two consecutive observations show
-the motion, so the loss uses nothing that is hidden from the agent.
+Reward and curiosity reveal little about which of several objects is the tool. The motion of every
+step reveals more, and predicting this motion trains the GRU and the encoder. Two consecutive
+observations show the motion, so the loss uses nothing that is hidden from the agent.
 
 Source: own; auxiliary losses of reinforcement learning, after Jaderberg et al. (2017).
 """

@@ -18,9 +18,9 @@ def adam(learning_rate: optax.Schedule, epsilon: float) -> optax.GradientTransfo
       m <- BETA1 m + (1 - BETA1) g,  v <- BETA2 v + (1 - BETA2) g^2,
       step = -learning_rate sqrt(1 - BETA2^t) / (1 - BETA1^t) * m / (sqrt(v) + epsilon).
 
-    This form closes section 2 of Kingma and Ba (2015), and the baseline's framework uses it.
-    `optax.adam` adds epsilon after the correction of v. At t = 1 epsilon then weighs 30 times less
-    (sqrt(1 - BETA2) = 0.03), which shows in parameters whose gradient is near 1e-6.
+    Kingma and Ba (2015) give this form at the end of section 2, and the baseline's framework uses
+    it. `optax.adam` adds epsilon after correcting v. At t = 1, epsilon then weighs 30 times less
+    (sqrt(1 - BETA2) = 0.03), which affects parameters whose gradient is near 1e-6.
 
     `learning_rate` is a function of the number of updates so far.
     """

@@ -1,9 +1,10 @@
 """Replay of failed tasks.
 
-Where most tasks of a set are easy, few updates teach the others. So failed tasks are replayed: the
+If most tasks of a set are easy, few updates teach the hard tasks. So failed tasks are replayed: the
 same reset keys draw the same tasks. A replayed task that fails again is copied to the next of L
-lists, so each list holds fewer easy tasks than the one before, without any measure of difficulty. A
-task stays in its list, solved or not, until newer ones overwrite it, so new skills are rehearsed.
+lists. Each list therefore holds fewer easy tasks than the list before, without any measure of
+difficulty. A task stays in its list, solved or not, until newer tasks overwrite it, so the agent
+rehearses new skills.
 
 Source: own; a simple relative of prioritized level replay, Jiang et al. (2021).
 """

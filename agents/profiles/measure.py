@@ -31,16 +31,16 @@ def profile(
     """Plays each task of a profile once with each policy, greedily.
 
     Args:
-      policies: by the name to show; all see the same number of feature channels.
+      policies: policies by display name, all with the same number of feature channels.
       parts: names of `tasks.PARTS`.
       strengths: of the graded transfers, from 0 (the base task) to 1 (the paper's transfer).
       num_tasks: tasks of each strength and symbolic swap, and of the other draws from {P}.
 
     Returns:
-      One row for each policy, part and level: how many tasks, and how many of them solved; mean
-      steps of the solved tasks, mean length of the shortest plan of the solvable tasks, and mean
-      optimality, shortest plan / steps, of the solved tasks; and for each of `FAILED` how many
-      failed episodes reached this subgoal last.
+      One row per policy, part and level. Columns: the number of tasks and of solved tasks; mean
+      steps and mean optimality (shortest plan / steps) of the solved tasks; mean length of the
+      shortest plan of the solvable tasks; and, for each of `FAILED`, the number of failed episodes
+      that reached this subgoal last.
 
     Raises:
       ValueError: a setting is not allowed, or the policies differ in feature channels.

@@ -8,8 +8,9 @@ from trap_tube_jax import dynamics
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
 from trap_tube_jax.state import State
 
-# In the order of a plan. Tool touched: the agent has grasped it. Tool moved, food moved: it has
-# left its first cell. Food out: the agent could walk to the food without moving the tool.
+# In the order of a plan. Tool touched: the agent has grasped the tool. Tool moved, food moved: the
+# object has left its initial cell. Food out: the agent could walk to the food without moving the
+# tool.
 SUBGOALS = ("none", "tool touched", "tool moved", "food moved", "food out")
 
 _step = jax.jit(jax.vmap(dynamics.step))

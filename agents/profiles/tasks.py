@@ -45,8 +45,8 @@ class Sampling(NamedTuple):
 def layout_kinds(tasks: State) -> list[str]:
     """Names how food and tool are placed in each of B tasks of {P}.
 
-    The food leaves the tube "away" from the agent, "towards" it or "sideways"; the tool is "along"
-    this way or "across" it.
+    The food leaves the tube "away" from the agent, "towards" the agent or "sideways"; the tool
+    points "along" this direction or "across" it.
     """
     parts = map(np.asarray, (tasks.board, tasks.agent, tasks.tool_extent))
     found = []

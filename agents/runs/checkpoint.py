@@ -1,7 +1,7 @@
 """Checkpoints of the whole training state, a file each that is named by its iteration.
 
-A file holds the state's arrays and a record of plain values. Each is written atomically, so a kill
-leaves the checkpoints before it.
+A file holds the state's arrays and a record of plain values. Each file is written atomically, so a
+killed process leaves earlier checkpoints intact.
 """
 
 from pathlib import Path

@@ -10,8 +10,8 @@ def enable_cache() -> None:
     """Keeps compiled programs from one process to the next, in $XDG_CACHE_HOME or ~/.cache.
 
     JAX's own settings take precedence: `JAX_COMPILATION_CACHE_DIR` names another folder,
-    `JAX_ENABLE_COMPILATION_CACHE=0` compiles everything anew. A folder that other users can write,
-    such as /tmp, would let them choose what runs.
+    `JAX_ENABLE_COMPILATION_CACHE=0` disables the cache. A folder that other users can write to,
+    such as /tmp, would let them choose the code that runs.
     """
     if jax.config.values["jax_compilation_cache_dir"] is None:
         parent = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

@@ -1,4 +1,4 @@
-"""Progress of a run on one line of a terminal, and its results in a few."""
+"""Shows a run's progress on one terminal line, and its results on a few lines."""
 
 import shlex
 

@@ -140,7 +140,7 @@ class RunFolder:
     def lock(self) -> Iterator[None]:
         """Makes this process the folder's only writer; makes the folder if missing.
 
-        Raises ValueError if another process writes to it, OSError if it cannot be made.
+        Raises ValueError if another process writes to the folder, OSError if it cannot be created.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         try:

@@ -27,7 +27,7 @@ def load(
         carry = policy.initial(batch)
         action, carry = policy.act(observation, carry, key)
 
-    Reading runs no code that the source names; only `imports` are imported.
+    Loading runs no code that the source names; only modules in `imports` are imported.
 
     Args:
       source: a run's folder, a file of parameters, or the name of a shipped agent.

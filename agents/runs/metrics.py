@@ -19,7 +19,7 @@ Frame = Any  # pandas.DataFrame; what a type checker infers of pandas is too wid
 
 
 def append_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Appends rows to a CSV file, which the first of them begin with a header.
+    """Appends rows to a CSV file; begins a new file with a header.
 
     Raises:
       OSError: the file cannot be written.
@@ -28,9 +28,9 @@ def append_rows(path: Path, rows: Sequence[Row]) -> None:
 
 
 def read_rows(path: Path, **options: Any) -> Frame:
-    """Reads a CSV file of a run, without a last line that a killed process wrote in part.
+    """Reads a CSV file of a run; drops a last line that a killed process left incomplete.
 
-    Returns an empty table if it is missing. The options are those of `pandas.read_csv`.
+    Returns an empty table if the file is missing. Passes `options` to `pandas.read_csv`.
     """
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     return pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1] or NO_ROWS), **options)

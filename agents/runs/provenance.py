@@ -32,7 +32,7 @@ def provenance() -> dict[str, Any]:
 
 
 def note_provenance(path: pathlib.Path, devices: str) -> None:
-    """Adds this machine, its versions and the commit to a JSON file of those before."""
+    """Adds this machine, its versions and the commit to a JSON file of earlier entries."""
     known = read_json(path) if path.exists() else []
     here = {**provenance(), "devices": devices}
     if here not in known:
@@ -42,7 +42,7 @@ def note_provenance(path: pathlib.Path, devices: str) -> None:
 def commit() -> str | None:
     """Returns the commit of the code, with "-dirty" where the code has changed since.
 
-    None without git, or where the code is not a checkout of its own.
+    Returns None without git, or if the project is not the root of its git checkout.
     """
     try:
         if pathlib.Path(_git("rev-parse", "--show-toplevel")).resolve() != ROOT.resolve():

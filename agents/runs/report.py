@@ -31,7 +31,7 @@ from trap_tube_jax.state import State, take
 CELL_SIZE = 16  # pixels of the page's boards
 GIF_CELL_SIZE = 24
 PAGE = Path(__file__).with_name("report.html")  # its $names are filled in
-COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00")  # told apart by all kinds of colour vision
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00")  # colour-blind safe
 
 PANELS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("tasks solved", "fraction", ("success", "evaluation")),
@@ -47,7 +47,7 @@ Played = Mapping[str, Evaluation]
 
 
 def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played) -> None:
-    """Writes curves, GIF and page of a run, given its policy's outcomes of an evaluator."""
+    """Writes curves, GIF and page of a run, from an evaluator and its outcomes `played`."""
     save_curves(read_rows(folder.metrics), folder.curves, folder.path.name)
     folder.animation.unlink(missing_ok=True)
     own = tt.task_set(run.config.env_id).short

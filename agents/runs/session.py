@@ -56,15 +56,15 @@ def train_run(
 ) -> Scores | None:
     """Trains a run to its end from its newest checkpoint, evaluates it and writes its files.
 
-    A finished run is left as it is. Only one process may call it for a folder at a time.
+    A finished run is left unchanged. Only one process at a time may call `train_run` for a folder.
 
     Args:
       path: the run's folder, made if missing.
       run: what to train; of a stored run only `EXTENDABLE` settings may differ.
       options: how to train.
       console: where progress is shown; nowhere if None.
-      stop_file: training stops as by SIGTERM once this file exists, which reaches threads and
-        other hosts.
+      stop_file: training stops as on SIGTERM once this file exists. Unlike a signal, a file reaches
+        threads and other hosts.
 
     Returns:
       The scores on test tasks; None if the run was finished before.
@@ -258,7 +258,7 @@ def restore(
 
 
 def best_iteration(rows: Frame, own: str) -> int | None:
-    """Returns when the highest mean fraction of the validation tasks was first solved.
+    """Returns the first iteration with the highest mean fraction of validation tasks solved.
 
     None if no evaluation is among the rows. The mean is over task sets; base, a single task, counts
     only if it is the training set `own`.
@@ -274,7 +274,7 @@ def best_iteration(rows: Frame, own: str) -> int | None:
 def make_advance(learner: Learner) -> Advance:
     """Returns a function that trains for one iteration and plays the validation tasks greedily.
 
-    Its metrics hold `evaluation`, bool[B], the tasks solved.
+    The metrics include `evaluation`, bool[B], whether each task is solved.
     """
     config = learner.config
     tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")

@@ -27,7 +27,7 @@ QUANTILES = (5, 25, 50, 75, 95)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; `arguments` are those of the process if absent."""
+    """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     options = _parser().parse_args(arguments)
     with plain_errors():
         import_modules(options.imports)
