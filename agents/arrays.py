@@ -61,6 +61,8 @@ def read_arrays(path: Path) -> tuple[Arrays, dict[str, Any]]:
       ValueError: the file is damaged or of another kind.
       OSError: the file cannot be opened.
     """
+    with path.open("rb"):  # safetensors calls an unreadable file missing
+        pass
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

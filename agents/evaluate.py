@@ -72,9 +72,7 @@ def evaluate(options: Options) -> None:
         prefer = tt.task_set(config.env_id).short
         shown = save_first_solved(options.gif, evaluator, played, prefer)
         notes.append(f"solved episode of {shown}: {options.gif}" if shown else "nothing is solved")
-    print(f"{policy.name}, iteration {policy.iteration}\n")
-    print(scores, end="\n\n")
-    print(*notes, sep="\n")
+    print(f"{policy.name}, iteration {policy.iteration}", scores, *notes, sep="\n\n")
 
 
 if __name__ == "__main__":

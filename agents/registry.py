@@ -1,6 +1,7 @@
 """Names of intrinsic rewards and encoders, filled by `agents.curiosity` and `agents.networks`."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from trap_tube_jax.checks import check_registered_name
@@ -41,3 +42,12 @@ class Registry(dict[str, Callable[..., Any]]):
 
 curiosities = Registry("curiosity")
 encoders = Registry("encoder")
+
+
+@contextlib.contextmanager
+def contract(kind: str, name: str) -> Iterator[None]:
+    """Turns a failed assertion about a registered object into a ValueError that names it."""
+    try:
+        yield
+    except AssertionError as error:
+        raise ValueError(f"{kind} {name!r} returns wrong shapes or dtypes: {error}") from error

@@ -83,18 +83,22 @@ def train(options: Options, run: Run, how: RunOptions) -> None:
       OSError: a file cannot be written.
     """
     folder = RunFolder(run_path(options, run))
-    if options.resume is None and folder.config.is_file():
-        again = f"continue it with --resume {folder.path}, or give another --name"
-        raise ValueError(f"{folder.path} holds a run; {again}")
+    if options.resume is None:
+        folder.check_free()
     become_devices(how.devices)
     processes.join(options.distributed)
     console = Console(quiet=jax.process_index() > 0, highlight=False)
     compilation.enable_cache()
+    again = f"Continue with: {display.resume_command(folder, run)}"
     try:
         scores = train_run(folder.path, run, how, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
-        console.out(f"Stopped. Continue with: {display.resume_command(folder, run)}")
+        console.out(f"Stopped. {again}")
         raise SystemExit(exit_code(stopped)) from None
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OSError(f"{error}. Saved checkpoints are kept. {again}") from error
     for line in ([scores] if scores else []) + display.summary(folder, run):
         console.out(line)
 

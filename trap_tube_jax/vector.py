@@ -3,13 +3,14 @@
 `VectorEnvironment` equals `jax.vmap` of an `AutoReset`, bit for bit; read that first. Three
 differences make it fast:
 
-1. Auto-reset by selection draws a new task for every environment at every step. Here only finished
-environments start over, in as many chunks of fixed size as needed. 2. Board and palette are fixed
-within an episode, so their picture is drawn once, at the reset. A step draws food, tool and agent
-over it. 3. A picture is a flat vector of bytes, each compared with its own row and column. A loop
-over 12 * 12 * N neighbouring bytes vectorises; a loop whose innermost axis has three channels does
-not. The pictures pass through the loop of the resets, which keeps XLA from fusing the later reshape
-to [12, 12, N] into the loop over bytes.
+1. Auto-reset by selection draws a new task for every environment at every step. Here only
+   finished environments start over, in as many chunks of fixed size as needed.
+2. Board and palette are fixed within an episode, so their picture is drawn once, at the
+   reset. A step draws food, tool and agent over it.
+3. A picture is a flat vector of bytes, each compared with its own row and column. A loop over
+   12 * 12 * N neighbouring bytes vectorises; a loop whose innermost axis has three channels
+   does not. The pictures pass through the loop of the resets, which keeps XLA from fusing the
+   later reshape to [12, 12, N] into the loop over bytes.
 """
 
 import dataclasses

@@ -52,7 +52,7 @@ def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
         axis.set_xlabel("iterations")
-    figure.supylabel("solved, % (thin: a seed, thick: their mean)", fontsize=10)
+    figure.supylabel("solved, %", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -114,4 +114,4 @@ def _draw_seeds(axis: Any, rows: Frame, color: str, name: str) -> None:
         axis.plot(own.index, own, color=color, label="" if with_mean or count else name, **style)
     if with_mean:
         mean = values.dropna().mean(axis=1)
-        axis.plot(mean.index, mean, color=color, linewidth=1.8, label=name)
+        axis.plot(mean.index, mean, color=color, linewidth=1.8, label=f"{name}, mean of seeds")

@@ -85,6 +85,8 @@ class Grid:
                 check_name(path.name)
                 if RunFolder(path).config.is_file():
                     run.check_continues(RunFolder(path).read())
+                else:
+                    RunFolder(path).check_free()
                 runs[path] = run
         return runs
 

@@ -12,6 +12,7 @@ from agents.networks.actions import ActionDistribution
 from agents.networks.core import Core, Heads
 from agents.networks.layers import draw
 from agents.networks.windows import encode_rows
+from agents.registry import contract
 from trap_tube_jax.objects import BOARD_SIZE
 
 Params = dict[str, Any]
@@ -34,7 +35,8 @@ class Agent:
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         # Only Flax's own layers, in a registered encoder, use the folded key; see `draw`.
         features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
-        chex.assert_shape(features, (1, None))  # a registered encoder must return [M, F]
+        with contract("encoder", self.config.encoder):
+            chex.assert_shape(features, (1, None))  # [M, F]
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
         params = {

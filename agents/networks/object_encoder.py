@@ -66,7 +66,7 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
         20 and log(1 + size) / 3. Flags relative to an invisible agent or food are 0.
       bool[M, 6]: whether there is such an object.
       f32[M, 94]: flags of the agent's row and column, 12 + 12, the food's, 12 + 12, and the food's
-      relative to the agent, 23 + 23.
+        relative to the agent, 23 + 23.
     """
     color = hash_rows(observation)
     own_colors = hash_rows(base_state(observation.shape[-1]).palette)

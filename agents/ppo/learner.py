@@ -28,7 +28,7 @@ from agents.ppo import advantages, losses, returns
 from agents.ppo.motion import MotionHead, motion_loss
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
-from agents.registry import curiosities
+from agents.registry import contract, curiosities
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, base_palette
 from trap_tube_jax.registry import make
@@ -177,7 +177,8 @@ class Learner:
         experience = self.experience(state.params, trajectory.episodes)
         mask, params = trajectory.episodes.mask, state.params["curiosity"]
         reward, memory = self.curiosity.reward(params, state.memory, experience)
-        chex.assert_trees_all_equal_shapes_and_dtypes((reward, memory), (mask, state.memory))
+        with contract("curiosity", self.config.curiosity):
+            chex.assert_trees_all_equal_shapes_and_dtypes((reward, memory), (mask, state.memory))
         return jnp.where(mask > 0, reward, 0.0), memory
 
     def make_batch(
@@ -266,7 +267,8 @@ class Learner:
                     f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
                     f"differ from {', '.join(terms)}; got {name!r}"
                 )
-            terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
+            with contract("curiosity", config.curiosity):
+                terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         total = sum(terms.values(), jnp.zeros((), jnp.float32))
         mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
         return total, {**terms, "loss": total, "entropy": mean_entropy}

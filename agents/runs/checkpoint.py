@@ -57,6 +57,8 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
         if iteration is None:
             return load(folder)
         raise
+    except ValueError as error:
+        raise ValueError(f"{error}; delete it to use the checkpoint before it") from error
 
 
 def _file(folder: Path, iteration: int) -> Path:

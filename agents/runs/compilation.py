@@ -13,8 +13,12 @@ def enable_cache() -> None:
     `JAX_ENABLE_COMPILATION_CACHE=0` disables the cache. A folder that other users can write to,
     such as /tmp, would let them choose the code that runs.
     """
-    if jax.config.values["jax_compilation_cache_dir"] is None:
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    try:
         parent = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(parent / "trap_tube_jax" / "jax"))
-        # By default JAX keeps only what took over a second; a run compiles many smaller programs.
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    except RuntimeError:  # neither HOME nor an entry in the user database, as in some containers
+        return
+    jax.config.update("jax_compilation_cache_dir", str(parent / "trap_tube_jax" / "jax"))
+    # By default JAX keeps only what took over a second; a run compiles many smaller programs.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -151,6 +151,14 @@ class RunFolder:
                 f"{self.path} is being written by another process; wait for its end"
             ) from None
 
+    def check_free(self) -> None:
+        """Raises ValueError unless a new run can be created here."""
+        if self.config.is_file():
+            again = f"continue it with --resume {self.path}, or give another --name"
+            raise ValueError(f"{self.path} holds a run; {again}")
+        if self.path.exists() and any(each.name != ".lock" for each in self.path.iterdir()):
+            raise ValueError(f"{self.path} exists, but holds no run; give another --name")
+
     def note(self, run: Run, options: RunOptions | None = None) -> None:
         """Writes a run, its options and the version of this package."""
         values = {**run.to_dict(), "options": dataclasses.asdict(options or RunOptions())}

@@ -22,9 +22,13 @@ def append_rows(path: Path, rows: Sequence[Row]) -> None:
     """Appends rows to a CSV file; begins a new file with a header.
 
     Raises:
+      ValueError: the rows have other columns than the file.
       OSError: the file cannot be written.
     """
-    pd.DataFrame(rows).to_csv(path, mode="a", header=not path.exists(), index=False)
+    frame, is_new = pd.DataFrame(rows), not path.exists()
+    if not is_new and list(pd.read_csv(path, nrows=0)) != list(frame):
+        raise ValueError(f"{path} has other columns than {', '.join(frame)}; move it away")
+    frame.to_csv(path, mode="a", header=is_new, index=False)
 
 
 def read_rows(path: Path, **options: Any) -> Frame:
@@ -37,8 +41,10 @@ def read_rows(path: Path, **options: Any) -> Frame:
 
 
 def rewind_rows(path: Path, iteration: int) -> None:
-    """Deletes the rows after an iteration."""
+    """Deletes the rows after an iteration; ValueError if the file has no column `iteration`."""
     rows = read_rows(path, dtype=str, keep_default_na=False)
+    if "iteration" not in rows:
+        raise ValueError(f"{path} has no column 'iteration'; delete or restore it")
     kept = rows[rows["iteration"].astype(int) <= iteration]
     if len(kept):
         write_text(path, kept.to_csv(index=False))

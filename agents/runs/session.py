@@ -82,13 +82,13 @@ def train_run(
         session.train()
         return session.finish()
 
+    if stored.config.is_file():
+        run.check_continues(stored.read())
     if jax.process_index() > 0:  # the first process's files are kept
         options = dataclasses.replace(options, report=False, tensorboard=False, wandb=False)
         with tempfile.TemporaryDirectory() as copy:
             return carry_out(options, RunFolder(Path(copy)))
     with stored.lock():
-        if stored.config.is_file():
-            run.check_continues(stored.read())
         return carry_out(options, stored)
 
 

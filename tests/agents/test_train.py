@@ -150,9 +150,16 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
 )
-def test_impossible_settings_are_refused_and_leave_nothing(capsys, tmp_path, arguments, message):
+def test_impossible_settings_are_refused_and_write_no_run(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, main, *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.rglob("*.json"))
+
+
+def test_a_folder_of_other_files_is_not_written_to(capsys, tmp_path):
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "metrics.csv").write_text("mine")
+    assert "exists, but holds no run" in refused(capsys, main, "--out", tmp_path, "--name", "x")
+    assert (tmp_path / "x" / "metrics.csv").read_text() == "mine"
 
 
 def test_a_run_is_not_overwritten(capsys, whole):

@@ -11,15 +11,14 @@ from tiny_policy import STEPS, food_next_to_agent, random_policy
 
 
 def test_an_action_is_avoided_where_it_was_taken_until_it_is_forgotten():
-    """At board 0 the memory is full of other boards when the first action is best again."""
     logits = jnp.log(jnp.array([[[0.5, 0.3, 0.1, 0.1], [0.97, 0.01, 0.01, 0.01]]]))
-    actions, repeats, chosen = ActionDistribution(logits), Repeats.empty(1), []
-    for seen in (0, 1, 0, *range(2, MEMORY + 1), 0):
-        board = jnp.full((1, 12, 12, 1), seen, jnp.uint8)
-        action, repeats = repeats.choose(actions, 1.0, board)
-        chosen.append(action[0].tolist())
-    assert chosen[:3] == [[0, 0], [0, 0], [1, 0]]
-    assert chosen[3:] == [[0, 0]] * MEMORY
+    actions = ActionDistribution(logits)
+    for gap, best in ((0, [1, 0]), (MEMORY - 1, [1, 0]), (MEMORY, [0, 0])):
+        repeats, action = Repeats.empty(1), jnp.zeros((1, 2), jnp.int32)
+        for seen in (0, *range(1, gap + 1), 0):
+            board = jnp.full((1, 12, 12, 1), seen, jnp.uint8)
+            action, repeats = repeats.choose(actions, 1.0, board)
+        assert action[0].tolist() == best, gap
 
 
 def test_a_penalty_changes_the_most_probable_action():

@@ -277,19 +277,19 @@ def with_curiosity(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("returned", "error", "message"),
+    ("returned", "message"),
     [
-        ({"reward": jnp.zeros(3, jnp.float32)}, AssertionError, r"\(3,\) != \(6, 2\)"),
-        ({"reward": jnp.zeros((6, 2), jnp.int32)}, AssertionError, "int32 != float32"),
-        ({"given": jnp.zeros(2, jnp.int32)}, AssertionError, r"\(2,\) != \(\)"),
-        ({"losses": ["policy_loss"]}, ValueError, "must end in '_loss' .* got 'policy_loss'"),
-        ({"losses": ["mine"]}, ValueError, "'none': .* entropy_loss; got 'mine'"),
-        ({"losses": {"my_loss": jnp.ones(3)}}, AssertionError, r"\(3,\)"),
+        ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(6, 2\)"),
+        ({"reward": jnp.zeros((6, 2), jnp.int32)}, "'none' .*int32 != float32"),
+        ({"given": jnp.zeros(2, jnp.int32)}, r"'none' .*\(2,\) != \(\)"),
+        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got 'policy_loss'"),
+        ({"losses": ["mine"]}, "'none': .* entropy_loss; got 'mine'"),
+        ({"losses": {"my_loss": jnp.ones(3)}}, r"'none' .*\(3,\)"),
     ],
 )
-def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returned, error, message):
+def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returned, message):
     own = with_curiosity(Returning(**returned))
-    with pytest.raises(error, match=message):
+    with pytest.raises(ValueError, match=message):
         jax.eval_shape(own.iterate, own.init(jax.random.key(0)))
 
 
@@ -299,7 +299,7 @@ def test_an_encoder_of_maps_is_refused(monkeypatch):
             return observation.astype(jnp.float32)
 
     monkeypatch.setitem(encoders, "maps", lambda config: Maps())
-    with pytest.raises(AssertionError, match=r"\(1, 12, 12, 3\)"):
+    with pytest.raises(ValueError, match=r"encoder 'maps' .*\(1, 12, 12, 3\)"):
         make_train(Config(encoder="maps")).init(jax.random.key(0))
 
 

@@ -39,6 +39,16 @@ def test_a_missing_folder_is_an_error_of_the_file_system(tmp_path):
         append_rows(tmp_path / "none" / "x.csv", [row(1)])
 
 
+def test_other_columns_are_refused(tmp_path):
+    path = tmp_path / "x.csv"
+    append_rows(path, [row(1)])
+    with pytest.raises(ValueError, match=r"x.csv has other columns than .*, more; move it away"):
+        append_rows(path, [row(2, more=1)])
+    path.write_text("2,1\n3,1\n")
+    with pytest.raises(ValueError, match=r"x.csv has no column 'iteration'"):
+        rewind_rows(path, 3)
+
+
 def test_a_score_is_a_row():
     solved, layout = np.array([True, True, False]), np.array([0, 0, 1])
     few = Score.of("sy", "{Sy}", solved, np.array([3, 6, 50]), layout=layout)
