@@ -17,13 +17,9 @@ from trap_tube_jax.objects import NUM_DIRECTIONS
 
 
 class Models(nn.Module):
-    """A forward model h + dense([h, a]) of h', and an inverse model of one layer and two heads.
-
-    If `detached`, no gradient of the forward model's error reaches h and h'.
-    """
+    """A forward model h + dense([h, a]) of h', and an inverse model of one layer and two heads."""
 
     hidden: int
-    detached: bool = False
 
     @nn.compact
     def __call__(self, h: jax.Array, after: jax.Array, action: jax.Array) -> Any:
@@ -37,8 +33,6 @@ class Models(nn.Module):
         x = nn.swish(dense(self.hidden, name="inverse")(jnp.concatenate([h, after], axis=-1)))
         heads = ("inverse_grasp", "inverse_move")
         logits = [output_dense(NUM_DIRECTIONS, name=name)(x) for name in heads]
-        if self.detached:
-            h, after = jax.lax.stop_gradient((h, after))
         change = output_dense(h.shape[-1], name="forward")(jnp.concatenate([h, action], axis=-1))
         return jnp.square(h + change - after), ActionDistribution(jnp.stack(logits, axis=-2))
 
@@ -60,18 +54,17 @@ class ICM(Curiosity):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns the sum over units of the forward model's squared errors."""
-        error, _ = self.predict(params, experience)
+        error, _ = self._predict(params, experience)
         return jnp.sum(error, axis=-1), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """Returns the mean over units of the same errors, and -log p(action)."""
-        error, action = self.predict(params, experience)
+        error, action = self._predict(params, experience)
         return {
             "forward_loss": jnp.mean(error, axis=-1),
             "inverse_loss": -action.log_prob(experience.episodes.action),
         }
 
-    def predict(self, params: Params, experience: Experience) -> Any:
-        """Returns the squared errors f32[T, B, H] of predicted h', and the inferred action."""
+    def _predict(self, params: Params, experience: Experience) -> Any:
         embeddings = experience.embedding, experience.next_embedding
         return self._models.apply(params, *embeddings, experience.action_embedding)

@@ -1,6 +1,6 @@
 """NovelD: the reward of a step from a familiar observation to a novel one.
 
-Source: Zhang et al. (2021); novelty by Burda et al. (2019b).
+Source: Zhang et al. (2021); novelty by Burda et al. (2019).
 """
 
 from typing import Any

@@ -1,6 +1,6 @@
 """Random network distillation: the error in predicting a fixed random encoder.
 
-Source: Burda et al. (2019b).
+Source: Burda et al. (2019).
 """
 
 from typing import Any

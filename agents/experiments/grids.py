@@ -136,7 +136,7 @@ def _value(text: str) -> Any:
 PAPER_POINTS = {"ppo": {"curiosity": "none"}, "ppo+icm": {"curiosity": "icm"}}
 PAPER_RUN = RunOptions(evaluate_every=1, reported=1000)
 BEST_RUN = RunOptions(evaluate_every=20, reported=1000)
-CURIOSITIES = ("icm", "icm-detached", "rnd", "noveld", "ride", "e3b", "effects")
+CURIOSITIES = ("icm", "rnd", "noveld", "effects")
 
 GRIDS = {
     "exp1": Grid(
@@ -150,13 +150,12 @@ GRIDS = {
     ),
     "best": Grid(Options(preset="best", env="pstsy", seeds=5), BEST_RUN),
     "curiosities": Grid(
-        Options(preset="best", env="pstsy", seeds=2),
+        Options(preset="best", env="pstsy", seeds=5),
         BEST_RUN,
         {"iterations": 312},
         {
             "ppo": {"curiosity": "none"},
             **{f"ppo+{name}": {"curiosity": name} for name in CURIOSITIES},
-            "ppo+effects,recurrent=false": {"curiosity": "effects", "recurrent": False},
         },
     ),
 }

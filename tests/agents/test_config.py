@@ -26,7 +26,7 @@ def test_presets_survive_json_and_train_without_curiosity_and_in_an_environment_
     [
         ({"minibatch_size": 100}, ["minibatch_size must divide", "100", "1024", "512"]),
         ({"minibatch_size": 0}, ["minibatch_size must be an integer from 1 to 1,000,000, got 0"]),
-        ({"curiosity": "rdn"}, ["curiosity", "rdn", "icm-detached", "rnd", "none"]),
+        ({"curiosity": "rdn"}, ["curiosity", "rdn", "icm", "rnd", "none"]),
         ({"discount": 1.5}, ["discount", "1.5", "from 0 to 1"]),
         ({"recurrent": "no"}, ["recurrent must be True or False", "'no'"]),
         ({"env_id": None}, ["env_id must be a name", "None"]),

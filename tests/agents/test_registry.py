@@ -32,6 +32,6 @@ def test_unusable_names_and_factories_are_refused(name, factory, words):
 
 @pytest.mark.parametrize("setting", ["curiosity", "encoder"])
 def test_unknown_names_are_refused_with_the_known_ones_and_the_way_to_add_more(setting):
-    known = {"curiosity": "icm, icm-detached", "encoder": "paper, objects"}[setting]
+    known = {"curiosity": "icm, rnd", "encoder": "paper, objects"}[setting]
     words = [f"unknown {setting} 'rdn'; allowed: {known}", "--import MODULE", "imports="]
     assert_refused(words, Config, **{setting: "rdn"})

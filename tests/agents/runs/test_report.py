@@ -22,7 +22,7 @@ from tiny_policy import food_next_to_agent, random_params
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
-CONFIG = small_config(curiosity="counts", stop_when_solved=0.0)
+CONFIG = small_config(curiosity="effects", stop_when_solved=0.0)
 
 
 def row(iteration, **values):
