@@ -18,7 +18,6 @@ from agents.files import write_bytes
 Tree = TypeVar("Tree")
 Arrays = dict[str, np.ndarray]
 
-SEPARATOR = "/"
 SUFFIX = ".safetensors"
 
 
@@ -71,25 +70,20 @@ def read_arrays(path: Path) -> tuple[Arrays, dict[str, Any]]:
         raise ValueError(f"{path} is not a file of arrays of this package: {error}") from error
 
 
-def is_key(x: Any) -> bool:
-    """Returns whether an array, or its shape, holds typed PRNG keys."""
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
 def key_data(x: jax.Array) -> jax.Array:
     """Returns the integers of typed keys; other arrays unchanged."""
-    return jax.random.key_data(x) if is_key(x) else x
+    return jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
 
 
 def _name(path: Any) -> str:
-    return jax.tree_util.keystr(path, simple=True, separator=SEPARATOR)
+    return jax.tree_util.keystr(path, simple=True, separator="/")
 
 
 def _to_leaf(name: str, array: np.ndarray, template: Any) -> jax.Array:
-    wanted = jax.eval_shape(jax.random.key_data, template) if is_key(template) else template
+    wanted = jax.eval_shape(key_data, template)
     if (array.dtype, array.shape) != (wanted.dtype, wanted.shape):
         raise ValueError(
             f"{name} is {array.dtype}{list(array.shape)}, not {wanted.dtype}{list(wanted.shape)}"
         )
     leaf = jnp.asarray(array)
-    return jax.random.wrap_key_data(leaf) if is_key(template) else leaf
+    return leaf if wanted.dtype == template.dtype else jax.random.wrap_key_data(leaf)

@@ -5,7 +5,6 @@ Source of the `paper` preset: agents/agent.md.
 
 import dataclasses
 import difflib
-import math
 from functools import partial
 from typing import Any, Literal, Self, get_args, get_origin
 
@@ -221,11 +220,6 @@ class Config:
         return self.episodes_per_iteration - sum(self.num_replayed)
 
     @property
-    def longest_iteration(self) -> int:
-        """Environment steps of an iteration in which no episode ends early."""
-        return self.episodes_per_iteration * self.step_limit(self.env_id)
-
-    @property
     def gradient_steps(self) -> int:
         """Gradient steps of one iteration."""
         return self.epochs * (self.episodes_per_iteration // self.minibatch_size)
@@ -286,27 +280,22 @@ def _plain(value: Any) -> Any:
 
 def _check_value(field: dataclasses.Field, value: Any) -> None:
     """Raises ValueError for a value that the field's type or limits do not allow."""
-    kind, limits = field.type, field.metadata["limits"]
-    if get_origin(kind) is Literal and value not in get_args(kind):
-        choices = ", ".join(get_args(kind))
-        raise ValueError(f"{field.name} must be one of {choices}, got {value!r}")
-    if kind in (bool, str) and type(value) is not kind:
-        wanted = "True or False" if kind is bool else "a name"
+    kind = field.type
+    if get_origin(kind) is Literal:
+        wanted, valid = f"one of {', '.join(get_args(kind))}", value in get_args(kind)
+    elif kind in (bool, str):
+        wanted, valid = "True or False" if kind is bool else "a name", type(value) is kind
+    else:
+        low, high = field.metadata["limits"]
+        is_whole = "int" in str(kind)
+        wanted = f"{'an integer' if is_whole else 'a finite number'} from {low:,}"
+        wanted += f" to {high:,}" if high < LARGEST else ""
+        numbers, valid = (value,), True
+        if get_origin(kind) is tuple:
+            length = 2 if field.name == "filters" else None
+            wanted = f"{length or 'a tuple of'} numbers, each {wanted}"
+            numbers, valid = value, type(value) is tuple and len(value) == (length or len(value))
+        types = (int,) if is_whole else (int, float)  # `type` tells a bool from an int
+        valid = valid and all(type(x) in types and low <= x <= high for x in numbers)
+    if not valid and not (value is None and field.default is None):
         raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
-    if limits is None or (value is None and field.default is None):
-        return
-    low, high = limits
-    types, wanted = (int, float), f"a finite number from {low:g}"
-    if "int" in str(kind):
-        types, wanted = (int,), f"an integer from {low:,}"
-    wanted += f" to {high:,}" if high < LARGEST else ""
-    is_tuple = get_origin(kind) is tuple
-    length = 2 if field.name == "filters" else None
-    if is_tuple:
-        wanted = f"{length or 'a tuple of'} numbers, each {wanted}"
-    numbers: tuple[Any, ...] = value if isinstance(value, tuple) and is_tuple else (value,)
-    if isinstance(value, tuple) != is_tuple or len(numbers) != (length or len(numbers)):
-        raise ValueError(f"{field.name} must be {wanted}, got {value!r}")
-    for number in numbers:  # `type` rejects bool, a subclass of int
-        if type(number) not in types or not math.isfinite(number) or not low <= number <= high:
-            raise ValueError(f"{field.name} must be {wanted}, got {value!r}")

@@ -16,15 +16,10 @@ def write_bytes(path: Path, content: bytes) -> None:
         draft.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file in UTF-8 atomically."""
-    write_bytes(path, text.encode())
-
-
 def write_json(path: Path, values: Any) -> None:
     """Writes a JSON file atomically, and makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(values, indent=2) + "\n")
+    write_bytes(path, (json.dumps(values, indent=2) + "\n").encode())
 
 
 def read_json(path: Path) -> Any:

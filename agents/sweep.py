@@ -25,17 +25,10 @@ def main(
     name: str = "sweep",
     grid: Grid | None = None,
 ) -> None:
-    """Runs a command line that trains a grid.
+    """Runs a command line that trains a grid, by default a single point.
 
-    Args:
-      arguments: those of the process if None.
-      program: the command.
-      name: the grid's name.
-      grid: the grid; a single point if None, which `--settings` multiplies.
-
-    Raises:
-      SystemExit: with 1 if a run failed, 2 if an option is not allowed, 128 + the signal's number
-        if stopped.
+    Exits with 1 if a run failed, 2 if an option is not allowed, 128 + the signal's number if
+    stopped.
     """
     arguments, grid = sys.argv[1:] if arguments is None else list(arguments), grid or Grid()
     console = Console(highlight=False)
@@ -60,16 +53,9 @@ def main(
 def launch(
     runs: Mapping[Path, Run], options: RunOptions, executor: Executor, console: Console
 ) -> list[Path]:
-    """Trains all runs to their end and reports each as it ends.
+    """Trains all runs, whose folders share a parent, and returns the folders of those that failed.
 
-    Args:
-      runs: the runs by their folders, which share a parent folder.
-      options: how to train each.
-      executor: calls `train_logged`; its workers share this file system.
-      console: where the outcomes are shown.
-
-    Returns:
-      The folders of runs that failed.
+    The executor's workers share this file system. The console shows each outcome.
 
     Raises:
       Stopped: on SIGINT or SIGTERM, after all runs have saved their current iteration.
@@ -94,7 +80,8 @@ def launch(
                         each.cancel()
                 if call.cancelled():
                     continue
-                path, outcome = calls[call], _outcome(call)
+                error = call.exception()  # its process was killed, or Dask gave up
+                path, outcome = calls[call], f"failed: {error}" if error else call.result()
                 log = f"; see {log_of(path)}" if outcome.startswith("failed") else ""
                 console.out(f"[{count}/{len(runs)}] {path.name}: {outcome}{log}")
                 failed += [] if outcome == "done" else [path]
@@ -120,13 +107,6 @@ def _ended(calls: Iterable[Future]) -> Iterator[Future]:
     while pending:
         ended, pending = wait(pending, timeout=1, return_when=FIRST_COMPLETED)
         yield from (call for call in calls if call in ended)
-
-
-def _outcome(call: Future) -> str:
-    try:
-        return call.result()
-    except Exception as error:  # its process was killed, or Dask gave up
-        return f"failed: {error}"
 
 
 if __name__ == "__main__":

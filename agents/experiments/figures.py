@@ -45,7 +45,7 @@ def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
     for name, rows in greedy.groupby("task_set", sort=False):
         if name != own and rows.groupby(["algorithm", "seed"]).size().min() > 1:
             panels[f"greedy, {label(str(name))}"] = rows
-    figure, axes = _panels(list(panels), min(3, len(panels)), 2.1, about["title"])
+    figure, axes = make_panels(list(panels), min(3, len(panels)), 2.1, about["title"])
     for axis, rows in zip(axes, panels.values(), strict=True):
         for color, name in zip(COLORS, curves["algorithm"].unique(), strict=False):
             _draw_seeds(axis, rows[rows["algorithm"] == name], color, str(name))
@@ -63,7 +63,7 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
     paper = tables.PAPER_SUCCESS if about["train_set"] == "pstsy" else {}
     own = list(tested["algorithm"].unique())
     names = [*own, *paper]
-    figure, axes = _panels(list(map(label, table)), 5, 0.25 * len(names) + 0.4, about["title"])
+    figure, axes = make_panels(list(map(label, table)), 5, 0.25 * len(names) + 0.4, about["title"])
     for axis, column in zip(axes, table, strict=True):
         for row, name in enumerate(own):
             values = table.loc[name, column].to_numpy()
@@ -86,13 +86,14 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
     return figure
 
 
-def _panels(
-    titles: Sequence[str], columns: int, height: float, title: str
+def make_panels(
+    titles: Sequence[str], columns: int, height: float, title: str = "", *, sharex: bool = True
 ) -> tuple[Figure, list[Any]]:
+    """Makes a figure of panels with a title each, in rows of `height` inches."""
     rows = math.ceil(len(titles) / columns)
     figure = Figure(figsize=(WIDTH, rows * height + 0.9), layout="constrained")
     figure.suptitle(title)
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    grid = figure.subplots(rows, columns, sharex=sharex, sharey=True, squeeze=False)
     axes = list(grid.flat)
     for axis in axes[len(titles) :]:
         axis.remove()

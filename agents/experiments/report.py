@@ -12,7 +12,7 @@ import pandas as pd
 
 import agents
 from agents.experiments import figures, tables
-from agents.files import read_json, write_json, write_text
+from agents.files import read_json, write_bytes, write_json
 from agents.runs.results import find_runs, metrics
 from trap_tube_jax.registry import task_set
 
@@ -58,7 +58,8 @@ def write(root: Path) -> str:
         f"jax {machine['jax']}, commit `{machine['commit']}`."
         for machine in about["machines"]
     ]
-    write_text(root / "table.md", "\n\n".join([f"# {about['title']}", *parts]) + "\n")
+    text = "\n\n".join([f"# {about['title']}", *parts]) + "\n"
+    write_bytes(root / "table.md", text.encode())
     drawn = figures.save(root, results, curves, about)
     shown = [f"{name}\n{found[name].to_string(line_width=WIDTH)}" for name in found]
     files = map(str, (root / "results.csv", root / "table.md", *drawn))

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -37,11 +36,8 @@ class EpisodeAxis:
     size: int = 1
 
     def mean(self, tree: Tree) -> Tree:
-        """Averages floats over the devices; returns integers, which are equal on all, unchanged."""
-        if self.size == 1:
-            return tree
-        is_float = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
-        return jax.tree.map(lambda x: jax.lax.pmean(x, EPISODES) if is_float(x) else x, tree)
+        """Averages floats over the devices."""
+        return tree if self.size == 1 else jax.lax.pmean(tree, EPISODES)
 
     def part(self, x: jax.Array) -> jax.Array:
         """Returns this device's rows i, i + size, i + 2 size, ... of `x` [B, ...]."""

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import binomtest
 
-from agents.experiments.figures import COLORS, WIDTH
+from agents.experiments.figures import COLORS, WIDTH, make_panels
 from agents.profiles.tasks import PARTS, Sampling
 from trap_tube_jax.rendering import render
+from trap_tube_jax.scoring.scores import wilson_interval
 from trap_tube_jax.state import take
 
 MARKERS = "osD^vPX"
@@ -28,10 +28,8 @@ def save_success(profile: pd.DataFrame, path: Path) -> None:
     `profile` is that of `measure.profile`, with at least one part of `PANELS`.
     """
     parts = [part for part in PANELS if part in set(profile["part"])]
-    rows = -(-len(parts) // 2)
-    figure = Figure(figsize=(WIDTH, 2.9 * rows + 0.4), layout="constrained")
-    axes = figure.subplots(rows, min(len(parts), 2), sharey=True, squeeze=False)
-    for axis, part in zip(axes.flat, parts, strict=False):
+    figure, axes = make_panels(parts, min(len(parts), 2), 2.9, sharex=False)
+    for axis, part in zip(axes, parts, strict=True):
         for index, (policy, own) in enumerate(profile.groupby("policy", sort=False)):
             groups = own.query("part == @part")
             x = groups["plan"] if part == "plan-length" else groups["level"].astype(float)
@@ -39,13 +37,8 @@ def save_success(profile: pd.DataFrame, path: Path) -> None:
             style = {"color": COLORS[index % 7], "marker": MARKERS[index % 7], "label": policy}
             axis.errorbar(x, percent, _margins(groups), capsize=2, clip_on=False, **style)
         axis.set(xlabel=PANELS[part], ylim=(0, 100))
-        axis.grid(alpha=0.3)
-    for axis in axes.flat[len(parts) :]:
-        axis.set_visible(False)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("solved, %")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
+    figure.supylabel("solved, %", fontsize=10)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.savefig(path, format="png")
 
 
@@ -85,7 +78,7 @@ def _margins(groups: pd.DataFrame) -> np.ndarray:
     Groups of a single task have no interval.
     """
     ends = [
-        binomtest(solved, tasks).proportion_ci(method="wilson") if tasks > 1 else 2 * (solved,)
+        wilson_interval(solved, tasks) if tasks > 1 else 2 * (solved,)
         for solved, tasks in zip(groups["solved"], groups["tasks"], strict=True)
     ]
     return 100 * np.abs(np.transpose(ends) - (groups["solved"] / groups["tasks"]).to_numpy())

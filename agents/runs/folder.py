@@ -109,29 +109,16 @@ class RunOptions:
 
 
 class RunFolder:
-    """The files of a run.
-
-    Attributes:
-      path: the folder.
-      config: settings and options, JSON.
-      provenance: machines, versions and commits that trained it, JSON.
-      metrics: a row per iteration, CSV.
-      evaluations: a row per evaluated iteration and task set, CSV.
-      best: the parameters with the best evaluation so far, with `evaluate_every`.
-      checkpoints: a file per checkpoint, named by its iteration.
-      curves: learning curves, PNG.
-      page: the report, HTML.
-      animation: a solved episode, GIF.
-    """
+    """The files of a run."""
 
     def __init__(self, path: Path):
         self.path = path
-        self.config = path / CONFIG_FILE
-        self.provenance = path / "provenance.json"
-        self.metrics = path / "metrics.csv"
-        self.evaluations = path / "evaluations.csv"
-        self.best = path / "best.safetensors"
-        self.checkpoints = path / "checkpoints"
+        self.config = path / CONFIG_FILE  # settings and options
+        self.provenance = path / "provenance.json"  # machines, versions and commits that trained it
+        self.metrics = path / "metrics.csv"  # a row per iteration
+        self.evaluations = path / "evaluations.csv"  # a row per evaluated iteration and task set
+        self.best = path / "best.safetensors"  # the best evaluation's, with `evaluate_every`
+        self.checkpoints = path / "checkpoints"  # a file each, named by its iteration
         self.curves = path / "curves.png"
         self.page = path / "report.html"
         self.animation = path / "solved.gif"

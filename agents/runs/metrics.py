@@ -9,7 +9,7 @@ import pandas as pd
 
 from agents.acting.policy import Policy
 from agents.config import Config
-from agents.files import write_text
+from agents.files import write_bytes
 from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import Purpose
 
@@ -47,7 +47,7 @@ def rewind_rows(path: Path, iteration: int) -> None:
         raise ValueError(f"{path} has no column 'iteration'; delete or restore it")
     kept = rows[rows["iteration"].astype(int) <= iteration]
     if len(kept):
-        write_text(path, kept.to_csv(index=False))
+        write_bytes(path, kept.to_csv(index=False).encode())
     else:
         path.unlink(missing_ok=True)
 
@@ -80,4 +80,5 @@ def is_last(row: Row, config: Config) -> bool:
     if 0 < config.stop_when_solved <= row["evaluation"]:
         return True
     limit = config.max_transitions
-    return limit is not None and row["transitions"] + config.longest_iteration > limit
+    longest = config.episodes_per_iteration * config.step_limit(config.env_id)
+    return limit is not None and row["transitions"] + longest > limit

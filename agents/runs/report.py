@@ -19,7 +19,7 @@ import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, Evaluator
-from agents.files import write_text
+from agents.files import write_bytes
 from agents.runs.folder import Run, RunFolder
 from agents.runs.metrics import Frame, read_rows
 from trap_tube_jax import solver
@@ -60,7 +60,7 @@ def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played) -> 
         settings=html.escape(json.dumps(run.to_dict(), indent=1)),
         episodes=episodes.replace("</", "<\\/"),
     )
-    write_text(folder.page, page)
+    write_bytes(folder.page, page.encode())
 
 
 def save_curves(rows: Frame, path: Path, title: str) -> None:

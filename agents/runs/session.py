@@ -76,20 +76,16 @@ def train_run(
     """
     options, console = options or RunOptions(), console or Console(quiet=True)
     stored = RunFolder(path)
-
-    def carry_out(options: RunOptions, folder: RunFolder) -> Scores | None:
+    if stored.config.is_file():
+        run.check_continues(stored.read())
+    is_first = jax.process_index() == 0
+    if not is_first:  # only the first process's files are kept
+        options = dataclasses.replace(options, report=False, tensorboard=False, wandb=False)
+    with stored.lock() if is_first else tempfile.TemporaryDirectory() as copy:
+        folder = stored if copy is None else RunFolder(Path(copy))
         session = Session(run, options, console, stored, folder, stop_file)
         session.train()
         return session.finish()
-
-    if stored.config.is_file():
-        run.check_continues(stored.read())
-    if jax.process_index() > 0:  # the first process's files are kept
-        options = dataclasses.replace(options, report=False, tensorboard=False, wandb=False)
-        with tempfile.TemporaryDirectory() as copy:
-            return carry_out(options, RunFolder(Path(copy)))
-    with stored.lock():
-        return carry_out(options, stored)
 
 
 class Session:
@@ -211,15 +207,11 @@ class Session:
         }
         append_rows(self.folder.metrics, [self.last])
         if self._validate and (iteration % self.options.evaluate_every == 0 or self.done):
-            self._evaluate(self._validate)
+            policy = self._policy()
+            scores = self._validate.scores(self._validate(policy.params))
+            append_rows(self.folder.evaluations, evaluation_rows(scores, policy, "validation"))
+            self._keep_best()
         return self.last
-
-    def _evaluate(self, evaluator: Evaluator) -> None:
-        """Evaluates the present policy; saves it if it is the best so far."""
-        policy = self._policy()
-        scores = evaluator.scores(evaluator(policy.params))
-        append_rows(self.folder.evaluations, evaluation_rows(scores, policy, "validation"))
-        self._keep_best()
 
     def _keep_best(self) -> None:
         """Saves the present policy if its evaluation is the best so far."""
