@@ -36,7 +36,8 @@ class Config:
     Attributes:
       env_id: task set to train on, by id or short name.
       num_features: N, feature channels of the observation; 3 is RGB.
-      max_steps: steps before an episode is truncated; None keeps the task set's limit.
+      max_steps: steps before an episode of training is truncated; None keeps the task set's limit,
+        which holds in evaluations on `sets` in any case.
       iterations: rollouts to train for, at most. Schedules span this number.
       max_transitions: environment steps to train for, at most; training stops before an iteration
         that could exceed it. None sets no limit.

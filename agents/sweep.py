@@ -61,7 +61,7 @@ def launch(
       Stopped: on SIGINT or SIGTERM, after all runs have saved their current iteration.
       KeyboardInterrupt: on a second signal; processes of this machine are killed.
     """
-    stop_file = next(iter(runs)).parent / ".stop"
+    stop_file = next(iter(runs)).parent.absolute() / ".stop"
 
     def ask() -> None:
         stop_file.touch()
@@ -73,7 +73,8 @@ def launch(
     with stop_signals(ask) as request:
         try:
             for path, run in runs.items():
-                calls[executor.submit(train_logged, path, run, options, stop_file)] = path
+                where = path.absolute()  # workers of a cluster may run in another folder
+                calls[executor.submit(train_logged, where, run, options, stop_file)] = path
             for count, call in enumerate(_ended(calls), 1):
                 if request() and isinstance(executor, ProcessPerCall):
                     for each in calls:  # on Dask this would also drop running calls

@@ -1,5 +1,6 @@
 """Greedy evaluation on the fixed tasks of the benchmark's protocol, by the network's fast path."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -87,13 +88,14 @@ class Evaluator:
     def of_sets(
         cls, config: Config, sets: Sequence[str], num_tasks: int, purpose: Purpose = "test"
     ) -> "Evaluator":
-        """Makes an evaluator of registered task sets.
+        """Makes an evaluator of registered task sets, whose step limits hold, as in the protocol.
 
         Raises:
           ValueError: unknown set, or no task.
         """
         names = [tt.task_set(name).short for name in sets]
         features = config.num_features
+        config = dataclasses.replace(config, max_steps=None)
         return cls(config, {x: evaluation_tasks(x, num_tasks, features, purpose) for x in names})
 
     def __call__(self, params: Params) -> dict[str, Evaluation]:

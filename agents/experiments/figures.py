@@ -28,6 +28,8 @@ def save(root: Path, results: Frame, curves: Frame, about: Mapping[str, Any]) ->
         drawn["curves.png"] = draw_curves(results, curves, about)
     if len(tested):
         drawn["success.png"] = draw_success(tested, about)
+    for name in ("curves.png", "success.png"):  # else figures of fewer runs would stay
+        (root / name).unlink(missing_ok=True)
     for name, figure in drawn.items():
         figure.savefig(root / name, dpi=DPI)
     return [root / name for name in drawn]

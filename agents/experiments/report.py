@@ -35,7 +35,7 @@ def collect(root: Path, command: str) -> None:
         "title": f"{root.name}: trained on {' or '.join(each.label for each in train_sets)}",
         "command": command,
         "train_set": train_sets[0].short if len(train_sets) == 1 else "training set",
-        "threshold": first["stop_when_solved"] or 1.0,
+        "threshold": max(own["stop_when_solved"] or 1.0 for own in configs),
         "settings": {k: v for k, v in first.items() if all(own[k] == v for own in configs)},
         "machines": [each for place, each in enumerate(machines) if each not in machines[:place]],
     }

@@ -11,6 +11,7 @@ from agents.acting.evaluation import Evaluator
 from agents.acting.policy import Policy
 from agents.profiles.subgoals import SUBGOALS, last_subgoals
 from agents.profiles.tasks import PARTS, STRENGTHS, Part, Sampling
+from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.solver import solve_batch
 
 BIN = 5  # steps, the width of the groups by plan length
@@ -79,7 +80,7 @@ def _play(
     name: str, policy: Policy, parts: Mapping[str, Part], plans: Mapping[str, np.ndarray]
 ) -> pd.DataFrame:
     """Plays all parts with a policy; returns a row for each episode."""
-    config = dataclasses.replace(policy.config, max_steps=policy.config.step_limit("base"))
+    config = dataclasses.replace(policy.config, max_steps=MAX_STEPS)
     evaluator = Evaluator(config, {part: drawn.tasks for part, drawn in parts.items()})
     frames = []
     for part, played in evaluator(policy.params).items():

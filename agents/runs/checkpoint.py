@@ -21,7 +21,7 @@ def save(folder: Path, iteration: int, state: Any, record: dict[str, Any]) -> No
       OSError: the file cannot be written.
     """
     folder.mkdir(exist_ok=True)
-    for draft in folder.glob(".*"):  # left by a killed process
+    for draft in folder.glob(f".*{SUFFIX}.*"):  # left by a killed process
         draft.unlink()
     record = {**record, "iteration": iteration}
     write_arrays(_file(folder, iteration), to_arrays(state), record)

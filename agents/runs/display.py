@@ -49,7 +49,8 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
     if len(solving):
         share = "" if threshold == 1 else f"{100 * threshold:g} % of "
         lines.append(f"First solved {share}{own.label} after {solving.min():,} episodes.")
-    lines.append(f"Report with curves and episodes to step through: {folder.page}")
+    if folder.page.exists():
+        lines.append(f"Report with curves and episodes to step through: {folder.page}")
     has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init
     if config.stop_when_solved and len(solving):
         lines.append("Next, learn all transfers: python -m agents.train --preset best")

@@ -69,7 +69,8 @@ class Run:
                 reason = "schedules span this number; " if name == "iterations" else ""
                 raise ValueError(
                     f"the run has {name}={value}, not {new[name]}; {reason}"
-                    f"only {', '.join(sorted(free & set(EXTENDABLE)))} may change"
+                    f"only {', '.join(sorted(free & set(EXTENDABLE)))} may change in a run; train "
+                    "with other settings under another --name"
                 )
 
 

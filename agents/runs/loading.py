@@ -54,7 +54,7 @@ def load(
         return read_policy(path)._replace(greedy=greedy)
     run = folder.read(imports)
     name = f"seed {run.seed}"
-    if iteration is None and folder.best.is_file():
+    if iteration is None and folder.best.is_file() and folder.read_options().evaluate_every:
         return read_policy(folder.best)._replace(name=name, greedy=greedy)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)

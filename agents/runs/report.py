@@ -70,7 +70,7 @@ def save_curves(rows: Frame, path: Path, title: str) -> None:
     panels = [
         (name, unit, found)
         for name, unit, metrics in PANELS
-        if (found := [metric for metric in metrics if metric in rows and rows[metric].any()])
+        if (found := [metric for metric in metrics if metric in rows])
     ]
     figure = Figure(figsize=(10, 2.6 * math.ceil(len(panels) / 2) + 0.5), layout="constrained")
     figure.suptitle(title)

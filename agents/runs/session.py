@@ -168,7 +168,7 @@ class Session:
     def finish(self) -> Scores | None:
         """Evaluates the final policy, or the best one; writes and returns the results."""
         policy = self._policy()
-        if self.stored.best.is_file():
+        if self.options.evaluate_every and self.stored.best.is_file():
             policy = read_policy(self.stored.best)
         tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
         is_tested = policy.iteration in set(tested["iteration"])

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -52,6 +53,14 @@ def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
         assert words in shown
 
 
+def test_workers_may_run_in_another_folder(monkeypatch, tmp_path):
+    found = []
+    monkeypatch.chdir(tmp_path)
+    train_run = lambda path, *_, stop_file, **__: found.append((path, stop_file))  # noqa: E731
+    launch(monkeypatch, Path(), train_run, "a")
+    assert found == [(tmp_path / "a", tmp_path / ".stop")]
+
+
 @pytest.mark.parametrize("signals", [1, 2])
 def test_a_signal_stops_all_runs_and_a_second_one_at_once(monkeypatch, tmp_path, signals):
     begun = []
@@ -81,7 +90,7 @@ def test_a_signal_stops_all_runs_and_a_second_one_at_once(monkeypatch, tmp_path,
         (["--settings", "clip_eps=1", "clip_eps=2"], "give a setting only once"),
         (["--settings", "clp_eps=1,2"], "did you mean 'clip_eps'"),
         (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
-        (["--settings", "env_id=base,p", "curiosity=counts"], "'counts' needs tasks that recur"),
+        (["--settings", "max_transitions=5"], "max_transitions must allow an iteration"),
         (["--only", "fst"], "no point 'fst'; allowed: fast"),
         ([*NEAR_FOOD, "--only", "x"], "no point 'x'"),  # names of own sets are known in time
         (["--seeds", "0"], "seeds must be >= 1, got 0"),

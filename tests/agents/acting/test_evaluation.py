@@ -67,6 +67,13 @@ def test_each_sets_own_limit_holds_unless_the_settings_have_one(played, own_task
         Evaluator(config, {"mine": tasks["one"]})
 
 
+def test_a_limit_of_training_does_not_change_the_protocol(own_task_sets):
+    tt.register("Own-v0", (), short="own", max_steps=6)
+    for max_steps in (1, 500):
+        evaluator = Evaluator.of_sets(Config(max_steps=max_steps), ["pst", "own"], 2)
+        assert evaluator.limits == {"pst": 50, "own": 6}
+
+
 def test_scores_use_the_papers_notation():
     outcome = Evaluation(jnp.array([True, False]), jnp.array([11, 50]), *[jnp.zeros((2, 50))] * 2)
     evaluator = Evaluator.of_sets(Config(), ["pst"], 2)

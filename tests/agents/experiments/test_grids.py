@@ -89,7 +89,7 @@ def test_a_stored_run_with_other_settings_is_refused(tmp_path):
     other = Run(dataclasses.replace(run.config, clip_eps=0.2), algorithm="fast")
     path.mkdir(parents=True)
     RunFolder(path).note(other)
-    assert_refused(["clip_eps=0.2, not 0.3"], Grid().runs, "sweep", given)
+    assert_refused(["clip_eps=0.2, not 0.3", "another --name"], Grid().runs, "sweep", given)
     RunFolder(path).note(run)
     longer = dataclasses.replace(given, settings=("clip_eps=0.3", "iterations=200"))
     assert Grid().runs("sweep", longer)[path].config.iterations == 200

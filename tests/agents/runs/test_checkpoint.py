@@ -47,10 +47,13 @@ def test_reading_makes_nothing(tmp_path):
 
 
 def test_a_save_that_was_killed_is_passed_over_and_removed(folder):
+    """Files and folders of others stay, such as those of Jupyter or NFS."""
     shutil.copy(folder / "4.safetensors", folder / ".5.safetensors.77")
+    (folder / ".ipynb_checkpoints").mkdir()
     assert checkpoint.iterations(folder) == [3, 4]
     save(folder, 5, 5)
-    assert sorted(path.name for path in folder.iterdir()) == ["4.safetensors", "5.safetensors"]
+    names = [".ipynb_checkpoints", "4.safetensors", "5.safetensors"]
+    assert sorted(path.name for path in folder.iterdir()) == names
 
 
 def test_a_reader_goes_on_with_the_newest_where_the_writer_deletes(folder, monkeypatch):

@@ -14,7 +14,7 @@ from agents import pretrained
 from agents.arrays import to_arrays
 from agents.config import Config
 from agents.runs import checkpoint
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import Run, RunFolder, RunOptions
 from agents.runs.loading import read_policy, save
 from easy import assert_same, enable_x64
 from tiny_policy import CONFIG, random_params, random_policy
@@ -46,7 +46,10 @@ def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path, monkeypatc
 
 def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path):
     path = shutil.copytree(run_path, tmp_path / "copy")
-    save(RunFolder(path).best, POLICY._replace(iteration=4))
+    folder = RunFolder(path)
+    save(folder.best, POLICY._replace(iteration=4))
+    assert agents.load(path).iteration == 6, "resumed without --evaluate-every"
+    folder.note(folder.read(), RunOptions(evaluate_every=2))
     policy = agents.load(path)
     assert (policy.name, policy.iteration) == ("seed 3", 4)
     assert agents.load(path, iteration=6).iteration == 6

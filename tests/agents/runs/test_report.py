@@ -8,6 +8,7 @@ import re
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 from rich.console import Console
@@ -96,6 +97,17 @@ def test_a_page_shows_shortest_plans(played, page):
         assert plan["frames"][0] == report._png(shown)
 
 
+def test_curves_of_a_run_that_solves_nothing_say_so(tmp_path):
+    """As many panels as if it did."""
+    heights = []
+    for share in (0.0, 0.5):
+        rows = pd.DataFrame([row(i, success=share, evaluation=share) for i in (1, 2)])
+        report.save_curves(rows, tmp_path / "x.png", "x")
+        with Image.open(tmp_path / "x.png") as picture:
+            heights.append(picture.height)
+    assert heights[0] == heights[1]
+
+
 def test_a_solved_episode_becomes_a_gif(played, tmp_path):
     evaluator, outcome = played
     path = tmp_path / "solved.gif"
@@ -135,6 +147,8 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
     solved = [row(2, evaluation=1.0, episodes=episodes)] if episodes else []
     rows = [row(1), *solved, row(3, evaluation=1.0, episodes=9999)] if solved else [row(1)]
     append_rows(folder.metrics, rows)
+    assert "report.html" not in "".join(display.summary(folder, run)), "with --no-report"
+    folder.page.touch()
     lines = display.summary(folder, run)
     assert lines[-1].endswith(expected)
     assert ("First solved base after 4,321 episodes." in lines) == bool(episodes)

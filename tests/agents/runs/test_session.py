@@ -144,6 +144,14 @@ def _raise_at(iteration, path, rows):
     append_rows(path, rows)
 
 
+def test_a_run_that_goes_on_without_selection_reports_its_last_policy(copy):
+    options = dataclasses.replace(TRACKED, evaluate_every=0)
+    train_run(copy, small_run(iterations=ITERATIONS + 1), options)
+    tested = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
+    assert tested["iteration"].tolist()[2:] == [ITERATIONS + 1] * 2
+    assert agents.load(copy).iteration == ITERATIONS + 1
+
+
 def test_a_finished_run_is_extended(copy, monkeypatch):
     """Its last parameters are made the best, so they are tested; an iteration takes a second."""
     clock = SimpleNamespace(perf_counter=itertools.count().__next__)
