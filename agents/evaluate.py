@@ -42,16 +42,11 @@ class Options:
     gif: Path | None = None
 
 
+@plain_errors()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
-    with plain_errors():
-        options = parse(Options, arguments, "python -m agents.evaluate")
-        compilation.enable_cache()
-        evaluate(options)
-
-
-def evaluate(options: Options) -> None:
-    """Evaluates a source, writes the files and prints the scores."""
+    options = parse(Options, arguments, "python -m agents.evaluate")
+    compilation.enable_cache()
     policy = load(options.source, iteration=options.iteration, imports=options.imports)
     config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks

@@ -43,29 +43,29 @@ class Options:
     imports: tuple[str, ...] = option((), append=True, flags=("--import",))
 
 
+@plain_errors()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    with plain_errors():
-        options = parse(Options, arguments, "python -m agents.profile")
-        compilation.enable_cache()
-        policies = {str(Path(x)): load(x, imports=options.imports) for x in options.runs}
-        origin = {
-            "command": f"python -m agents.profile {shlex.join(arguments)}",
-            "iterations": {name: policy.iteration for name, policy in policies.items()},
-            **provenance(),
-        }
-        options.output.mkdir(parents=True, exist_ok=True)
-        found = profile(policies, options.parts, options.strengths, options.tasks)
-        found.to_csv(options.output / "profile.csv", index=False, float_format="%.6g")
-        write_json(options.output / "provenance.json", origin)
-        if set(options.parts) & set(figures.PANELS):
-            figures.save_success(found, options.output / "success.png")
-        if "control" in options.parts:
-            figures.save_controls(found, options.output / "controls.png")
-        print(f"Tasks solved, %\n\n{success_table(found).to_string()}\n")
-        print(f"Failed episodes, by last subgoal reached\n\n{failure_table(found).to_string()}\n")
-        print(f"results: {options.output}")
+    options = parse(Options, arguments, "python -m agents.profile")
+    compilation.enable_cache()
+    policies = {str(Path(x)): load(x, imports=options.imports) for x in options.runs}
+    origin = {
+        "command": f"python -m agents.profile {shlex.join(arguments)}",
+        "iterations": {name: policy.iteration for name, policy in policies.items()},
+        **provenance(),
+    }
+    options.output.mkdir(parents=True, exist_ok=True)
+    found = profile(policies, options.parts, options.strengths, options.tasks)
+    found.to_csv(options.output / "profile.csv", index=False, float_format="%.6g")
+    write_json(options.output / "provenance.json", origin)
+    if set(options.parts) & set(figures.PANELS):
+        figures.save_success(found, options.output / "success.png")
+    if "control" in options.parts:
+        figures.save_controls(found, options.output / "controls.png")
+    print(f"Tasks solved, %\n\n{success_table(found).to_string()}\n")
+    print(f"Failed episodes, by last subgoal reached\n\n{failure_table(found).to_string()}\n")
+    print(f"results: {options.output}")
 
 
 if __name__ == "__main__":

@@ -49,10 +49,10 @@ class Options:
     distributed: tuple[str, ...] | None = option(None, "devices and hosts")
 
 
+@plain_errors()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
-    with plain_errors():
-        train(*parse(arguments))
+    train(*parse(arguments))
 
 
 def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
@@ -63,8 +63,7 @@ def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     if first.resume is not None:
         if (first.name, first.preset) != (defaults.name, defaults.preset):
             raise ValueError("--resume continues a run as it is; leave out --name and --preset")
-        folder = RunFolder(first.resume)
-        run, how = folder.read(first.imports), folder.read_options()
+        run, how = RunFolder(first.resume).read(first.imports)
         defaults = Options(seed=run.seed)
     options, config, how = parse_all([defaults, run.config, how], arguments, PROGRAM)
     imports = tuple(dict.fromkeys((*run.imports, *options.imports)))

@@ -68,7 +68,8 @@ class Environment(ByValue):
 
     `reset` and `step` are pure and unbatched: jit, vmap and scan them. An environment holds no
     episode; everything that changes is in the `State`. Environments with equal transfers, base
-    state and step limit are equal. To shard a batch, use a mesh of `Auto` axes or `jax.shard_map`.
+    state and step limit are equal. To shard a batch, use a mesh of `Auto` axes, or `jax.shard_map`
+    with `check_vma=False`.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Environment(ByValue):
         Raises:
           ValueError: naming the argument, its value and what is allowed.
         """
-        if callable(transfers) or not isinstance(transfers, Iterable):
+        if callable(transfers) or isinstance(transfers, str) or not isinstance(transfers, Iterable):
             raise ValueError(
                 f"transfers must be a sequence of functions (key, state) -> state, "
                 f"got {transfers!r}"
@@ -109,7 +110,8 @@ class Environment(ByValue):
         """Draws a task.
 
         Args:
-          key: PRNG key; the same key gives the same task, bit for bit.
+          key: PRNG key; the same key in the same program gives the same task, bit for bit. Between
+            programs, such as a batch and a loop, a colour may differ by 1 in a task of thousands.
 
         Returns:
           The state at time 0, and a timestep with reward 0.
@@ -251,7 +253,7 @@ def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
     name = transfer_name(transfer)
     try:
         drawn = jax.jit(compose(transfer))(key, state)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, IndexError) as error:  # JAX raises all of them
         raise ValueError(
             f"transfer {name} failed; allowed: a function (key, state) -> state that runs under "
             f"jax.jit; {type(error).__name__}: {error}"

@@ -211,8 +211,11 @@ def _play(game: Game) -> None:
 @contextlib.contextmanager
 def _single_keys(terminal: int) -> Iterator[int]:
     """Lets a terminal send keys at once and unseen, inside the `with` block."""
-    import termios  # noqa: PLC0415  absent on Windows
-    import tty  # noqa: PLC0415
+    try:
+        import termios  # noqa: PLC0415
+        import tty  # noqa: PLC0415
+    except ImportError:  # Windows
+        raise ValueError("play needs a Unix terminal, such as that of WSL") from None
 
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.checks import check_integer
+from trap_tube_jax.checks import check_integer, integer_array
 from trap_tube_jax.dynamics import holds_tool, step
 from trap_tube_jax.environment import check_actions
 from trap_tube_jax.geometry import unit_vector
@@ -108,9 +108,9 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
     """
     check_state(state)
     cell_size = check_integer("cell_size", cell_size)
-    actions = np.atleast_1d(actions)
-    if not actions.size:
+    if isinstance(actions, list) and not actions:
         actions = np.zeros((0, 2), np.int32)
+    actions = np.atleast_1d(integer_array("action", actions))
     is_padding = (actions == NO_DIRECTION).all(axis=-1, keepdims=True)
     check_actions(np.where(is_padding, 0, actions), (len(actions), 2))
     return np.asarray(_episode_frames(state, actions.astype(np.int32), cell_size=cell_size))

@@ -70,3 +70,11 @@ def place(layout: State, cells: jax.Array) -> State:
 def cells_of(state: State) -> jax.Array:
     """Returns the cells of agent, tool and food of B states, u8[B, 3, 2]."""
     return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)
+
+
+def first_visits(identity: jax.Array) -> jax.Array:
+    """Returns f32[T, B], 1 where i32[T, B] is new in its episode, else 0."""
+    time = jnp.arange(len(identity), dtype=jnp.int32)
+    same = identity[:, None] == identity[None]
+    earlier = (time[:, None] > time[None])[..., None]
+    return 1.0 - jnp.any(same & earlier, axis=1).astype(jnp.float32)

@@ -13,16 +13,9 @@ from agents.acting.rollout import rollout
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.scoring.benchmark import blocks
-from trap_tube_jax.scoring.scores import Optimality, Score, Scores
-from trap_tube_jax.scoring.tasks import (
-    ALL_SETS,
-    PROTOCOL,
-    Purpose,
-    evaluation_tasks,
-    label,
-    layout_numbers,
-)
+from trap_tube_jax.scoring.benchmark import blocks, score_of
+from trap_tube_jax.scoring.scores import Scores
+from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, Purpose, evaluation_tasks
 from trap_tube_jax.state import State, take
 
 
@@ -116,21 +109,15 @@ class Evaluator:
         played: Mapping[str, Evaluation],
         shortest: Mapping[str, np.ndarray] | None = None,
     ) -> Scores:
-        """Computes the score of every set.
+        """Computes the score of every set from the outcomes that a call returned.
 
-        Args:
-          played: outcomes by set, as a call returned them.
-          shortest: lengths i32[B] of each set's shortest plans, to compare with; or None.
+        `shortest` has the lengths i32[B] of each set's shortest plans, to compare with.
         """
         made = []
         for name, outcome in played.items():
-            solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
-            found = None
-            if shortest is not None:
-                found = Optimality.of(solved, length, shortest[name], self.limits[name])
-            layout = layout_numbers(name, self.tasks[name])
-            score = Score.of(name, label(name), solved, length, layout=layout, optimality=found)
-            made.append(score)
+            found = np.asarray(outcome.solved), np.asarray(outcome.length)
+            plans = None if shortest is None else shortest[name]
+            made.append(score_of(name, self.tasks[name], *found, self.limits[name], plans))
         return Scores(PROTOCOL, tt.__version__, None, tuple(made))
 
 

@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.acting.episodes import CELL_AGENT, CELL_FOOD, CELL_TOOL, Episodes
+from agents.acting.episodes import CELL_AGENT, CELL_FOOD, CELL_TOOL, Episodes, first_visits
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.curiosity.visits import first_visits
 from agents.networks.grouping import hash_rows
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 

@@ -54,17 +54,18 @@ class ICM(Curiosity):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns the sum over units of the forward model's squared errors."""
-        error, _ = self._predict(params, experience)
+        error, _ = self.predict(params, experience)
         return jnp.sum(error, axis=-1), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """Returns the mean over units of the same errors, and -log p(action)."""
-        error, action = self._predict(params, experience)
+        error, action = self.predict(params, experience)
         return {
             "forward_loss": jnp.mean(error, axis=-1),
             "inverse_loss": -action.log_prob(experience.episodes.action),
         }
 
-    def _predict(self, params: Params, experience: Experience) -> Any:
+    def predict(self, params: Params, experience: Experience) -> Any:
+        """Returns the squared errors f32[T, B, H] of predicted h', and the inferred action."""
         embeddings = experience.embedding, experience.next_embedding
         return self._models.apply(params, *embeddings, experience.action_embedding)

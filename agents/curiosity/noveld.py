@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from agents.acting.episodes import first_visits
 from agents.curiosity.base import Experience, Params
 from agents.curiosity.rnd import RND
-from agents.curiosity.visits import first_visits
 
 ALPHA = 0.5  # as in the paper
 

@@ -84,7 +84,7 @@ class Grid:
                 path = root / f"{point}-seed{seed}"
                 check_name(path.name)
                 if RunFolder(path).config.is_file():
-                    run.check_continues(RunFolder(path).read())
+                    run.check_continues(RunFolder(path).read()[0])
                 else:
                     RunFolder(path).check_free()
                 runs[path] = run

@@ -152,22 +152,11 @@ class RunFolder:
         values = {**run.to_dict(), "options": dataclasses.asdict(options or RunOptions())}
         write_json(self.config, {"version": __version__, **values})
 
-    def read_options(self) -> RunOptions:
-        """Returns the stored options; ValueError names one that is unknown or not allowed."""
-        try:
-            stored = read_json(self.config)["options"]
-            return RunOptions(**{**stored, "sets": stored["sets"] and tuple(stored["sets"])})
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{self.config} lacks options or holds others: {error}") from error
+    def read(self, imports: tuple[str, ...] = ()) -> tuple[Run, RunOptions]:
+        """Returns the stored run and its options.
 
-    def read(self, imports: tuple[str, ...] = ()) -> Run:
-        """Returns the stored run.
-
-        Args:
-          imports: modules to import first, which register names of the settings.
-
-        Raises:
-          ValueError: there is no run, or its settings cannot be read.
+        First imports modules, which register names of the settings. Raises ValueError if there is
+        no run, or its settings or options cannot be read.
         """
         import_modules(imports)
         if not self.config.is_file():
@@ -176,8 +165,9 @@ class RunFolder:
         try:
             values = read_json(self.config)
             version, needs = values.pop("version", version), values.get("imports", needs)
-            values.pop("options", None)
-            return Run.from_dict(values)
+            options = values.pop("options", {})
+            run, sets = Run.from_dict(values), options["sets"] and tuple(options["sets"])
+            return run, RunOptions(**{**options, "sets": sets})
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             missing = "".join(f" --import {name}" for name in needs if name not in imports)
             hint = f"; it was trained with{missing}" if missing else ""

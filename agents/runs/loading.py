@@ -52,9 +52,9 @@ def load(
             raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
         import_modules(imports)
         return read_policy(path)._replace(greedy=greedy)
-    run = folder.read(imports)
+    run, options = folder.read(imports)
     name = f"seed {run.seed}"
-    if iteration is None and folder.best.is_file() and folder.read_options().evaluate_every:
+    if iteration is None and options.evaluate_every and folder.best.is_file():
         return read_policy(folder.best)._replace(name=name, greedy=greedy)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)

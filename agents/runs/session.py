@@ -77,7 +77,7 @@ def train_run(
     options, console = options or RunOptions(), console or Console(quiet=True)
     stored = RunFolder(path)
     if stored.config.is_file():
-        run.check_continues(stored.read())
+        run.check_continues(stored.read()[0])
     is_first = jax.process_index() == 0
     if not is_first:  # only the first process's files are kept
         options = dataclasses.replace(options, report=False, tensorboard=False, wandb=False)

@@ -167,6 +167,19 @@ def test_masks_and_missing_seeds_reset_as_gymnasiums_own_batch_does(mode):
             assert_same(ours.step(actions), theirs.step(actions))
 
 
+def test_batches_reset_again_under_any_kind_of_key_and_use_none_twice():
+    def observations():
+        envs = TrapTubeVectorEnv("p", 2)
+        envs.reset(seed=3)
+        again, mask = envs.reset()[0], np.array([True, False])
+        return [again, envs.reset(seed=[None, 5])[0], envs.reset(options={"reset_mask": mask})[0]]
+
+    expected = observations()
+    for setting in (jax.default_prng_impl("rbg"), jax.debug_key_reuse(True)):
+        with setting:
+            np.testing.assert_array_equal(observations(), expected)
+
+
 def test_masks_and_seeds_are_checked():
     envs = TrapTubeVectorEnv("p", 2)
     with pytest.raises(gymnasium.error.ResetNeeded):

@@ -256,6 +256,11 @@ def branching(key, state):
     return state if state.time > 0 else tt.base_state()
 
 
+def by_mask(key, state):
+    del key
+    return state.replace(agent=state.board[state.board > 0][:2].astype(jnp.int32))
+
+
 BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
     ({"max_steps": 0}, ["max_steps", ">= 1", "0"]),
     ({"max_steps": 2.5}, ["max_steps", "integer >= 1", "2.5"]),
@@ -266,6 +271,7 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
     ({"base": EASY.replace(time=np.int32(3))}, ["time 3", "allowed: time 0"]),
     ({"transfers": None}, ["transfers", "(key, state) -> state", "None"]),
     ({"transfers": tt.symbolic}, ["transfers", "sequence", "symbolic"]),
+    ({"transfers": "TrapTube-v0"}, ["transfers", "sequence", "'TrapTube-v0'"]),
     ({"transfers": ("symbolic",)}, ["(key, state) -> state", "'symbolic'"]),
     ({"transfers": (no_state,)}, ["no_state", "invalid", "State", "NoneType"]),
     ({"transfers": (broken(time=np.int32(3)),)}, ["transfer must keep time 0", "got time 3"]),
@@ -275,6 +281,7 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
     ),
     ({"transfers": (one_argument,)}, ["one_argument", "a function (key, state) -> state"]),
     ({"transfers": (branching,)}, ["branching", "runs under jax.jit", "TracerBool"]),
+    ({"transfers": (by_mask,)}, ["by_mask", "runs under jax.jit", "NonConcreteBooleanIndex"]),
     (
         {"transfers": (broken(agent=jnp.array((0, 0))), broken(food=jnp.array((0, 0))))},
         ["invalid", "share cell (0, 0)"],

@@ -140,7 +140,8 @@ def test_episode_frames_show_every_state_and_grasp_and_padding_moves_nothing():
     ("actions", "message"),
     [
         *((actions, "must be integer[") for actions in (5, [3, 7], [[0, 1, 2]])),
-        ([[0.0, 1.0]], "must hold integers"),
+        *((actions, "must hold integers") for actions in ([[0.0, 1.0]], [["up", "left"]])),
+        ([[0, 1], [2]], "rectangular"),
         *(([[0, 0], pair], f"{pair}") for pair in ((0, 4), (-1, 2), (2, -1), (-2, -2))),
     ],
 )

@@ -253,12 +253,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
             )
         state = _started(self._state)
         fresh, _ = self._programs.reset(self._next_keys(seed))
-        state = jax.tree.map(
-            lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-            fresh,
-            state,
-        )
-        self._state = state
+        self._state = state = jax.tree.map(functools.partial(_select, mask), fresh, state)
         return np.array(_observe(state.episodes.inner)), {}
 
     def step(
@@ -313,7 +308,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         if self._state is None:
             return keys
         is_seeded = np.array([each is not None for each in seeds])
-        return jnp.where(is_seeded, keys, self._state.episodes.key)
+        return _select(is_seeded, keys, self._state.episodes.key)
 
 
 def register() -> None:
@@ -334,8 +329,17 @@ def register() -> None:
 
 
 def _keys(seeds: Sequence[Any]) -> jax.Array:
-    """Returns one PRNG key per seed, modulo 2**32."""
-    return jax.vmap(jax.random.key)(np.array([seed % 2**32 for seed in seeds], np.uint32))
+    """Returns one Threefry key per seed, modulo 2**32, such as `AutoReset` keeps."""
+    numbers = np.array([seed % 2**32 for seed in seeds], np.uint32)
+    return jax.vmap(functools.partial(jax.random.key, impl="threefry2x32"))(numbers)
+
+
+def _select(mask: np.ndarray, new: jax.Array, old: jax.Array) -> jax.Array:
+    """Selects rows of `new` [B, ...] where `mask` bool[B], else of `old`; uses up no keys."""
+    if jnp.issubdtype(new.dtype, jax.dtypes.prng_key):
+        data = _select(mask, jax.random.key_data(new), jax.random.key_data(old))
+        return jax.random.wrap_key_data(data, impl="threefry2x32")
+    return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _started(state: Any) -> Any:

@@ -24,6 +24,7 @@ from trap_tube_jax.scoring.tasks import (
     ALL_SETS,
     PROTOCOL,
     evaluation_tasks,
+    label,
     layout_numbers,
 )
 from trap_tube_jax.solver.search import solve_batch
@@ -180,16 +181,29 @@ def _scores(
     for entry in [task_set(name) for name in sets]:
         states = evaluation_tasks(entry.short, tasks, num_features)
         solved, length = play(entry, states)
-        found = None
-        if optimality:
-            part = slice(optimality)
-            shortest = solve_batch(take(states, part)).length
-            found = Optimality.of(solved[part], length[part], shortest, entry.max_steps)
-        layout = layout_numbers(entry.short, states)
-        made.append(
-            Score.of(entry.short, entry.label, solved, length, layout=layout, optimality=found)
-        )
+        shortest = solve_batch(take(states, slice(optimality))).length if optimality else None
+        made.append(score_of(entry.short, states, solved, length, entry.max_steps, shortest))
     return Scores(PROTOCOL, __version__, seed, tuple(made))
+
+
+def score_of(
+    name: str,
+    states: State,
+    solved: np.ndarray,
+    length: np.ndarray,
+    max_steps: int,
+    shortest: np.ndarray | None = None,
+) -> Score:
+    """Computes the score of outcomes bool[B] and numbers of steps i32[B] on B tasks of a set.
+
+    `shortest` has the lengths of the first tasks' shortest plans, to compare with.
+    """
+    found = None
+    if shortest is not None:
+        part = slice(len(shortest))
+        found = Optimality.of(solved[part], length[part], shortest, max_steps)
+    layout = layout_numbers(name, states)
+    return Score.of(name, label(name), solved, length, layout=layout, optimality=found)
 
 
 def blocks(total: int) -> list[np.ndarray]:

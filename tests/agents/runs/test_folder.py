@@ -62,8 +62,7 @@ def test_a_folder_holds_a_run_and_its_options(tmp_path):
     run, options = Run(Config(hidden=8)), RunOptions(reported=5, sets=("base",))
     RunFolder(tmp_path / "x").path.mkdir()
     RunFolder(tmp_path / "x").note(run, options)
-    assert RunFolder(tmp_path / "x").read() == run
-    assert RunFolder(tmp_path / "x").read_options() == options
+    assert RunFolder(tmp_path / "x").read() == (run, options)
     assert_refused(["none holds no run; runs in", "x"], RunFolder(tmp_path / "none").read)
 
 
@@ -87,10 +86,9 @@ def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
 
 
 def test_damaged_options_are_named(tmp_path):
-    folder = RunFolder(tmp_path)
     for options in ({}, {"options": {"sets": None, "more": 1}}):
-        write_json(folder.config, options)
-        assert_refused(["config.json lacks options or holds others"], folder.read_options)
+        write_json(tmp_path / "config.json", {**Run(Config()).to_dict(), **options})
+        assert_refused(["config.json", "cannot be read"], RunFolder(tmp_path).read)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path
     folder = RunFolder(path)
     save(folder.best, POLICY._replace(iteration=4))
     assert agents.load(path).iteration == 6, "resumed without --evaluate-every"
-    folder.note(folder.read(), RunOptions(evaluate_every=2))
+    folder.note(folder.read()[0], RunOptions(evaluate_every=2))
     policy = agents.load(path)
     assert (policy.name, policy.iteration) == ("seed 3", 4)
     assert agents.load(path, iteration=6).iteration == 6

@@ -159,7 +159,7 @@ def test_a_finished_run_is_extended(copy, monkeypatch):
     monkeypatch.setattr(session, "best_iteration", lambda rows, own: ITERATIONS + 1)
     train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
     assert final_state(copy)[0] == ITERATIONS + 1
-    assert RunFolder(copy).read().config.iterations == ITERATIONS + 1
+    assert RunFolder(copy).read()[0].config.iterations == ITERATIONS + 1
     tested = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
     assert tested["iteration"].tolist()[2:] == [ITERATIONS + 1] * 2
     before, after = read_rows(copy / "metrics.csv")["seconds"].iloc[-2:]
