@@ -1,4 +1,4 @@
-"""Draws the pictures of README.md and environment.md: python -m benchmarks.pictures --help."""
+"""Draws the pictures of README.md and other pages: python -m benchmarks.pictures --help."""
 
 import argparse
 from collections.abc import Sequence
@@ -8,8 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
 import trap_tube_jax as tt
+from agents.experiments import figures, tables
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
 
@@ -17,7 +19,8 @@ with needs_extra("pictures"):
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-FIGURES = Path(__file__).parent / "results" / "figures"
+RESULTS = Path(__file__).parent / "results"
+FIGURES = RESULTS / "figures"
 DPI = 200  # twice the pixels of a page that shows 830
 CELL = 40  # pixels of a cell before scaling
 # Okabe and Ito's colour-blind-safe palette, by object code.
@@ -93,18 +96,26 @@ def draw_symbolic() -> Figure:
     return figure
 
 
+def draw_table_2() -> Figure:
+    """Draws success on the sets of Table 2: presets `best` and `paper`, and the paper's agents."""
+    rows = [pd.read_csv(RESULTS / name / "results.csv") for name in ("exp2_best", "exp2_paper")]
+    names = {"ppo": "PPO, ours", "ppo+icm": "PPO + ICM, ours"}
+    tested = tables.reported(pd.concat(rows)).replace(names)
+    return figures.draw_success(tested, {"title": "Trained on {P, St, Sy}", "train_set": "pstsy"})
+
+
 def _show(axis: Any, picture: np.ndarray) -> None:
     axis.imshow(picture, interpolation="nearest" if len(picture) < CELL else "antialiased")
     axis.set(xticks=[], yticks=[])
 
 
-PICTURES = {"board": draw_board, "symbolic": draw_symbolic}
+PICTURES = {"board": draw_board, "symbolic": draw_symbolic, "table2": draw_table_2}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.pictures", description="Draw board.png and symbolic.png."
+        prog="python -m benchmarks.pictures", description="Draw the pictures of the pages."
     )
     parser.add_argument("--output", type=Path, default=FIGURES, help="folder of the pictures")
     options = parser.parse_args(arguments)
