@@ -25,11 +25,8 @@ def encode_episodes(
 ) -> Any:
     """Encodes all observations to f32[T + 1, B, F], or to a tree of such arrays.
 
-    Args:
-      encode_rows: encodes observations u8[chunk, 12, 12, N]; see `chunks.map_rows`.
-      params: parameters of `encode_rows`, by which the features are differentiable.
-      episodes: the episodes.
-      chunk: distinct observations encoded at once.
+    The features are differentiable by `params`. `encode_rows` gets `chunk` distinct observations
+    u8[chunk, 12, 12, N] at once; see `chunks.map_rows`.
     """
     shape = episodes.observation_id.shape
     groups = group(episodes.observation_id.reshape(-1))

@@ -37,13 +37,9 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(agent: Agent, params: Params, env: Environment, tasks: State) -> Evaluation:
-    """Plays every task once with the most probable actions. Pure; jit it.
+    """Plays each of B tasks at time 0 once, with the most probable actions. Pure; jit it.
 
-    Args:
-      agent: the network.
-      params: its parameters.
-      env: the dynamics and the step limit; its transfers are not used.
-      tasks: B states at time 0.
+    `env` gives the dynamics and the step limit; its transfers are not used.
     """
     played = rollout(agent, params, env, tasks, key=None)
     action = played.episodes.action.swapaxes(0, 1)
@@ -56,15 +52,10 @@ class Evaluator:
     """Greedy play on the tasks of several sets, compiled once for any parameters."""
 
     def __init__(self, config: Config, tasks: Mapping[str, State]):
-        """Prepares the play.
+        """Prepares the play of each set's tasks by policies of these settings.
 
-        Args:
-          config: settings of the policies to evaluate.
-          tasks: the tasks of each set, by name. If `config.max_steps` is None, the names must be
-            those of registered sets, whose limits hold.
-
-        Raises:
-          ValueError: `config.max_steps` is None, and a set is not registered.
+        If `config.max_steps` is None, the limits of the registered sets hold; ValueError names one
+        that is not registered.
         """
         self.tasks = dict(tasks)
         self.limits = {name: config.step_limit(name) for name in self.tasks}

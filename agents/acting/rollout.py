@@ -37,15 +37,10 @@ class Trajectory(NamedTuple):
 def rollout(
     agent: Agent, params: Params, env: Environment, initial: State, key: jax.Array | None
 ) -> Trajectory:
-    """Plays one episode from each of B initial states.
+    """Plays one episode of T = `env.max_steps` steps from each of B states at time 0.
 
-    Args:
-      agent: the network; with `align_to_food` it acts in frames that face the food.
-      params: its parameters.
-      env: the dynamics; `max_steps` is T.
-      initial: B states at time 0.
-      key: PRNG key of the actions; None takes the most probable ones after
-        `repeat_penalty`.
+    Draws the actions with `key`; None takes the most probable ones after `repeat_penalty`. With
+    `align_to_food` the agent acts in frames that face the food.
     """
     batch, penalty = len(initial.time), agent.config.repeat_penalty
     frame = Frame.of(jnp.zeros(batch, jnp.int32))
