@@ -86,7 +86,10 @@ def task_set(name: str) -> TaskSet:
         if name in (candidate.id, candidate.short):
             return candidate
     allowed = ", ".join(f"{entry.id} ({entry.short})" for entry in _task_sets.values())
-    raise ValueError(f"unknown task set {name!r}; allowed: {allowed}")
+    raise ValueError(
+        f"unknown task set {name!r}; allowed: {allowed}; a set of yours is known once its module "
+        "is imported, as by --import MODULE"
+    )
 
 
 def make(

@@ -173,6 +173,7 @@ class Session:
         tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
         is_tested = policy.iteration in set(tested["iteration"])
         if is_tested and (self.folder.page.exists() or not self.options.report):
+            self.console.out("Tested before; python -m agents.evaluate plays other sets and tasks.")
             return None
         self.console.out("Evaluating ...")
         tasks = self.options.reported or self.run.config.eval_episodes

@@ -1,6 +1,7 @@
 """Runs from Python: what they write, how they continue, and how they end badly."""
 
 import dataclasses
+import io
 import itertools
 import shutil
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import pandas as pd
 import pytest
+from rich.console import Console
 
 import agents
 from agents.acting import evaluation
@@ -114,9 +116,11 @@ def _raise(error):
 
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(session, "make_advance", None)
-    before = (copy / "evaluations.csv").read_bytes()
-    assert train_run(copy, small_run(), TRACKED) is None
+    before, output = (copy / "evaluations.csv").read_bytes(), io.StringIO()
+    more = dataclasses.replace(TRACKED, reported=9)
+    assert train_run(copy, small_run(), more, console=Console(file=output)) is None
     assert (copy / "evaluations.csv").read_bytes() == before
+    assert "agents.evaluate plays other" in output.getvalue()
 
 
 def test_the_best_policy_is_never_newer_than_the_last_checkpoint(tmp_path, monkeypatch):
