@@ -15,7 +15,14 @@ from paths import ROOT
 from small_runs import small_config
 
 RESULTS = ROOT / "benchmarks" / "results"
-RECORDS = ("exp2_best", "exp2_curiosities", "exp2_paper", "exp2_paper_encoder", "fast_base")
+RECORDS = (
+    "exp2_best",
+    "exp2_curiosities",
+    "exp2_long",
+    "exp2_paper",
+    "exp2_paper_encoder",
+    "fast_base",
+)
 ABOUT = {"title": "x", "train_set": "pstsy", "threshold": 1.0}
 
 
