@@ -61,15 +61,16 @@ class VectorEnvironment:
 
     Attributes:
       env: an environment without auto-reset, not a subclass: the batch would bypass its methods.
-      chunk_size: environments that start over at a time, at least 1. Small chunks waste less
-        when few end together, and suit a CPU; large ones suit a GPU.
+      chunk_size: environments that start over at a time, at least 1; by default 32 on a CPU and a
+        32nd of the batch on other devices. Small chunks waste less when few episodes end
+        together; large ones occupy a GPU.
 
     Raises:
       ValueError: naming the argument, its value and what is allowed.
     """
 
     env: Environment
-    chunk_size: int = dataclasses.field(default=32, kw_only=True)
+    chunk_size: int | None = dataclasses.field(default=None, kw_only=True)
     auto_resets: ClassVar = True
 
     def __post_init__(self):
@@ -79,7 +80,8 @@ class VectorEnvironment:
                 f"env must be a trap_tube_jax.Environment, got {self.env!r}"
                 + (hint if isinstance(self.env, Environment) else "")
             )
-        object.__setattr__(self, "chunk_size", check_integer("chunk_size", self.chunk_size))
+        if self.chunk_size is not None:
+            object.__setattr__(self, "chunk_size", check_integer("chunk_size", self.chunk_size))
 
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Starts the first episodes, one for each of the keys [B], B >= 1.
@@ -120,7 +122,7 @@ class VectorEnvironment:
         self, done: jax.Array, state: VectorState, picture: jax.Array
     ) -> tuple[VectorState, jax.Array]:
         """Replaces state and picture by those of a next episode where `done` bool[B]."""
-        num_envs, size = len(done), min(self.chunk_size, len(done))
+        num_envs, size = len(done), self._chunk_size(len(done))
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
         def start_chunk(carry):
@@ -148,6 +150,12 @@ class VectorEnvironment:
             (jnp.int32(0), (state, picture)),
         )
         return state, picture
+
+    def _chunk_size(self, num_envs: int) -> int:
+        size = self.chunk_size
+        if size is None:
+            size = 32 if jax.default_backend() == "cpu" else max(32, num_envs // 32)
+        return min(size, num_envs)
 
 
 def _check_keys(keys: Any) -> None:

@@ -58,7 +58,7 @@ def run_plain(env):
 NEAR = tt.State.from_ascii(["AF.........T", *["." * 12] * 11])
 ENVIRONMENTS = [
     (tt.make("pstsy", max_steps=MAX_STEPS), 3, "threefry2x32"),
-    (tt.Environment((tt.structural,), base=NEAR, max_steps=MAX_STEPS), 64, "unsafe_rbg"),
+    (tt.Environment((tt.structural,), base=NEAR, max_steps=MAX_STEPS), None, "unsafe_rbg"),
     (tt.make("base", num_features=1, max_steps=MAX_STEPS), 1, "threefry2x32"),
 ]
 
