@@ -28,15 +28,10 @@ them.
 Pages in this folder: environment.md, own_tasks.md, graded.md, controls.md, protocol.md.
 """
 
-# ruff: noqa: F401  the imports are the public names
-
 import importlib.util
-import sys
-import types
-import typing
 import warnings
 
-from trap_tube_jax._version import __version__
+from trap_tube_jax._version import __version__ as __version__
 from trap_tube_jax.environment import ArraySpec, Environment, action_from_index, action_to_index
 from trap_tube_jax.graded import graded_perceptual, graded_structural
 from trap_tube_jax.objects import base_palette
@@ -60,6 +55,52 @@ from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, s
 from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 
+__all__ = [
+    "CONTROL_TASK_SETS",
+    "PAPER_TASK_SETS",
+    "ArraySpec",
+    "AutoReset",
+    "Distances",
+    "Environment",
+    "EpisodeStatistics",
+    "Plan",
+    "Score",
+    "Scores",
+    "State",
+    "TaskSet",
+    "TimeStep",
+    "Transfer",
+    "VectorEnvironment",
+    "VectorState",
+    "action_from_index",
+    "action_to_index",
+    "base_palette",
+    "base_state",
+    "compose",
+    "distances",
+    "episode_frames",
+    "evaluation_tasks",
+    "graded_perceptual",
+    "graded_structural",
+    "make",
+    "observe",
+    "perceptual",
+    "register",
+    "registered_ids",
+    "render",
+    "render_ascii",
+    "save_gif",
+    "score",
+    "score_gymnasium",
+    "solve",
+    "solve_batch",
+    "structural",
+    "symbolic",
+    "task_set",
+    "validate",
+    "visible_objects",
+]
+
 
 def _register_with_gymnasium() -> None:
     """Follows Gymnasium's convention: importing a package registers its environments."""
@@ -74,20 +115,5 @@ def _register_with_gymnasium() -> None:
 _register_with_gymnasium()
 
 
-__all__: list[str]
-
-
 def __dir__() -> list[str]:
-    """Lists the public names, without submodules."""
-    public = {name: value for name, value in globals().items() if not name.startswith("_")}
-    return [name for name in public if not isinstance(public[name], types.ModuleType)]
-
-
-if not typing.TYPE_CHECKING:
-
-    def __getattr__(name: str) -> list[str]:
-        # help() prints everything that `__all__` names in full, 1,300 lines. Without `__all__` it
-        # prints the text above, so pydoc alone does not get to see it.
-        if name == "__all__" and sys._getframe(1).f_code.co_name != "docmodule":
-            return __dir__()
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return __all__
