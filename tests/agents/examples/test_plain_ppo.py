@@ -59,18 +59,23 @@ def plain_params(params):
 
 def test_rewards_advantages_and_losses_are_those_of_the_learner():
     learner, plain = make_train(CONFIG), plain_ppo.PlainPPO(CONFIG)
-    state = learner.init(jax.random.key(0))
-    reset_keys = jax.random.split(jax.random.key(1), CONFIG.episodes_per_iteration)
-    trajectory = learner.play(state.params, reset_keys, jax.random.key(2))
+    state = jax.jit(learner.init)(jax.random.key(0))
+
+    @jax.jit
+    def play(state):
+        reset_keys = jax.random.split(jax.random.key(1), CONFIG.episodes_per_iteration)
+        trajectory = learner.play(state.params, reset_keys, jax.random.key(2))
+        reward, _ = learner.intrinsic_reward(state, trajectory)
+        return trajectory, learner.make_batch(state, trajectory, reward)
+
+    trajectory, (batch, moments) = play(state)
     episodes = trajectory.episodes
     assert 0 < episodes.mask.mean() < 1, "some end early"
-    reward, _ = learner.intrinsic_reward(state, trajectory)
-    batch, moments = learner.make_batch(state, trajectory, reward)
     # Updated parameters, so that ratios are not 1.
     noise = iter(jax.random.split(jax.random.key(3), len(jax.tree.leaves(state.params))))
     now = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(noise), x.shape), state.params)
     now["core"]["params"]["bias"] = now["core"]["params"]["bias"].at[1, : 2 * CONFIG.hidden].set(0)
-    _, expected = learner.loss(now, batch)
+    _, expected = jax.jit(learner.loss)(now, batch)
 
     steps = (
         episodes.action,
@@ -80,14 +85,16 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
         trajectory.value[:-1, :, 0],
     )
     steps = jax.tree.map(lambda x: x.swapaxes(0, 1), (episodes.observations(), *steps))
-    start = plain.init(jax.random.key(0))
+    start = jax.jit(plain.init)(jax.random.key(0))
 
     def translated(params):  # in 64 bits where the plain program computes in these
         return jax.tree.map(lambda x, own: x.astype(own.dtype), plain_params(params), start.params)
 
     plain_state = start.replace(params=translated(state.params))
-    variance, (episode, advantage, target) = plain.prepare(plain_state, plain_ppo.Episode(*steps))
-    total, terms = plain.loss(translated(now), (episode, advantage, target))
+    variance, (episode, advantage, target) = jax.jit(plain.prepare)(
+        plain_state, plain_ppo.Episode(*steps)
+    )
+    total, terms = jax.jit(plain.loss)(translated(now), (episode, advantage, target))
     chex.assert_trees_all_close(
         [variance, advantage.T, target.T[..., None], {**terms, "loss": total}],
         [
@@ -103,9 +110,10 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
 
 def test_an_update_lowers_the_loss():
     plain = plain_ppo.PlainPPO(CONFIG)
-    state, batch, minibatches = jax.jit(plain.collect)(plain.init(jax.random.key(0)))
+    state = jax.jit(plain.init)(jax.random.key(0))
+    state, batch, minibatches = jax.jit(plain.collect)(state)
     after, terms = jax.jit(plain.update)(state, batch, minibatches[0])
-    assert plain.loss(after.params, batch)[0] < sum(terms.values())
+    assert jax.jit(plain.loss)(after.params, batch)[0] < sum(terms.values())
 
 
 @pytest.mark.slow
