@@ -27,11 +27,11 @@ def make_learner(axis=ONE_DEVICE):
     return make_train(CONFIG, tt.Environment(base=base, max_steps=6), axis)
 
 
-def train(devices, iterations):
-    """Returns the final state where it is, all metrics, and the placement."""
-    placement = Placement.of(devices, CONFIG)
+def train(iterations):
+    """Trains on two devices; returns the final state where it is, all metrics and the placement."""
+    placement = Placement.of(2, CONFIG)
     learner = make_learner(placement.axis)
-    state, rows = placement.put(learner.init(jax.random.key(0))), []
+    state, rows = placement.put(jax.jit(learner.init)(jax.random.key(0))), []
     iterate = jax.jit(placement.shard(learner.iterate), donate_argnums=0)
     for _ in range(iterations):
         state, metrics = iterate(state)
@@ -39,20 +39,26 @@ def train(devices, iterations):
     return state, rows, placement
 
 
-def train_seeds(devices):
-    """Trains two seeds for an iteration, spread over devices by JAX alone; returns arrays [2, ...].
+def train_seeds():
+    """Trains two seeds for an iteration, one on each device by JAX alone, then exchanges them.
 
-    This is the program of agents/parallel/README.md.
+    This is the program of agents/parallel/README.md. Returns arrays [2, ...] of the first and of
+    the second time, in the same order of seeds, and the number of devices.
     """
     learner = make_learner()
-    mesh = jax.make_mesh(
-        (devices,), ("seeds",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
-    )
+    mesh = jax.make_mesh((2,), ("seeds",), axis_types=(AxisType.Auto,))
+    init = jax.jit(jax.vmap(learner.init))
+    iterate = jax.jit(jax.vmap(learner.iterate), donate_argnums=0)
+
+    def train(keys):
+        keys = jax.device_put(keys, NamedSharding(mesh, PartitionSpec("seeds")))
+        return iterate(init(keys))[0]
+
     keys = jax.random.split(jax.random.key(0), 2)
-    keys = jax.device_put(keys, NamedSharding(mesh, PartitionSpec("seeds")))
-    states = jax.jit(jax.vmap(learner.init))(keys)
-    states, _ = jax.jit(jax.vmap(learner.iterate), donate_argnums=0)(states)
-    return to_arrays(states), len(states.iteration.devices())
+    first, second = train(keys), train(keys[::-1])
+    devices = len(first.iteration.devices())
+    second = {name: x[::-1] for name, x in to_arrays(second).items()}
+    return to_arrays(first), second, devices
 
 
 def unequal_copies(state):
@@ -67,7 +73,7 @@ def unequal_copies(state):
 def gradient_gap():
     """The largest relative difference between the gradient of a batch and that of two halves."""
     learner = make_learner()
-    state = learner.init(jax.random.key(1))
+    state = jax.jit(learner.init)(jax.random.key(1))
 
     @jax.jit
     def make_batch(state):
@@ -115,31 +121,33 @@ def shared_rows():
     return rows.tolist(), len(set(words.tolist()))
 
 
+def shape(x):
+    return str(x.dtype), x.shape
+
+
 def main():
     become_devices(2)
-    shared, rows, placement = train(2, 3)
-    state = to_arrays(placement.local(shared))
-    alone, rows_alone, _ = train(1, 1)
-    expected = to_arrays(alone)
-    (spread, seed_devices), (together, _) = train_seeds(2), train_seeds(1)
+    shared, rows, placement = train(3)
+    state = placement.local(shared)
+    learner = make_learner()
+    alone, metrics = jax.eval_shape(
+        learner.iterate, jax.eval_shape(learner.init, jax.random.key(0))
+    )
+    first, second, seed_devices = train_seeds()
     steps = sum(row["episode_length"] for row in rows) * CONFIG.episodes_per_iteration
     report = {
         "unequal_copies": unequal_copies(shared),
-        "iteration": int(state["iteration"]),
-        "transitions": int(state["transitions"]),
+        "iteration": int(state.iteration),
+        "transitions": int(state.transitions),
         "steps_played": round(float(steps)),
         "gradient_gap": gradient_gap(),
         "shared_rows": shared_rows(),
         "seed_devices": seed_devices,
         "seeds_gap": max(
-            float(np.max(np.abs(np.float64(spread[name]) - x))) for name, x in together.items()
+            float(np.max(np.abs(np.float64(first[name]) - x))) for name, x in second.items()
         ),
-        "different_shapes": [
-            name
-            for name, x in expected.items()
-            if (state[name].dtype, state[name].shape) != (x.dtype, x.shape)
-        ],
-        "different_metrics": sorted(set(rows[0]) ^ set(rows_alone[0])),
+        "same_shapes": jax.tree.map(shape, state) == jax.tree.map(shape, alone),
+        "same_metrics": set(rows[0]) == set(metrics),
     }
     print(json.dumps(report))
 

@@ -56,10 +56,12 @@ def test_two_devices_train_as_one():
     )
     assert done.returncode == 0, done.stderr
     two = json.loads(done.stdout)
-    assert two["unequal_copies"] == two["different_shapes"] == two["different_metrics"] == []
+    assert two["unequal_copies"] == []
+    assert two["same_shapes"]
+    assert two["same_metrics"]
     assert two["iteration"] == 3
     assert two["transitions"] == two["steps_played"] > 0
     assert two["gradient_gap"] < 1e-5  # of the mean of two halves and the whole
     assert two["shared_rows"] == [list(range(6)), 2]
     assert two["seed_devices"] == 2
-    assert two["seeds_gap"] < 1e-5  # between a seed on each device and both on one
+    assert two["seeds_gap"] < 1e-5  # between a seed on the first device and on the second
