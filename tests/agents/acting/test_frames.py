@@ -17,7 +17,7 @@ NUMBERS = range(NUM_FRAMES)
 def states() -> tt.State:
     """Plays {P, St, Sy} at random for 20 steps; returns the states [B]."""
     env = tt.make("pstsy")
-    state, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 256))
+    state, _ = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 256))
 
     def step(state, key):
         action = jax.random.randint(key, (256, 2), 0, 4)
@@ -48,10 +48,11 @@ def one_of(images: tt.State, number: int) -> tt.State:
 
 @pytest.mark.parametrize("number", NUMBERS)
 def test_an_image_looks_like_the_mirrored_picture(states, images, number):
-    expected = mirrored(number, np.asarray(jax.vmap(tt.observe)(states)))
-    found = jax.vmap(tt.observe)(one_of(images, number))
+    observe = jax.jit(jax.vmap(tt.observe))
+    expected = mirrored(number, np.asarray(observe(states)))
+    found = observe(one_of(images, number))
     np.testing.assert_array_equal(found, expected)
-    pictures = jax.vmap(Frame.of(jnp.asarray(number)).picture)(jax.vmap(tt.observe)(states))
+    pictures = jax.vmap(Frame.of(jnp.asarray(number)).picture)(observe(states))
     np.testing.assert_array_equal(pictures, expected)
 
 

@@ -62,14 +62,15 @@ def test_an_episodes_reward_does_not_depend_on_other_episodes(name):
 def test_rnd_trains_the_predictor_alone():
     curiosity = make("rnd")
     board = jax.random.randint(jax.random.key(0), (3, 12, 12, 3), 0, 256).astype(jnp.uint8)
-    params = curiosity.init(jax.random.key(1), board)
+    params = jax.jit(curiosity.init)(jax.random.key(1), board)
+    encode = jax.jit(curiosity.encode)
 
     def loss(params):
-        features = curiosity.encode(params, board)[:, None]
+        features = encode(params, board)[:, None]
         experience = Experience(None, features)  # pyright: ignore
         return jnp.sum(curiosity.losses(params, experience)["forward_loss"])
 
-    features = curiosity.encode(params, board)[1:]
+    features = encode(params, board)[1:]
     np.testing.assert_allclose(loss(params), jnp.sum(jnp.mean(features**2, axis=-1)), rtol=1e-5)
     gradient = jax.grad(loss)(params)["params"]
     assert not any(np.any(x) for x in jax.tree.leaves(gradient.pop("target")))

@@ -72,7 +72,7 @@ def test_effects_can_be_read_off_the_observations(short):
     env = tt.make(short, max_steps=STEPS)
     episodes = random_episodes(env)
     boards = np.asarray(jax.jit(Episodes.observations)(episodes))
-    found = np.asarray(new_effects(episodes) * episodes.mask[None])
+    found = np.asarray(jax.jit(new_effects)(episodes) * episodes.mask[None])
     own = {"agent": np.asarray(env.base.palette[7]), "food": np.asarray(env.base.palette[5])}
     checked = 0
     for index in range(BATCH):

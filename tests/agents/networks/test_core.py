@@ -16,7 +16,7 @@ def test_a_step_depends_on_the_past_only_with_memory(recurrent):
     """Two histories that differ in their first observation alone."""
     config = Config(filters=(2, 2), hidden=4, embedding=2, recurrent=recurrent)
     agent = Agent(config)
-    params = agent.init(jax.random.key(0))
+    params = jax.jit(agent.init)(jax.random.key(0))
     action, reward = jnp.zeros((STEPS, BATCH, 2), jnp.int32), jnp.zeros((STEPS, BATCH), jnp.float32)
     features = jax.random.normal(jax.random.key(1), (STEPS + 1, BATCH, 2), jnp.float32)
     unroll = jax.jit(agent.unroll)

@@ -26,7 +26,7 @@ def test_kernels_have_the_variance_of_their_layer_and_biases_are_zero():
 def scales(module: nn.Module, *inputs: Any) -> dict[str, float]:
     """Returns by path each parameter's standard deviation times the root of its fan-in."""
     found = {}
-    params = module.init(jax.random.key(0), *inputs)["params"]
+    params = jax.jit(module.init)(jax.random.key(0), *inputs)["params"]
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         (scale,) = set(np.ravel(leaf * np.sqrt(np.prod(leaf.shape[:-1]))).tolist())
         found["/".join(part.key for part in path)] = round(float(scale), 4)

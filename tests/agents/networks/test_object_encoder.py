@@ -19,7 +19,7 @@ PALETTE = np.asarray(tt.base_state().palette)
 @pytest.fixture(scope="module")
 def tasks() -> tt.State:
     env = tt.make("psy")
-    return jax.vmap(env.reset)(jax.random.split(jax.random.key(3), 32))[0]
+    return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 32))[0]
 
 
 def described(board: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
@@ -54,7 +54,7 @@ def described(board: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
 def test_objects_are_where_they_are(tasks):
     """The last board has neither agent nor food."""
     blank = np.zeros((1, 12, 12, 3), np.uint8)
-    boards = np.concatenate([jax.vmap(tt.observe)(tasks), blank])
+    boards = np.concatenate([jax.jit(jax.vmap(tt.observe))(tasks), blank])
     features, exists, places = map(np.asarray, describe(jnp.asarray(boards)))
     for board, found, is_there, place in zip(boards, features, exists, places, strict=True):
         expected, expected_place = described(board)
@@ -94,7 +94,7 @@ def test_objects_that_are_not_there_do_not_count(monkeypatch):
     params = jax.jit(agent.init)(jax.random.key(0))
     # No object but the ground; and one more, with neither agent nor food.
     boards = jnp.zeros((2, 12, 12, 3), jnp.uint8).at[1, 0, 0].set(200)
-    plain = agent.encode(params, boards)
+    plain = jax.jit(agent.encode)(params, boards)
 
     def filled(board):
         described, exists, *rest = described_by(board)
@@ -103,5 +103,6 @@ def test_objects_that_are_not_there_do_not_count(monkeypatch):
 
     described_by = object_encoder.describe_board
     monkeypatch.setattr(object_encoder, "describe_board", filled)
-    np.testing.assert_array_equal(agent.encode(params, boards), plain)
+    found = jax.jit(lambda: agent.encode(params, boards))()
+    np.testing.assert_array_equal(found, plain)
     assert (plain[0] != plain[1]).any()

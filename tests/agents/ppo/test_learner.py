@@ -201,7 +201,7 @@ def test_seeds_side_by_side_are_those_alone():
 
 def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key():
     best = make_train(dataclasses.replace(BEST, epochs=1))
-    state = best.init(jax.random.key(0))
+    state = jax.jit(best.init)(jax.random.key(0))
     assert state.params["heads"]["params"]["value"]["kernel"].shape == (4, 2)
     iterate = jax.jit(best.iterate)
     with jax.debug_key_reuse(True):
