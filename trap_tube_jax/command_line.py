@@ -25,7 +25,7 @@ def plain_errors() -> Iterator[None]:
     prepare_terminal()
     try:
         yield
-        sys.stdout.flush()
+        print(end="", flush=True)  # does nothing where stdout is closed, unlike its own flush
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python warns at exit
         raise SystemExit(1) from None

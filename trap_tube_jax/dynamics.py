@@ -68,4 +68,5 @@ def holds_tool(state: State, direction: jax.Array | int) -> jax.Array:
 def static_object(board: jax.Array, cell: jax.Array) -> jax.Array:
     """Returns the code i32[] of the static object at `cell` i32[2] of u8[12, 12]; -1 off it."""
     row, column = jnp.clip(cell, 0, BOARD_SIZE - 1)
-    return jnp.where(is_on_board(cell), board[row, column].astype(jnp.int32), -1)
+    code = jnp.asarray(board)[row, column]  # NumPy takes no traced indices
+    return jnp.where(is_on_board(cell), code.astype(jnp.int32), -1)

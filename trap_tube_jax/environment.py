@@ -99,9 +99,9 @@ class Environment(ByValue):
             )
         self.max_steps = check_integer("max_steps", max_steps, maximum=LARGEST_TIME)
         self.transfers = tuple(transfers)
-        self.base = base_state() if base is None else _check_base(base)
         own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
+            self.base = base_state() if base is None else _check_base(base)
             state, key = self.base, jax.random.key(0)
             for transfer in self.transfers[: own[-1] + 1 if own else 0]:
                 state = _try_transfer(transfer, jax.random.clone(key), state)
@@ -227,17 +227,18 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> jax.Array:
 
 
 def _timestep(state: State, reward: jax.Array) -> TimeStep:
+    # Copies, since the caller may donate the state and keep the timestep.
     return TimeStep(
         observation=observe(state),
         reward=reward,
-        terminated=state.terminated,
-        truncated=state.truncated,
+        terminated=jnp.copy(state.terminated),
+        truncated=jnp.copy(state.truncated),
         discount=1.0 - state.terminated.astype(jnp.float32),
     )
 
 
 def _check_base(base: State) -> State:
-    """Returns `base` if it is a valid state at time 0."""
+    """Returns a copy of `base`, which the caller may donate or change, if it is at time 0."""
     base = validate(with_narrow_integers(base))
     time = int(base.time)
     if time != 0:
@@ -245,7 +246,7 @@ def _check_base(base: State) -> State:
             f"the base state is at time {time}; allowed: time 0, as in "
             "base.replace(time=np.int32(0))"
         )
-    return base
+    return jax.tree.map(jnp.array, base)
 
 
 def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:

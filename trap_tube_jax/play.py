@@ -194,7 +194,7 @@ def _colored(text: str, color: Sequence[int]) -> str:
 
 def _play(game: Game) -> None:
     """Draws and reads keys until the player quits; raises ValueError without a terminal."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout)):
         raise ValueError("play needs a terminal; its input or output is not one")
     with _single_keys(sys.stdin.fileno()) as terminal, contextlib.suppress(KeyboardInterrupt):
         while True:

@@ -230,7 +230,7 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
     role = jnp.where(swaps, partner, objects)
     return state.replace(
         board=jnp.where(swaps, board, state.board),
-        palette=state.palette[role],
+        palette=jnp.asarray(state.palette)[role],  # NumPy takes no traced indices
         tool=jnp.where(swaps, corner, state.tool),
         tool_extent=jnp.where(swaps, extent, state.tool_extent),
     )

@@ -1,7 +1,7 @@
 """Batches of environments with auto-reset: the fast path on a CPU.
 
-`VectorEnvironment` equals `jax.vmap` of an `AutoReset`, bit for bit; read that first. Three
-differences make it fast:
+`VectorEnvironment` equals `jax.vmap` of an `AutoReset`; read that first. Three differences make it
+fast:
 
 1. Auto-reset by selection draws a new task for every environment at every step. Here only
    finished environments start over, in as many chunks of fixed size as needed.
@@ -53,7 +53,7 @@ class VectorEnvironment:
     """B environments in lockstep, each starting its next episode when one ends.
 
     States, observations and everything else equal `jax.vmap` of `AutoReset(env)` for the same
-    keys and actions.
+    keys and actions, up to the rounding of colours between programs (`Environment.reset`).
 
     The environment is batched: jit and scan it, and do not vmap it over environments. A vmap over
     seeds works; each step then runs as many chunks as the seed with the most finished

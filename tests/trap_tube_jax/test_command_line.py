@@ -51,6 +51,12 @@ def test_a_closed_pipe_ends_a_command_in_silence():
     assert process.returncode == 1
 
 
+def test_a_command_without_stdout_ends_in_silence(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    with plain_errors():
+        print("as under command >&-")
+
+
 def test_a_missing_library_is_named_with_its_extra():
     with (
         pytest.raises(

@@ -1,5 +1,6 @@
 """The contract of `Environment`."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -152,13 +153,37 @@ def test_states_and_environments_may_be_made_within_a_traced_function():
     assert state == tt.make("two-traps").reset(key)[0]
 
 
-def test_a_state_without_transfers_may_be_donated():
-    env = tt.make("base")
+@pytest.mark.parametrize("base", [None, tt.base_state()], ids=["absent", "own"])
+def test_a_state_may_be_donated(base):
+    """Neither the environment nor a timestep holds its arrays."""
+    env = tt.Environment(base=base)
     step = jax.jit(env.step, donate_argnums=0)
+    if base is not None:
+        step(base, np.zeros(2, np.int32))
     for _ in range(2):
-        state, _ = env.reset(jax.random.key(0))
+        state, timestep = env.reset(jax.random.key(0))
         state, _ = step(state, np.zeros(2, np.int32))
         assert state.time == 1
+        assert not timestep.done
+
+
+def test_an_environment_keeps_its_base_when_the_callers_changes():
+    agent = np.array([9, 1], np.int32)
+    env = tt.Environment(base=tt.base_state().replace(agent=agent))
+    agent[:] = 0
+    assert env == tt.Environment(base=tt.base_state())
+    assert env.reset(jax.random.key(0))[0].agent.tolist() == [9, 1]
+
+
+def test_states_of_numpy_arrays_serve_under_vmap_and_jit():
+    env, state = tt.make("base"), tt.base_state()
+    host, actions = jax.device_get(state), jnp.array([[0, 3], [0, 1]])
+    keys = jax.random.split(jax.random.key(0), 2)
+    for function, batch in ((env.step, actions), (lambda s, key: tt.symbolic(key, s), keys)):
+        expected = jax.vmap(function, (None, 0))(state, batch)
+        assert_same(jax.vmap(function, (None, 0))(host, batch), expected)
+        alone = jax.jit(functools.partial(function, host))(batch[0])
+        assert_same(alone, rows(expected, 0))
 
 
 def test_own_transfers_apply_in_order_to_what_the_ones_before_return():

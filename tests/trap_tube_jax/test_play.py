@@ -134,6 +134,8 @@ def test_without_a_terminal_the_command_line_says_so(monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
     assert "play needs a terminal" in refused(capsys, play.main)
     assert "unknown task set 'x'" in refused(capsys, play.main, "x")
+    monkeypatch.setattr("sys.stdin", None)
+    assert "play needs a terminal" in refused(capsys, play.main)
     monkeypatch.setitem(sys.modules, "termios", None)
     with pytest.raises(ValueError, match="a Unix terminal"), play._single_keys(0):
         pass

@@ -31,6 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     with plain_errors():
         import_modules(options.imports)
+        if options.output is not None:
+            options.output.parent.mkdir(parents=True, exist_ok=True)
         if options.show is not None:
             _show(options)
         elif options.distances is not None:

@@ -59,7 +59,9 @@ def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypa
 
 
 def test_command_line_shows_that_there_is_no_plan(tmp_path, capsys):
-    main(["--show", "too-short-tool", "--output", str(tmp_path / "plan.gif")])
+    animation = tmp_path / "new" / "plan.gif"
+    main(["--show", "too-short-tool", "--output", str(animation)])
+    assert animation.exists(), "the folder is made"
     assert capsys.readouterr().out.startswith("start (unsolvable)\n")
 
 
