@@ -1,11 +1,13 @@
 """Runs from Python: what they write, how they continue, and how they end badly."""
 
 import dataclasses
+import functools
 import io
 import itertools
 import shutil
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
@@ -35,6 +37,18 @@ ASKED: list[tuple[str, str]] = []  # sets and purposes of the tasks that `whole`
 def small_run(iterations=ITERATIONS, **values):
     replay = {"replay_fractions": (0.25, 0.25), "replay_capacity": 5}
     return Run(small_config(iterations=iterations, motion_coef=0.5, **replay), **values)
+
+
+def replace_training(monkeypatch, change):
+    """Makes an iteration count and set its metrics to 0, then `change` what it returns."""
+    iterate = Learner.iterate
+
+    def count(self, state):
+        _, metrics = jax.eval_shape(functools.partial(iterate, self), state)
+        metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
+        return change(state._replace(iteration=state.iteration + 1), metrics)
+
+    monkeypatch.setattr(Learner, "iterate", count)
 
 
 @pytest.fixture(scope="module")
@@ -190,13 +204,10 @@ def test_the_best_iteration_is_the_first_of_the_highest_mean_over_sets(own, sets
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
-    iterate = Learner.iterate
+    def diverge(after, metrics):
+        return after, {**metrics, "loss": 1 / (after.iteration < 3)}
 
-    def diverge(self, state):
-        after, metrics = iterate(self, state)
-        return after, {**metrics, "loss": metrics["loss"] / (after.iteration < 3)}
-
-    monkeypatch.setattr(Learner, "iterate", diverge)
+    replace_training(monkeypatch, diverge)
     with pytest.raises(ValueError, match=r"iteration 3: .* try a learning_rate below 0.002"):
         train_run(tmp_path / "x", small_run(), PLAIN)
     assert final_state(tmp_path / "x")[0] == 2
@@ -228,13 +239,9 @@ def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch
 
 def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypatch):
     """Whose float32 mean is 0.99999994."""
-
-    def evaluate(agent, params, env, tasks):
-        """Solves all by any parameters but the first, whose biases are 0."""
-        trained = jnp.any(params["heads"]["params"]["value"]["bias"] != 0)
-        return evaluation.Evaluation(jnp.full(41, trained), *jnp.ones((3, 41)))
-
-    monkeypatch.setattr(session, "evaluate", evaluate)
+    solved = evaluation.Evaluation(jnp.full(41, True), *jnp.ones((3, 41)))
+    monkeypatch.setattr(session, "evaluate", lambda *_: solved)
+    replace_training(monkeypatch, lambda *returned: returned)
     run = Run(small_config(iterations=3, stop_when_solved=1.0))
     train_run(tmp_path / "x", run, PLAIN)
     assert [row["evaluation"] for row in untimed(tmp_path / "x")] == ["1.0"]
