@@ -27,12 +27,7 @@ def option(default: Any, group: str | None = None, **metadata: Any) -> Any:
 
 
 def parse(cls: type[Options], arguments: Sequence[str] | None, prog: str) -> Options:
-    """Reads a command line into a dataclass; fields without a default are positional.
-
-    Raises:
-      SystemExit: the command line is invalid, or asks for help.
-      ValueError: a value is not allowed.
-    """
+    """Reads a command line into one dataclass; see `parse_all`."""
     return parse_all([cls], arguments, prog)[0]
 
 
@@ -41,12 +36,14 @@ def parse_all(
 ) -> list[Any]:
     """Reads a command line into several dataclasses; first imports the modules of `--import`.
 
+    Fields without a default are positional.
+
     Args:
       declared: dataclasses, or instances whose values are the defaults. The docstring of the first
         describes the command.
       arguments: those of the process if None.
       prog: the command.
-      partly: ignores unknown options and --help.
+      partly: ignores unknown options and --help, and imports nothing.
 
     Raises:
       SystemExit: the command line is invalid, or asks for help.
@@ -74,11 +71,16 @@ def parse_all(
             _add(groups[group], field, getattr(each, field.name, None), text, kinds[field.name])
     found = vars(parser.parse_known_args(arguments)[0] if partly else parser.parse_args(arguments))
     values = {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
-    import_modules(values.get("imports", ()))  # they register names that the classes check
-    return [
-        _class(each)(**{field.name: values[field.name] for field in dataclasses.fields(each)})
-        for each in declared
-    ]
+    if not partly:
+        import_modules(values.get("imports", ()))  # they register names that the classes check
+    return [_replaced(each, values) for each in declared]
+
+
+def _replaced(declared: Any, values: dict[str, Any]) -> Any:
+    """Returns an instance of the declared options with the values that the command line gives."""
+    given = {f.name: values[f.name] for f in dataclasses.fields(declared) if f.name in values}
+    is_class = isinstance(declared, type)
+    return declared(**given) if is_class else dataclasses.replace(declared, **given)
 
 
 def _class(declared: Any) -> type:
@@ -97,7 +99,9 @@ def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: An
         return
     options = _values(kind)
     if field.metadata.get("append"):
-        options, default = {"action": "append", "metavar": "NAME"}, list(default)
+        options = {"action": "append", "metavar": "NAME"}
+    elif options.get("nargs") == "*":
+        options["action"] = "extend"  # given twice, the option holds the values of both
     shown = "on" if default is True else default
     if isinstance(default, list | tuple):
         shown = " ".join(map(str, default))
@@ -105,7 +109,7 @@ def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: An
         f"--{field.name.replace('_', '-')}",
         *field.metadata.get("flags", ()),
         dest=field.name,
-        default=default,
+        default=argparse.SUPPRESS,  # the class has them
         help=text if shown is None or shown is False or shown == "" else f"{text} [{shown}]",
         **options,
     )

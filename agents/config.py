@@ -198,11 +198,7 @@ class Config:
         return dataclasses.asdict(self)
 
     def step_limit(self, name: str) -> int:
-        """Returns the steps after which an episode of a task set is truncated.
-
-        Raises:
-          ValueError: `max_steps` is None and the task set is unknown.
-        """
+        """Returns the steps after which an episode of a task set is truncated."""
         return task_set(name).max_steps if self.max_steps is None else self.max_steps
 
     @property

@@ -51,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks
     evaluator = Evaluator.of_sets(config, options.sets or own_and_paper_sets(config), tasks)
+    own = tt.task_set(config.env_id).short if options.gif else ""  # refused before it is played
     shortest = None
     if options.optimality:
         shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
@@ -64,8 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         notes.append(f"results: {options.output}")
     if options.gif is not None:
         options.gif.parent.mkdir(parents=True, exist_ok=True)
-        prefer = tt.task_set(config.env_id).short
-        shown = save_first_solved(options.gif, evaluator, played, prefer)
+        shown = save_first_solved(options.gif, evaluator, played, own)
         notes.append(f"solved episode of {shown}: {options.gif}" if shown else "nothing is solved")
     print(f"{policy.name}, iteration {policy.iteration}", scores, *notes, sep="\n\n")
 

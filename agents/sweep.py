@@ -32,9 +32,9 @@ def main(
     """
     arguments, grid = sys.argv[1:] if arguments is None else list(arguments), grid or Grid()
     console = Console(highlight=False)
+    jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
     with plain_errors():
         options, how = parse_all([grid.options, grid.run], arguments, program)
-        jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
         runs = grid.runs(name, options)
         root = next(iter(runs)).parent
         try:

@@ -13,7 +13,7 @@ from agents.config import Config
 from agents.parallel import processes
 from agents.parallel.devices import become_devices
 from agents.runs import compilation, display
-from agents.runs.folder import Run, RunFolder, RunOptions, check_name
+from agents.runs.folder import DeviceOptions, Run, RunFolder, RunOptions, check_name
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped, exit_code
 from trap_tube_jax.command_line import plain_errors
@@ -29,7 +29,7 @@ class Options:
     A second Ctrl-C stops at once.
 
     Attributes:
-      preset: named settings to start from: fast, best or paper.
+      preset: initial settings (fast, best or paper).
       seed: seed of all draws. agents.sweep trains several.
       name: the run's folder within --out, by default <preset>-<task set>-<seed>.
       out: the folder of all runs.
@@ -52,7 +52,15 @@ class Options:
 @plain_errors()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
+    start_devices(arguments)
     train(*parse(arguments))
+
+
+def start_devices(arguments: Sequence[str] | None) -> None:
+    """Splits the CPU and joins the other processes, before modules of --import start JAX."""
+    options, how = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
+    become_devices(how.devices)
+    processes.join(options.distributed)
 
 
 def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
@@ -74,30 +82,23 @@ def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
 
 
 def train(options: Options, run: Run, how: RunOptions) -> None:
-    """Trains a run, or continues it, and prints its results.
-
-    Raises:
-      SystemExit: training was stopped; the message says how to continue.
-      ValueError: the run cannot be trained or continued.
-      OSError: a file cannot be written.
-    """
+    """Trains a run, or continues it, and prints its results, or how to continue if it stops."""
     folder = RunFolder(run_path(options, run))
     if options.resume is None:
         folder.check_free()
-    become_devices(how.devices)
-    processes.join(options.distributed)
+        processes.agree(None)  # no process writes before all have checked
+    become_devices(how.devices)  # of a stored run
     console = Console(quiet=jax.process_index() > 0, highlight=False)
     compilation.enable_cache()
-    again = f"Continue with: {display.resume_command(folder, run)}"
     try:
         scores = train_run(folder.path, run, how, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
-        console.out(f"Stopped. {again}")
+        console.out(f"Stopped. {display.how_to_go_on(folder, run)}")
         raise SystemExit(exit_code(stopped)) from None
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OSError(f"{error}. Saved checkpoints are kept. {again}") from error
+        raise OSError(f"{error}. {display.how_to_go_on(folder, run)}") from error
     for line in ([scores] if scores else []) + display.summary(folder, run):
         console.out(line)
 

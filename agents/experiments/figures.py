@@ -28,7 +28,7 @@ def save(root: Path, results: Frame, curves: Frame, about: Mapping[str, Any]) ->
         drawn["curves.png"] = draw_curves(results, curves, about)
     if len(tested):
         drawn["success.png"] = draw_success(tested, about)
-    for name in ("curves.png", "success.png"):  # else figures of fewer runs would stay
+    for name in ("curves.png", "success.png"):  # or those of an earlier, smaller grid would stay
         (root / name).unlink(missing_ok=True)
     for name, figure in drawn.items():
         figure.savefig(root / name, dpi=DPI)
@@ -94,7 +94,7 @@ def make_panels(
     """Makes a figure of panels with a title each, in rows of `height` inches."""
     rows = math.ceil(len(titles) / columns)
     figure = Figure(figsize=(WIDTH, rows * height + 0.9), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     grid = figure.subplots(rows, columns, sharex=sharex, sharey=True, squeeze=False)
     axes = list(grid.flat)
     for axis in axes[len(titles) :]:

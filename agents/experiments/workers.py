@@ -66,8 +66,8 @@ def train_logged(path: Path, run: Run, options: RunOptions, stop_file: Path) -> 
         return "stopped"
     with log_of(path).open("a", buffering=1, encoding="utf-8") as log:
         try:
+            become_devices(options.devices)  # first, because a module may start JAX
             import_modules(run.imports)
-            become_devices(options.devices)
             enable_cache()
             train_run(path, run, options, console=Console(file=log), stop_file=stop_file)
         except Stopped:
@@ -85,7 +85,7 @@ def log_of(path: Path) -> Path:
 
 def _begin(threads: int) -> None:
     os.environ.setdefault("NPROC", str(threads))  # for XLA, which starts one per core
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C arrives by the stop file
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C arrives through the stop file
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -48,10 +48,10 @@ def update_variance(
     episodes: Episodes,
     intrinsic_reward: jax.Array,
 ) -> jax.Array:
-    """Moves the variances f32[2] of both rewards towards those of B episodes with f32[T, B].
+    """Moves the variances f32[2] of both rewards towards those of B episodes.
 
-    Iteration 0 replaces the variances. With separate value heads, the second variance is that of
-    the discounted intrinsic returns.
+    `intrinsic_reward` is f32[T, B]. Iteration 0 replaces the variances. With separate value heads,
+    the second variance is that of the discounted intrinsic returns.
     """
     if config.value_heads == "separate":
         discount = jnp.full_like(intrinsic_reward, config.discount)

@@ -60,6 +60,13 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
     return lines
 
 
+def how_to_go_on(folder: RunFolder, run: Run) -> str:
+    """Says how an interrupted run goes on."""
+    if not folder.config.is_file():
+        return f"{folder.path} holds no run to continue."
+    return f"Continue with: {resume_command(folder, run)}"
+
+
 def resume_command(folder: RunFolder, run: Run) -> str:
     """Returns the command that continues a run."""
     imports = [word for name in run.imports for word in ("--import", name)]

@@ -75,8 +75,19 @@ class Run:
 
 
 @dataclasses.dataclass(frozen=True)
-class RunOptions:
-    """Options of carrying out a run; none changes what it learns on one device.
+class DeviceOptions:
+    """Options that take effect before JAX starts.
+
+    Attributes:
+      devices: devices that share the run, by default one, or all if distributed.
+    """
+
+    devices: int | None = option(None, "devices and hosts")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions(DeviceOptions):
+    """Options for carrying out a run; on one device, none of them changes what it learns.
 
     Attributes:
       checkpoint_every: iterations between checkpoints.
@@ -87,7 +98,6 @@ class RunOptions:
       report: writes curves, page and GIF at the end.
       tensorboard: logs metrics for TensorBoard.
       wandb: logs metrics to Weights & Biases; offline with WANDB_MODE=offline.
-      devices: devices that share the run, by default one, or all if distributed (`Placement.of`).
     """
 
     checkpoint_every: int = option(10, "run")
@@ -97,7 +107,6 @@ class RunOptions:
     report: bool = option(True, "run")
     tensorboard: bool = option(False, "run")
     wandb: bool = option(False, "run")
-    devices: int | None = option(None, "devices and hosts")
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number that is too small or an unknown set."""
@@ -184,5 +193,5 @@ def runs_next_to(path: Path) -> str:
 
 def check_name(name: str) -> None:
     """Raises ValueError unless a name is a plain folder name."""
-    if not name or Path(name).name != name or name.startswith("."):
+    if Path(name).name != name or name[:1] in ("", ".") or not name.isprintable():
         raise ValueError(f"name must be a folder's name without a path, got {name!r}")

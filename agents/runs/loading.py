@@ -37,7 +37,8 @@ def load(
       imports: modules to import first, which register curiosities, encoders or task sets.
 
     Raises:
-      ValueError: there is no such policy, or it cannot be read.
+      ValueError: there is no such policy, or it is damaged or of another version.
+      OSError: a file cannot be opened.
     """
     folder, path = RunFolder(Path(source)), Path(source)
     if not folder.config.is_file():

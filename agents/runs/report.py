@@ -73,7 +73,7 @@ def save_curves(rows: Frame, path: Path, title: str) -> None:
         if (found := [metric for metric in metrics if metric in rows])
     ]
     figure = Figure(figsize=(10, 2.6 * math.ceil(len(panels) / 2) + 0.5), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     for place, (name, unit, metrics) in enumerate(panels, 1):
         axis = figure.add_subplot(math.ceil(len(panels) / 2), 2, place)
         axis.set(ylabel=unit, xlabel="episodes")

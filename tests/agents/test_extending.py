@@ -13,7 +13,7 @@ import pytest
 
 import agents
 import trap_tube_jax as tt
-from agents import make_train
+from agents import make_train, train
 from agents.files import read_json
 from agents.train import main
 from paths import ROOT
@@ -93,6 +93,17 @@ def test_the_pages_curiosity_pays_for_a_moved_tool(here):
     trajectory = trajectory._replace(episodes=trajectory.episodes._replace(cells=cells))
     reward, _ = jax.jit(learner.intrinsic_reward)(start, trajectory)
     np.testing.assert_array_equal(np.argwhere(reward), [[4, 2]])
+
+
+def test_devices_and_processes_are_ready_before_a_module_starts_jax(here, capsys, monkeypatch):
+    ready = []
+    monkeypatch.setattr(
+        train, "become_devices", lambda count: ready.append((count, "my_module" in sys.modules))
+    )
+    monkeypatch.setattr(train.processes, "join", ready.append)
+    arguments = ["--import", "my_module", "--env", "nowhere"]
+    refused(capsys, main, *arguments, "--devices", "2", "--distributed", "a:1", "2", "0")
+    assert ready == [(2, False), ("a:1", "2", "0")]
 
 
 def test_modules_that_cannot_be_imported_are_named(here, capsys):

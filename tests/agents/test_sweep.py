@@ -88,6 +88,7 @@ def test_a_signal_stops_all_runs_and_a_second_one_at_once(monkeypatch, tmp_path,
         (["--settings", "clip_eps"], "NAME=VALUE,VALUE, got 'clip_eps'"),
         (["--settings", "clip_eps="], "NAME=VALUE,VALUE, got 'clip_eps='"),
         (["--settings", "clip_eps=1", "clip_eps=2"], "give a setting only once"),
+        (["--settings", "clip_eps=1", "--settings", "clip_eps=2"], "give a setting only once"),
         (["--settings", "clp_eps=1,2"], "did you mean 'clip_eps'"),
         (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
         (["--settings", "max_transitions=5"], "max_transitions must allow an iteration"),
@@ -107,6 +108,20 @@ def test_impossible_sweeps_are_refused_and_leave_nothing(
     out = tmp_path / "out"
     assert words in refused(capsys, sweep.main, *arguments, "--out", out)
     assert not out.exists()
+
+
+def test_modules_are_imported_after_other_devices_are_left_to_the_runs(monkeypatch):
+    order = []
+
+    def parse_all(*_):
+        order.append("modules")
+        raise ValueError
+
+    monkeypatch.setattr(sweep.jax.config, "update", lambda name, _: order.append(name))
+    monkeypatch.setattr(sweep, "parse_all", parse_all)
+    with pytest.raises(SystemExit):
+        sweep.main([])
+    assert order == ["jax_platforms", "modules"]
 
 
 def test_a_grid_that_is_being_written_is_refused(capsys, tmp_path):

@@ -12,11 +12,14 @@ import agents
 from agents import evaluate
 from agents.config import PRESETS, Config
 from agents.files import read_json
+from agents.runs import session
 from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.loading import save
 from agents.runs.provenance import commit
 from agents.train import main, parse, run_path
 from refusal import refused
 from small_runs import final_state, options, read_iterations, run, start, untimed
+from tiny_policy import random_policy
 
 ITERATIONS = 30
 
@@ -184,6 +187,25 @@ def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
     assert folder.config.read_bytes() == settings
 
 
+def test_a_stop_before_the_first_file_promises_nothing(capsys, monkeypatch, tmp_path):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(session, "make_train", stop)
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--out", str(tmp_path), "--name", "x"])
+    assert exit_info.value.code == 130
+    assert capsys.readouterr().out == f"Stopped. {tmp_path / 'x'} holds no run to continue.\n"
+
+
+def test_an_unknown_training_set_is_refused_before_anything_is_played(capsys, tmp_path):
+    save(tmp_path / "x.safetensors", random_policy(env_id="Own-v0"))
+    arguments = [tmp_path / "x.safetensors", "--sets", "base", "--output", tmp_path / "x.csv"]
+    message = refused(capsys, evaluate.main, *arguments, "--gif", tmp_path / "x.gif")
+    assert "unknown task set 'Own-v0'" in message
+    assert not (tmp_path / "x.csv").exists()
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_options_take_precedence_over_every_preset(preset):
     arguments = f"--preset {preset} --env psy --seed 3 --hidden 32 --curiosity none"
@@ -224,3 +246,4 @@ def test_help_documents_every_setting(capsys, monkeypatch):
     for field in dataclasses.fields(Config):
         assert f"--{field.name.replace('_', '-')}" in text
     assert "global norm of clipped gradients" in text
+    assert "(fast, best or paper)" in text

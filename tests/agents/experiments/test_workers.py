@@ -42,6 +42,14 @@ def test_a_run_is_logged_next_to_its_folder(tmp_path, monkeypatch, raises, outco
     assert workers.train_logged(*arguments) == "stopped"
 
 
+def test_devices_are_split_before_modules_are_imported(tmp_path, monkeypatch):
+    order = []
+    for name in ("become_devices", "import_modules", "train_run"):
+        monkeypatch.setattr(workers, name, lambda *_, name=name, **__: order.append(name))
+    workers.train_logged(tmp_path / "a", Run(Config()), RunOptions(devices=2), tmp_path / ".stop")
+    assert order == ["become_devices", "import_modules", "train_run"]
+
+
 def test_dask_is_an_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(ImportError, match=r"pip install 'trap-tube-jax\[cluster\]'"):

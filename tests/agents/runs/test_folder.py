@@ -30,7 +30,7 @@ def test_a_run_is_the_same_after_json():
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
         *(
             (check_name, {"name": name}, ["a folder's name without a path", repr(name)])
-            for name in ("", ".", "..", "a/b", ".hidden")
+            for name in ("", ".", "..", "a/b", ".hidden", "a\nb", "\udcff")
         ),
     ],
 )

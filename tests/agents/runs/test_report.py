@@ -102,7 +102,7 @@ def test_curves_of_a_run_that_solves_nothing_say_so(tmp_path):
     heights = []
     for share in (0.0, 0.5):
         rows = pd.DataFrame([row(i, success=share, evaluation=share) for i in (1, 2)])
-        report.save_curves(rows, tmp_path / "x.png", "x")
+        report.save_curves(rows, tmp_path / "x.png", "no formula: $^$")
         with Image.open(tmp_path / "x.png") as picture:
             heights.append(picture.height)
     assert heights[0] == heights[1]
