@@ -24,7 +24,6 @@ from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
-from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
 
 
@@ -41,11 +40,6 @@ class Options(harness.Options):
     preset: str = "paper"
     sets: tuple[str, ...] = ("base", "pstsy")
     warm: int = 0
-
-    def check(self) -> None:
-        """Checks the options; see `harness.Options.check`."""
-        check_integer("warm", self.warm, minimum=0)
-        super().check()
 
 
 @dataclasses.dataclass(frozen=True)

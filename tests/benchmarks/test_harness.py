@@ -64,7 +64,6 @@ def test_recorded_commands_can_be_given():
         (env_throughput, ("--num-steps", "0"), "num_steps must be an integer >= 1, got 0"),
         (env_throughput, ("--num-envs", "4", "0"), "num_envs must be an integer >= 1, got 0"),
         (peers, ("--num-envs", "3", "--devices", "2"), "num_envs must be multiples of devices=2"),
-        (train_throughput, ("--warm", "-1"), "warm must be an integer >= 0, got -1"),
         (train_throughput, ("--preset", "typo"), "unknown preset 'typo'; allowed: paper, "),
         (learner_peers, ("--minibatch-size", "5"), "minibatch_size must divide "),
         *((module, ("--output", "x"), "a record needs committed code") for module in MODULES),
