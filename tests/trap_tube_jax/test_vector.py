@@ -74,6 +74,15 @@ def test_equals_the_plain_reference_in_every_bit(env, chunk_size, impl):
     assert_same(fast, plain)
 
 
+@pytest.mark.parametrize(("backend", "size"), [("cpu", 32), ("gpu", 64)])
+def test_chunks_are_large_on_other_devices_than_a_cpu(backend, size, monkeypatch):
+    vector = tt.VectorEnvironment(tt.make("base"))
+    state, _ = jax.eval_shape(vector.reset, jax.random.split(jax.random.key(0), 2048))
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    program = str(jax.make_jaxpr(vector.step)(state, jnp.zeros((2048, 2), jnp.int32)))
+    assert [f":key<fry>[{n}]" in program for n in (32, 64)] == [n == size for n in (32, 64)]
+
+
 @pytest.mark.parametrize("num_features", [2, 3, 9])
 def test_draws_what_observe_shows(num_features):
     env = tt.make("pstsy", num_features=num_features)
