@@ -31,10 +31,11 @@ class Conv(nn.Module):
         return convolve(x, kernel) + as_row(bias, x.ndim)
 
 
-def patches(x: jax.Array, size: int) -> jax.Array:
-    """Cuts f32[M, H, W, C] into all squares, f32[M, H - size + 1, W - size + 1, size² * C]."""
+def patches(x: jax.Array, size: int, stride: int = 1) -> jax.Array:
+    """Cuts [M, H, W, C] into squares, [M, H', W', size² * C] with H' = (H - size) // stride + 1."""
     height, width = (length - size + 1 for length in x.shape[1:3])
-    shifts = [x[:, i : i + height, j : j + width] for i in range(size) for j in range(size)]
+    starts = [(i, j) for i in range(size) for j in range(size)]
+    shifts = [x[:, i : i + height : stride, j : j + width : stride] for i, j in starts]
     return jnp.concatenate(shifts, axis=-1)
 
 

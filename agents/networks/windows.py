@@ -57,9 +57,8 @@ def encode_rows(
 
 def cut_into_windows(board: jax.Array) -> jax.Array:
     """Cuts boards [M, 12, 12, C] into 36 windows each, [36 * M, 4, 4, C], zeros beyond the edge."""
-    beyond = (0, WINDOW - 2)
-    padded = jnp.pad(board, ((0, 0), beyond, beyond, (0, 0)))
-    return patches(padded, WINDOW)[:, ::2, ::2].reshape(-1, WINDOW, WINDOW, board.shape[-1])
+    padded = jnp.pad(board, ((0, 0), (0, WINDOW - 2), (0, WINDOW - 2), (0, 0)))
+    return patches(padded, WINDOW, stride=2).reshape(-1, WINDOW, WINDOW, board.shape[-1])
 
 
 def encode_windows(
