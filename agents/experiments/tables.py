@@ -50,10 +50,10 @@ def tables(results: Frame, curves: Frame, about: Mapping[str, Any]) -> dict[str,
 
 
 def reported(results: Frame) -> Frame:
-    """Returns each seed's newest rows on test tasks, with their `percent` solved."""
+    """Returns each seed's newest rows on test tasks, once each, with their `percent` solved."""
     rows = results[results["purpose"] == "test"]
     newest = rows.groupby(["algorithm", "seed"], sort=False)["iteration"].transform("max")
-    rows = rows[rows["iteration"] == newest]
+    rows = rows[rows["iteration"] == newest].drop_duplicates(["algorithm", "seed", "task_set"])
     return rows.assign(percent=100 * rows["solved"] / rows["tasks"])
 
 

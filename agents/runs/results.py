@@ -51,7 +51,7 @@ def find_runs(paths: Paths) -> list[RunFolder]:
     """Returns the runs in folders, sorted by path; ValueError for a folder without."""
     found: list[RunFolder] = []
     for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
-        walk = os.walk(path)  # unlike `rglob`, passes over folders that a writer deletes
+        walk = os.walk(path, followlinks=True)  # unlike `rglob`, passes over deleted folders
         runs = sorted(Path(folder) for folder, _, files in walk if CONFIG_FILE in files)
         if not runs:
             raise ValueError(f"{path} holds no run")

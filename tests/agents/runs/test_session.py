@@ -93,13 +93,15 @@ def test_only_the_final_evaluation_plays_test_tasks(whole):
     assert [*chosen_by, ("base", "test"), ("p", "test")] == ASKED
 
 
-def test_results_are_a_tidy_table(whole):
+def test_results_are_a_tidy_table(whole, tmp_path):
     table = results(whole.parent)
     assert list(table["task_set"]) == ["base", "p"] * 4
     assert set(table["algorithm"]) == {"ppo+effects"}
     assert set(table["hidden"]) == {4}
     assert set(table["run"]) == {str(whole)}
     assert list(metrics([whole])["iteration"]) == list(range(1, ITERATIONS + 1))
+    (tmp_path / "link").symlink_to(whole)
+    assert len(results(tmp_path)) == len(table)
     with pytest.raises(ValueError, match="holds no run"):
         results(whole / "checkpoints")
 
