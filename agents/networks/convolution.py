@@ -4,6 +4,8 @@ On a CPU, matrix products are faster than XLA's convolutions, whose derivatives 
 equal those of Flax's convolutions up to rounding.
 """
 
+import functools
+import itertools
 from typing import Any
 
 import flax.linen as nn
@@ -51,13 +53,19 @@ def padded_patches(x: jax.Array, size: int, *, turned: bool = False) -> jax.Arra
 
 
 def add_patches(x: jax.Array, size: int) -> jax.Array:
-    """Transposes `padded_patches`.
+    """Transposes `padded_patches`, for an odd size.
 
     Every cell of f32[M, H, W, size² * C] holds its contributions to the cells around it, row by
     row; their sums are f32[M, H, W, C].
     """
-    cells = jax.ShapeDtypeStruct((*x.shape[:-1], x.shape[-1] // size**2), x.dtype)
-    return jax.linear_transpose(lambda y: padded_patches(y, size), cells)(x)[0]
+    # JAX transposes `split` to one concatenation, but slices to a sum of padded arrays.
+    parts, reach = jnp.split(x, size**2, axis=-1), range(-(size // 2), size // 2 + 1)
+    zero, still = jnp.zeros((), x.dtype), (0, 0, 0)
+    moved = [
+        jax.lax.pad(part, zero, [still, (down, -down, 0), (right, -right, 0), still])
+        for part, (down, right) in zip(parts, itertools.product(reach, reach), strict=True)
+    ]
+    return functools.reduce(jnp.add, moved)
 
 
 @jax.custom_vjp

@@ -29,15 +29,7 @@ from agents.runs.display import ProgressLine
 from agents.runs.folder import Run, RunFolder, RunOptions
 from agents.runs.loading import read_policy, save
 from agents.runs.loggers import open_loggers
-from agents.runs.metrics import (
-    Frame,
-    Row,
-    append_rows,
-    evaluation_rows,
-    is_last,
-    read_rows,
-    rewind_rows,
-)
+from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read_rows, rewind_rows
 from agents.runs.provenance import note_provenance
 from agents.runs.stopping import Stopped, stop_signals
 from trap_tube_jax.scoring.scores import Scores
@@ -250,7 +242,7 @@ def restore(
     return state, row
 
 
-def best_iteration(rows: Frame, own: str) -> int | None:
+def best_iteration(rows: Any, own: str) -> int | None:
     """Returns the first iteration with the highest mean fraction of validation tasks solved.
 
     None if no evaluation is among the rows. The mean is over task sets; base, a single task, counts
