@@ -14,6 +14,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from scipy import stats
 
 from agents.experiments import tables
 from paths import ROOT
@@ -182,6 +183,12 @@ def test_stated_results_are_those_of_the_records():
     rows[BEST].append(f"| mean | {cells(table.mean())} |")
     for name, own in percent_solved("exp2_curiosities").groupby("algorithm"):
         rows[CURIOSITIES].append(f"| `{name}` | {means(own.drop(columns='base'))} |")
+    on_p = percent_solved("exp2_curiosities")["p"]
+    effects, rnd = on_p["ppo+effects"], on_p["ppo+rnd"]
+    welch: Any = stats.ttest_ind(effects, rnd, equal_var=False)
+    more = effects.mean() - rnd.mean()
+    test = f"(Welch's t-test, p = {welch.pvalue:.2f})"
+    rows[CURIOSITIES].append(f"by {more:.1f} points on {{P}} {test}")
     for page, expected in rows.items():
         for row in expected:
             assert row in text_of(page), (page, row)
