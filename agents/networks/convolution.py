@@ -82,6 +82,7 @@ def _convolve_backward(residuals: Any, cotangent: jax.Array) -> tuple[jax.Array,
     x, kernel = residuals
     size, _, channels, features = kernel.shape
     turned = kernel[::-1, ::-1].swapaxes(2, 3)
+    cotangent = jax.lax.optimization_barrier(cotangent)  # else XLA computes it for every shift
     around = padded_patches(cotangent, size, turned=True)
     by_kernel = jnp.tensordot(x, around, axes=[(0, 1, 2)] * 2)
     by_kernel = by_kernel.reshape(channels, size, size, features).transpose(1, 2, 0, 3)
