@@ -59,9 +59,10 @@ def add_patches(x: jax.Array, size: int) -> jax.Array:
     row; their sums are f32[M, H, W, C].
     """
     # JAX transposes `split` to one concatenation, but slices to a sum of padded arrays.
+    zero, still = jnp.zeros((), x.dtype), (0, 0, 0)
     parts, reach = jnp.split(x, size**2, axis=-1), range(-(size // 2), size // 2 + 1)
     moved = [
-        jax.lax.pad(part, 0.0, [(0, 0, 0), (down, -down, 0), (right, -right, 0), (0, 0, 0)])
+        jax.lax.pad(part, zero, [still, (down, -down, 0), (right, -right, 0), still])
         for part, (down, right) in zip(parts, itertools.product(reach, reach), strict=True)
     ]
     return functools.reduce(jnp.add, moved)
