@@ -11,9 +11,10 @@ import pytest
 import spec_reference as spec
 import trap_tube_jax as tt
 from goodness_of_fit import assert_fits
+from paths import ROOT
 from refusal import assert_refused
 from samples import BOARDS, OUTLINES, Layout, draw, read_layouts, tally
-from trap_tube_jax.graded import points_between
+from trap_tube_jax.graded import near_layouts, points_between
 
 DRAWS = 2**15
 STRENGTHS = (0.3, 0.7)
@@ -101,6 +102,17 @@ def test_what_is_drawn_can_be_drawn_at_any_higher_strength():
         where = (drawn.outline, drawn.vertical, drawn.tool, drawn.agent)
         assert np.all(placements(strength)[where] > 0)
     np.testing.assert_allclose(placements(1.0), spec.placements())
+
+
+@pytest.mark.parametrize("strength", [0, 0.25, 0.5, 1])
+def test_the_page_states_how_many_outcomes_each_choice_has(strength):
+    tables = near_layouts(float(strength))
+    frames = np.unique(tables.layout[:, 0])
+    agents = np.concatenate([tables.num_agents[i, : tables.num_tools[i]] for i in frames])
+    counts = [tables.num_food[frames], tables.num_tools[frames], agents]
+    cells = ["–".join(map(str, sorted({own.min(), own.max()}))) for own in counts]
+    row = f"| {strength} | {len(tables.layout)} | {' | '.join(cells)} |"
+    assert row in (ROOT / "trap_tube_jax" / "graded.md").read_text(encoding="utf-8")
 
 
 def test_the_ends_are_the_base_task_and_the_papers_transfers():
