@@ -91,7 +91,8 @@ class AutoReset:
         """Starts the first episode. See `Environment.reset`."""
         reset_key, next_key = jax.random.split(threefry_key(key))
         inner, timestep = self.env.reset(reset_key)
-        first = auto_reset_timestep(timestep, timestep.observation, timestep.observation)
+        final = jnp.copy(timestep.observation)  # of its own memory, so both may be donated
+        first = auto_reset_timestep(timestep, timestep.observation, final)
         return AutoResetState(inner, next_key), first
 
     def step(

@@ -113,6 +113,11 @@ def test_episode_statistics_of_a_vector_count_each_environment():
     np.testing.assert_array_equal(state.last_return, [1, 0])
 
 
+def test_what_reset_returns_may_be_donated():
+    first = tt.EpisodeStatistics(tt.AutoReset(tt.make("base"))).reset(jax.random.key(0))
+    jax.jit(lambda pair: jax.tree.map(jnp.copy, pair), donate_argnums=0)(first)
+
+
 @pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
 def test_auto_reset_refuses_what_resets_itself_or_counts(wrapper):
     env = wrapper(tt.Environment())
