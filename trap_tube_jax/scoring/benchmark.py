@@ -18,7 +18,7 @@ from trap_tube_jax.checks import check_integer, check_seed, described, integer_a
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
-from trap_tube_jax.registry import TaskSet, task_set
+from trap_tube_jax.registry import TaskSet, make, task_set
 from trap_tube_jax.scoring.scores import Optimality, Score, Scores
 from trap_tube_jax.scoring.tasks import (
     ALL_SETS,
@@ -177,8 +177,10 @@ def _scores(
     if isinstance(sets, str) or not sets:
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
     check_integer("optimality", optimality, minimum=0)
-    made = []
-    for entry in [task_set(name) for name in sets]:
+    made, entries = [], [task_set(name) for name in sets]
+    for entry in entries:
+        make(entry.short, num_features=num_features)  # refuses, before anything is played
+    for entry in entries:
         states = evaluation_tasks(entry.short, tasks, num_features)
         solved, length = play(entry, states)
         shortest = solve_batch(take(states, slice(optimality))).length if optimality else None
@@ -230,6 +232,11 @@ def _play(
         step_key = jax.random.fold_in(key, now.time)
         batch = len(now.observation)
         action, carry = _pair(policy.act(now.observation, now.carry, step_key), batch)
+        expected, got = (jax.tree.structure(each) for each in (now.carry, carry))
+        if got != expected:
+            raise ValueError(
+                f"the policy's act must return a carry like that of initial, {expected}, got {got}"
+            )
         states, timestep = jax.vmap(env.step)(now.states, action)
         in_range = jnp.all((action >= 0) & (action < NUM_DIRECTIONS), axis=-1)
         return _Episodes(

@@ -253,7 +253,8 @@ def test_an_agent_may_keep_a_state(near):
 def test_refusals(near):
     words = ["num_features=5", "has 3"]
     assert_refused(words, tt.score, Rightward(), ["near"], num_features=5)
-    assert_refused(words, tt.score_gymnasium, Single(RIGHT), ["near"], num_features=5)
+    played: Any = None  # no action, so playing base first would fail in other words
+    assert_refused(words, tt.score_gymnasium, Single(played), ["base", "near"], num_features=5)
     assert_refused(["initial(batch)", "object has no initial"], tt.score, object())
     assert_refused(["predict(observation)", "neither"], tt.score_gymnasium, object())
     for sets, options, words in (
@@ -311,6 +312,9 @@ def test_act_must_return_a_carry(near, tasks):
     policy: Any = Random()
     policy.act = lambda observation, carry, key: jnp.zeros((len(observation), 2), int)
     words = ["act must return a pair (actions i32[B, 2], carry)", "got "]
+    assert_refused(words, tt.score, policy, ["near"], tasks)
+    policy.act = lambda observation, carry, key: (jnp.zeros((len(observation), 2), int), (0, 0))
+    words = ["act must return a carry like that of initial", "got PyTreeDef((*, *))"]
     assert_refused(words, tt.score, policy, ["near"], tasks)
 
 
