@@ -108,7 +108,7 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
     """
     check_state(state)
     cell_size = check_integer("cell_size", cell_size)
-    if isinstance(actions, list) and not actions:
+    if isinstance(actions, list | tuple) and not actions:
         actions = np.zeros((0, 2), np.int32)
     actions = np.atleast_1d(integer_array("action", actions))
     is_padding = (actions == NO_DIRECTION).all(axis=-1, keepdims=True)
@@ -125,7 +125,7 @@ def save_gif(
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1. Pictures of at most
         256 colours are stored exactly.
       path: the file to write.
-      fps: frames per second, 1 to 50.
+      fps: frames per second, 1 to 50; a frame lasts whole hundredths of a second.
       hold: seconds by which the last frame stays longer, 0 to 100.
 
     Raises:

@@ -61,9 +61,9 @@ class VectorEnvironment:
 
     Attributes:
       env: an environment without auto-reset, not a subclass: the batch would bypass its methods.
-      chunk_size: environments that start over at a time, at least 1; by default 32 on a CPU and a
-        32nd of the batch on other devices. Small chunks waste less when few episodes end
-        together; large ones occupy a GPU.
+      chunk_size: environments that start over at a time, at least 1; by default 32 on a CPU, and
+        the larger of 32 and a 32nd of the batch on other devices. Small chunks waste less when few
+        episodes end together; large ones occupy a GPU.
 
     Raises:
       ValueError: naming the argument, its value and what is allowed.

@@ -131,7 +131,7 @@ def test_episode_frames_show_every_state_and_grasp_and_padding_moves_nothing():
     np.testing.assert_array_equal(frames[1], tt.render(moved, 8, grasp=0))
     after = moved.replace(agent=moved.agent.at[1].add(1), tool=moved.tool.at[1].add(1))
     np.testing.assert_array_equal(frames[2], tt.render(after, 8))
-    assert len(rendering.episode_frames(state, [], 8)) == 1
+    assert len(rendering.episode_frames(state, (), 8)) == 1
     padding = rendering.episode_frames(state, [[-1, -1]] * 2, 8)
     np.testing.assert_array_equal(padding, np.stack([tt.render(state, 8)] * 3))
 
