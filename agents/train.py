@@ -59,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def start_devices(arguments: Sequence[str] | None) -> None:
     """Splits the CPU and joins the other processes, before modules of --import start JAX."""
     options, how = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
-    become_devices(how.devices)
+    stored = None if options.resume is None else RunFolder(options.resume).devices()
+    become_devices(how.devices or stored)
     processes.join(options.distributed)
 
 
@@ -87,7 +88,6 @@ def train(options: Options, run: Run, how: RunOptions) -> None:
     if options.resume is None:
         folder.check_free()
         processes.agree(None)  # no process writes before all have checked
-    become_devices(how.devices)  # of a stored run
     console = Console(quiet=jax.process_index() > 0, highlight=False)
     compilation.enable_cache()
     try:

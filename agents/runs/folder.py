@@ -161,6 +161,11 @@ class RunFolder:
         values = {**run.to_dict(), "options": dataclasses.asdict(options or RunOptions())}
         write_json(self.config, {"version": __version__, **values})
 
+    def devices(self) -> int | None:
+        """Returns the stored option; unlike `read`, needs no modules."""
+        values = read_json(self.config) if self.config.is_file() else {}
+        return values.get("options", {}).get("devices")
+
     def read(self, imports: tuple[str, ...] = ()) -> tuple[Run, RunOptions]:
         """Returns the stored run and its options.
 
