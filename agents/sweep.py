@@ -63,9 +63,9 @@ def launch(
     """
     stop_file = next(iter(runs)).parent.absolute() / ".stop"
 
-    def ask() -> None:
+    def ask(text: str) -> None:
         stop_file.touch()
-        console.out("Finishing the current iterations; Ctrl-C again stops now.")
+        console.out(text)
 
     stop_file.unlink(missing_ok=True)
     calls: dict[Future, Path] = {}

@@ -48,7 +48,8 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
     solving = read_rows(folder.metrics).query("evaluation >= @threshold")["episodes"]
     if len(solving):
         share = "" if threshold == 1 else f"{100 * threshold:g} % of "
-        lines.append(f"First solved {share}{own.label} after {solving.min():,} episodes.")
+        more = "; --stop-when-solved 0 trains on" if config.stop_when_solved else ""
+        lines.append(f"First solved {share}{own.label} after {solving.min():,} episodes{more}.")
     if folder.page.exists():
         lines.append(f"Report with curves and episodes to step through: {folder.page}")
     has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init

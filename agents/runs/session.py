@@ -5,7 +5,7 @@ saving, then evaluation. No thread runs JAX in the background.
 """
 
 import dataclasses
-import functools
+import importlib
 import tempfile
 import time
 from collections.abc import Callable
@@ -32,6 +32,7 @@ from agents.runs.loggers import open_loggers
 from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read_rows, rewind_rows
 from agents.runs.provenance import note_provenance
 from agents.runs.stopping import Stopped, stop_signals
+from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
@@ -68,6 +69,10 @@ def train_run(
     """
     options, console = options or RunOptions(), console or Console(quiet=True)
     stored = RunFolder(path)
+    with needs_extra("logging"):  # before anything is compiled or written
+        for name in ("tensorboard", "wandb"):
+            if getattr(options, name):
+                importlib.import_module(name)
     if stored.config.is_file():
         run.check_continues(stored.read()[0])
     is_first = jax.process_index() == 0
@@ -137,11 +142,8 @@ class Session:
         advance = self.placement.shard(make_advance(self.learner))
         advance = jax.jit(advance, donate_argnums=0).lower(self.state).compile()
         chosen = {"tensorboard": self.options.tensorboard, "wandb": self.options.wandb}
-        asked = functools.partial(
-            self.console.out, "Finishing this iteration; Ctrl-C again stops now."
-        )
         with (
-            stop_signals(asked, self.stop_file) as request,
+            stop_signals(self.console.out, self.stop_file) as request,
             open_loggers(self.folder.path, self.run, **chosen) as log,
             ProgressLine(self.console, config.iterations) as progress,
         ):

@@ -27,7 +27,7 @@ def exit_code(stopped: Stopped | KeyboardInterrupt) -> int:
 
 @contextlib.contextmanager
 def stop_signals(
-    on_request: Callable[[], None], file: Path | None = None
+    say: Callable[[str], None], file: Path | None = None
 ) -> Iterator[Callable[[], int | None]]:
     """Turns the first Ctrl-C or SIGTERM into a request and the second into KeyboardInterrupt.
 
@@ -40,7 +40,7 @@ def stop_signals(
         if received:
             raise KeyboardInterrupt
         received.append(number)
-        on_request()
+        say("Finishing the current iterations; Ctrl-C again stops now.")
 
     def request() -> int | None:
         asked = file is not None and file.exists()

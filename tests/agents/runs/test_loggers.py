@@ -1,14 +1,24 @@
 """Metrics in TensorBoard and Weights & Biases, by their own readers."""
 
+import sys
+
 import pytest
 
 from agents.runs.folder import Run, RunOptions
 from agents.runs.session import train_run
 from small_runs import small_config
 
-pytestmark = pytest.mark.interop
+
+@pytest.mark.parametrize("options", [RunOptions(tensorboard=True), RunOptions(wandb=True)])
+def test_a_missing_library_is_named_before_anything_is_written(options, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ImportError, match="logging"):
+        train_run(tmp_path / "run", Run(small_config()), options)
+    assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.interop
 def test_tensorboard_gets_the_metrics(tmp_path):
     reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     options = RunOptions(tensorboard=True, report=False)
@@ -21,14 +31,12 @@ def test_tensorboard_gets_the_metrics(tmp_path):
         assert event.tensor_proto.float_val[0] == pytest.approx(float(row["loss"]))
 
 
+@pytest.mark.interop
 def test_wandb_logs_offline(tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    train_run(
-        tmp_path / "run",
-        Run(small_config(iterations=2)),
-        RunOptions(wandb=True, report=False),
-    )
+    options = RunOptions(wandb=True, report=False)
+    train_run(tmp_path / "run", Run(small_config(iterations=2)), options)
     (log,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
     assert b"intrinsic_reward" in log.read_bytes()

@@ -215,18 +215,6 @@ def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monke
     assert final_state(tmp_path / "x")[0] == 2
 
 
-def test_settings_changed_on_disk_are_noticed(copy):
-    RunFolder(copy).note(small_run(seed=3), TRACKED)
-    with pytest.raises(ValueError, match="the run has seed=3, not 0"):
-        train_run(copy, small_run(iterations=9), TRACKED)
-
-
-def test_metrics_deleted_between_stop_and_resume_cost_the_curve_alone(copy):
-    (copy / "metrics.csv").unlink()
-    train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
-    assert [row["iteration"] for row in untimed(copy)] == [str(ITERATIONS + 1)]
-
-
 def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch):
     def full(*args, **kwargs):
         raise OSError("cannot write checkpoint 2: no space")
