@@ -66,8 +66,8 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     iterate = jax.jit(learner.iterate)
     for _ in range(warm):
         state, _ = iterate(state)
-    reset_key, action_key = jax.random.split(state.key)
-    reset_keys = jax.random.split(reset_key, config.episodes_per_iteration)
+    reset_key, action_key, *_ = jax.random.split(state.key, 4)  # as `Learner.iterate` does
+    reset_keys = learner.draw_tasks(state.task_replay, reset_key)
 
     def play(state: TrainState) -> Trajectory:
         return learner.play(state.params, reset_keys, action_key)
@@ -128,7 +128,7 @@ def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax
 
 
 def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batch) -> jax.Array:
-    """Returns the sum of squares of everything that the loss terms are computed from."""
+    """Returns the sum of squares of what all loss terms but motion's are computed from."""
     agent, curiosity, episodes = learner.agent, learner.curiosity, part.episodes
     embedding, following = agent.unroll(params, features, episodes.action, episodes.reward)
     actions = agent.embed_action(params, episodes.action)
