@@ -36,7 +36,7 @@ def collect(root: Path, command: str) -> None:
         "command": command,
         "train_set": train_sets[0].short if len(train_sets) == 1 else "training set",
         "threshold": max(own["stop_when_solved"] or 1.0 for own in configs),
-        "settings": {k: v for k, v in first.items() if all(own[k] == v for own in configs)},
+        "settings": {k: v for k, v in first.items() if all(own.get(k) == v for own in configs)},
         "machines": [each for place, each in enumerate(machines) if each not in machines[:place]],
     }
     write_json(root / "grid.json", about)

@@ -141,15 +141,10 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--discount 2", "discount must be a finite number from 0 to 1, got 2"),
         ("--max-gradient-norm inf", "max_gradient_norm must be a finite number"),
         ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),
-        ("--epochs 2147483648", "epochs must be an integer from 1 to 10,000, got 2147483648"),
         ("--seed -1", "seed must be an integer >= 0 and <= 2147483647, got -1"),
-        (
-            "--max-transitions 5",
-            "max_transitions must allow an iteration, which takes up to 12,800",
-        ),
+        ("--max-transitions 5", "must allow an iteration, which takes up to 12,800"),
         ("--name a/b", "name must be a folder's name without a path, got 'a/b'"),
         ("--resume no/such", "no/such holds no run; runs in no: none"),
-        ("--resume x --name y", "leave out --name and --preset"),
         ("--resume x --preset best", "leave out --name and --preset"),
         ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
@@ -213,12 +208,7 @@ def test_options_take_precedence_over_every_preset(preset):
     own = {"env_id": "PerceptualSymbolicTrapTube-v0", "hidden": 32, "curiosity": "none"}
     assert wanted == Run(Config.preset(preset, **own), 3)
     assert run_path(found, wanted).name == f"{preset}-psy-3"
-
-
-def test_the_default_is_the_preset_fast():
-    found, wanted, *_ = parse([])
-    assert wanted == Run(Config.preset("fast"))
-    assert str(run_path(found, wanted)) == "runs/fast-base-0"
+    assert str(run_path(*parse([])[:2])) == "runs/fast-base-0"
 
 
 def test_resumed_runs_keep_their_settings_and_options(tmp_path):

@@ -296,7 +296,6 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
     ({"base": EASY.replace(time=np.int32(3))}, ["time 3", "allowed: time 0"]),
     ({"transfers": None}, ["transfers", "(key, state) -> state", "None"]),
     ({"transfers": tt.symbolic}, ["transfers", "sequence", "symbolic"]),
-    ({"transfers": "TrapTube-v0"}, ["transfers", "sequence", "'TrapTube-v0'"]),
     ({"transfers": ("symbolic",)}, ["(key, state) -> state", "'symbolic'"]),
     ({"transfers": (no_state,)}, ["no_state", "invalid", "State", "NoneType"]),
     ({"transfers": (broken(time=np.int32(3)),)}, ["transfer must keep time 0", "got time 3"]),

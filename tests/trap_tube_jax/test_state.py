@@ -114,7 +114,6 @@ BAD_ARRAYS = [
     ({"food": (0, 2**40)}, ["food", str(2**40), "allowed"]),
     ({"tool": (9, 1)}, ["tool", "(9, 1)", "(4, 1)", "0 to 11"]),
     ({"tool": (-1, 1)}, ["tool", "(-1, 1)", "0 to 11"]),
-    ({"tool": (2**31 - 1, 1)}, ["tool", str(2**31 - 1), "0 to 11"]),
     ({"tool_extent": (2, 2)}, ["tool_extent", "(2, 2)", "1 to 4"]),
     ({"tool_extent": (1, 5)}, ["tool_extent", "(1, 5)", "1 to 4"]),
     ({"tool_extent": (0, 1)}, ["tool_extent", "(0, 1)", "1 to 4"]),
@@ -144,7 +143,6 @@ BAD_PICTURES: list[tuple[Any, dict[str, Any], list[str]]] = [
     ({8: ".T.........."}, {}, ["(5, 1)", "1 to 4"]),
     ([row.replace("T", ".") for row in PICTURE], {}, ["tool 'T'", "tool=", "tool_extent="]),
     ({}, {"tool": (0, 0)}, ["tool and tool_extent", "together"]),
-    ({}, {"tool_extent": (1, 1)}, ["tool and tool_extent", "together"]),
     ({}, {"tool": (0, 0), "tool_extent": (1, 1)}, ["tool", "(0, 0)", "(4, 1)", "one of the two"]),
     ({}, {"agent": (0, 0)}, ["agent", "(0, 0)", "(9, 1)", "one of the two"]),
     ({}, {"palette": [1, 2, 3]}, ["palette", "[8, N]", "[3]"]),
@@ -167,7 +165,6 @@ BAD_FIELDS: list[tuple[dict[str, Any], list[str]]] = [
     ({"food": (5, 5)}, ["state.food", "array", "tuple"]),
     ({"palette": np.zeros(8, np.uint8)}, ["state.palette", "uint8[8, N]", "[8]"]),
     ({"terminated": np.array(True)}, ["terminated", "unfinished"]),
-    ({"truncated": np.array(True)}, ["truncated", "unfinished"]),
     ({"tool": np.array((11, 11), np.int32)}, ["tool", "(11, 11)", "0 to 11"]),
     ({"food": np.array((5, 4), np.int32)}, ["food", "(5, 4)", "trap"]),
 ]
