@@ -27,8 +27,9 @@ for folder in ("trap_tube_jax", "agents", "benchmarks", "tests"):
 NAMES = sorted(str(page.relative_to(ROOT)) for page in PAGES)
 PROTOCOL = "trap_tube_jax/protocol.md"
 RESULTS = ROOT / "benchmarks" / "results"
-BEST, CURIOSITIES, TABLE_2 = (
-    f"benchmarks/results/{name}.md" for name in ("best_preset", "curiosities", "table_2")
+BEST, CURIOSITIES, PAPER, TABLE_2 = (
+    f"benchmarks/results/{name}.md"
+    for name in ("best_preset", "curiosities", "paper_preset", "table_2")
 )
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -158,7 +159,7 @@ def means(percent: Any) -> str:
 def test_stated_results_are_those_of_the_records():
     """Each number of a table of solved tasks that has a record."""
     best, fast = (percent_solved(name) for name in ("exp2_best", "fast_base"))
-    rows = {"README.md": [], PROTOCOL: [], BEST: [], CURIOSITIES: [], TABLE_2: []}
+    rows = {"README.md": [], PROTOCOL: [], BEST: [], CURIOSITIES: [], PAPER: [], TABLE_2: []}
     rows["README.md"].append(f"| preset `best` | {means(best[list(ALL_SETS[1:])])} |")
     for name, (paper, _) in tables.PAPER_SUCCESS.items():
         rows[PROTOCOL].append(f"{cells(paper)} | ≤ 25,600,000 |")
@@ -183,6 +184,10 @@ def test_stated_results_are_those_of_the_records():
     rows[BEST].append(f"| mean | {cells(table.mean())} |")
     for name, own in percent_solved("exp2_curiosities").groupby("algorithm"):
         rows[CURIOSITIES].append(f"| `{name}` | {means(own.drop(columns='base'))} |")
+    solved = rows_of("exp1", "curves").query("evaluation == 1")
+    first = solved.pivot_table("episodes", "seed", "algorithm", "min").reindex(range(5))
+    for seed, (ppo, icm) in first.map("{:,.0f}".format).replace("nan", "–").iterrows():
+        rows[PAPER].append(f"| {seed} | {icm} | {ppo} |")
     on_p = percent_solved("exp2_curiosities")["p"]
     effects, rnd = on_p["ppo+effects"], on_p["ppo+rnd"]
     welch: Any = stats.ttest_ind(effects, rnd, equal_var=False)

@@ -141,7 +141,6 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--discount 2", "discount must be a finite number from 0 to 1, got 2"),
         ("--max-gradient-norm inf", "max_gradient_norm must be a finite number"),
         ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),
-        ("--seed -1", "seed must be an integer >= 0 and <= 2147483647, got -1"),
         ("--max-transitions 5", "must allow an iteration, which takes up to 12,800"),
         ("--name a/b", "name must be a folder's name without a path, got 'a/b'"),
         ("--resume no/such", "no/such holds no run; runs in no: none"),
