@@ -58,8 +58,8 @@ def add_patches(x: jax.Array, size: int) -> jax.Array:
     Every cell of f32[M, H, W, size² * C] holds its contributions to the cells around it, row by
     row; their sums are f32[M, H, W, C].
     """
-    # JAX transposes `split` to one concatenation, but slices to a sum of padded arrays.
     zero, still = jnp.zeros((), x.dtype), (0, 0, 0)
+    # JAX transposes `split` to one concatenation, but slices to a sum of padded arrays.
     parts, reach = jnp.split(x, size**2, axis=-1), range(-(size // 2), size // 2 + 1)
     moved = [
         jax.lax.pad(part, zero, [still, (down, -down, 0), (right, -right, 0), still])

@@ -69,15 +69,15 @@ def train_run(
     """
     options, console = options or RunOptions(), console or Console(quiet=True)
     stored = RunFolder(path)
-    with needs_extra("logging"):  # before anything is compiled or written
-        for name in ("tensorboard", "wandb"):
-            if getattr(options, name):
-                importlib.import_module(name)
     if stored.config.is_file():
         run.check_continues(stored.read()[0])
     is_first = jax.process_index() == 0
     if not is_first:  # only the first process's files are kept
         options = dataclasses.replace(options, report=False, tensorboard=False, wandb=False)
+    with needs_extra("logging"):  # before anything is compiled or written
+        for name in ("tensorboard", "wandb"):
+            if getattr(options, name):
+                importlib.import_module(name)
     with stored.lock() if is_first else tempfile.TemporaryDirectory() as copy:
         folder = stored if copy is None else RunFolder(Path(copy))
         session = Session(run, options, console, stored, folder, stop_file)

@@ -102,11 +102,12 @@ def test_devices_and_processes_are_ready_before_a_module_starts_jax(here, capsys
         train, "become_devices", lambda count: ready.append((count, "my_module" in sys.modules))
     )
     monkeypatch.setattr(train.processes, "join", ready.append)
+    arguments = "--import my_module --env nowhere --devices 2 --distributed a:1 2 0"
+    refused(capsys, main, *arguments.split())
+    sys.modules.pop("my_module")
     RunFolder(here / "x").note(Run(small_config()), RunOptions(devices=2))
     refused(capsys, main, "--import", "my_module", "--resume", here / "x", "--hidden", "8")
-    arguments = ["--env", "nowhere", "--devices", "2", "--distributed", "a:1", "2", "0"]
-    refused(capsys, main, *arguments)
-    assert ready == [(2, False), None, (2, True), ("a:1", "2", "0")]
+    assert ready == [(2, False), ("a:1", "2", "0"), (2, False), None]
 
 
 def test_modules_that_cannot_be_imported_are_named(here, capsys):

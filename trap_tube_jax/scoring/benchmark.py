@@ -23,7 +23,7 @@ from trap_tube_jax.scoring.scores import Optimality, Score, Scores
 from trap_tube_jax.scoring.tasks import (
     ALL_SETS,
     PROTOCOL,
-    evaluation_tasks,
+    fixed_tasks,
     label,
     layout_numbers,
 )
@@ -178,10 +178,10 @@ def _scores(
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
     check_integer("optimality", optimality, minimum=0)
     made, entries = [], [task_set(name) for name in sets]
-    for entry in entries:
-        make(entry.short, num_features=num_features)  # refuses, before anything is played
-    for entry in entries:
-        states = evaluation_tasks(entry.short, tasks, num_features)
+    # All before the first is played, so that a wrong one costs nothing.
+    envs = [make(entry.short, num_features=num_features) for entry in entries]
+    for entry, env in zip(entries, envs, strict=True):
+        states = fixed_tasks(env, entry.id, tasks)
         solved, length = play(entry, states)
         shortest = solve_batch(take(states, slice(optimality))).length if optimality else None
         made.append(score_of(entry.short, states, solved, length, entry.max_steps, shortest))

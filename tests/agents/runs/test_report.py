@@ -158,4 +158,5 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
 def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
     run, folder = Run(small_config(stop_when_solved=0.995)), RunFolder(tmp_path)
     append_rows(folder.metrics, [row(1, evaluation=0.996)])
-    assert display.summary(folder, run)[0].startswith("First solved 99.5 % of base after 8 ep")
+    solved = "First solved 99.5 % of base after 8 episodes; --stop-when-solved 0 trains on."
+    assert display.summary(folder, run)[0] == solved

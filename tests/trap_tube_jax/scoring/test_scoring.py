@@ -251,10 +251,9 @@ def test_an_agent_may_keep_a_state(near):
 
 
 def test_refusals(near):
-    words = ["num_features=5", "has 3"]
+    words = ["num_features=5", "has 3"]  # before base, which an agent without action cannot play
     assert_refused(words, tt.score, Rightward(), ["near"], num_features=5)
-    played: Any = None  # no action, so playing base first would fail in other words
-    assert_refused(words, tt.score_gymnasium, Single(played), ["base", "near"], num_features=5)
+    assert_refused(words, tt.score_gymnasium, Single(None), ["base", "near"], num_features=5)
     assert_refused(["initial(batch)", "object has no initial"], tt.score, object())
     assert_refused(["predict(observation)", "neither"], tt.score_gymnasium, object())
     for sets, options, words in (
