@@ -13,12 +13,12 @@ import numpy as np
 from agents import registry
 from trap_tube_jax.registry import task_set
 
-LARGEST = 2**31 - 1  # the largest i32, in which training counts
+MAX_INT32 = 2**31 - 1  # the largest i32, in which training counts
 GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
 
 def _setting(
-    group: str, default: Any, low: float | None = None, high: float = LARGEST, **metadata: Any
+    group: str, default: Any, low: float | None = None, high: float = MAX_INT32, **metadata: Any
 ) -> Any:
     """Declares a field of `Config`: its group, default and, for numbers, inclusive limits."""
     limits = None if low is None else (low, high)
@@ -222,7 +222,7 @@ class Config:
         return self.epochs * (self.episodes_per_iteration // self.minibatch_size)
 
 
-PAYS_FOR_EFFECTS = {
+EFFECTS_DEFAULTS = {
     "epochs": 4,
     "discount": 0.98,
     "bootstrap": "value",
@@ -235,7 +235,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     # Solves the base task within a minute.
     "fast": {
-        **PAYS_FOR_EFFECTS,
+        **EFFECTS_DEFAULTS,
         "iterations": 100,
         "stop_when_solved": 1.0,
         "episodes_per_iteration": 256,
@@ -246,7 +246,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     # Learns {P, St, Sy}: encodes objects, replays failed tasks, predicts motion, avoids repeats.
     "best": {
-        **PAYS_FOR_EFFECTS,
+        **EFFECTS_DEFAULTS,
         "env_id": "pstsy",
         "iterations": 1150,
         "max_transitions": 25_600_000,
@@ -286,7 +286,7 @@ def _check_value(field: dataclasses.Field, value: Any) -> None:
         low, high = field.metadata["limits"]
         is_whole = "int" in str(kind)
         wanted = f"{'an integer' if is_whole else 'a finite number'} from {low:,}"
-        wanted += f" to {high:,}" if high < LARGEST else ""
+        wanted += f" to {high:,}" if high < MAX_INT32 else ""
         numbers, valid = (value,), True
         if get_origin(kind) is tuple:
             length = 2 if field.name == "filters" else None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from agents.command_line import option, parse
 from agents.files import write_json
-from agents.profiles import figures
+from agents.profiles import plots
 from agents.profiles.measure import failure_table, profile, success_table
 from agents.profiles.tasks import PARTS, STRENGTHS
 from agents.runs import compilation
@@ -59,10 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = profile(policies, options.parts, options.strengths, options.tasks)
     found.to_csv(options.output / "profile.csv", index=False, float_format="%.6g")
     write_json(options.output / "provenance.json", origin)
-    if set(options.parts) & set(figures.PANELS):
-        figures.save_success(found, options.output / "success.png")
+    if set(options.parts) & set(plots.PANELS):
+        plots.save_success(found, options.output / "success.png")
     if "control" in options.parts:
-        figures.save_controls(found, options.output / "controls.png")
+        plots.save_controls(found, options.output / "controls.png")
     print(f"Tasks solved, %\n\n{success_table(found).to_string()}\n")
     print(f"Failed episodes, by last subgoal reached\n\n{failure_table(found).to_string()}\n")
     print(f"results: {options.output}")

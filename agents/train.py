@@ -11,9 +11,10 @@ import trap_tube_jax as tt
 from agents.command_line import option, parse_all
 from agents.config import Config
 from agents.parallel import processes
-from agents.parallel.devices import become_devices
+from agents.parallel.devices import split_cpu
 from agents.runs import compilation, display
-from agents.runs.folder import DeviceOptions, Run, RunFolder, RunOptions, check_name
+from agents.runs.folder import RunFolder, check_name
+from agents.runs.run import DeviceOptions, Run, RunOptions
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped, exit_code
 from trap_tube_jax.command_line import plain_errors
@@ -58,9 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def start_devices(arguments: Sequence[str] | None) -> None:
     """Splits the CPU and joins the other processes, before modules of --import start JAX."""
-    options, how = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
+    options, run_options = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
     stored = None if options.resume is None else RunFolder(options.resume).devices()
-    become_devices(how.devices or stored)
+    split_cpu(run_options.devices or stored)
     processes.join(options.distributed)
 
 
@@ -68,37 +69,39 @@ def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     """Reads a command line and, with --resume, the stored run."""
     # The preset, or the stored run, decides the defaults of all other options.
     (first,) = parse_all([Options], arguments, PROGRAM, partly=True)
-    defaults, run, how = Options(), Run(Config.preset(first.preset)), RunOptions()
+    defaults, run, run_options = Options(), Run(Config.preset(first.preset)), RunOptions()
     if first.resume is not None:
         if (first.name, first.preset) != (defaults.name, defaults.preset):
             raise ValueError("--resume continues a run as it is; leave out --name and --preset")
-        run, how = RunFolder(first.resume).read(first.imports)
+        run, run_options = RunFolder(first.resume).read(first.imports)
         defaults = Options(seed=run.seed)
-    options, config, how = parse_all([defaults, run.config, how], arguments, PROGRAM)
+    options, config, run_options = parse_all(
+        [defaults, run.config, run_options], arguments, PROGRAM
+    )
     imports = tuple(dict.fromkeys((*run.imports, *options.imports)))
     given = {"config": config, "seed": options.seed, "imports": imports}
     if first.resume is None:
         given["algorithm"] = ""  # named after the settings given
-    return options, dataclasses.replace(run, **given), how
+    return options, dataclasses.replace(run, **given), run_options
 
 
-def train(options: Options, run: Run, how: RunOptions) -> None:
+def train(options: Options, run: Run, run_options: RunOptions) -> None:
     """Trains a run, or continues it, and prints its results, or how to continue if it stops."""
     folder = RunFolder(run_path(options, run))
     if options.resume is None:
         folder.check_free()
-        processes.agree(None)  # no process writes before all have checked
+        processes.max_over_processes(None)  # no process writes before all have checked
     console = Console(quiet=jax.process_index() > 0, highlight=False)
     compilation.enable_cache()
     try:
-        scores = train_run(folder.path, run, how, console=console)
+        scores = train_run(folder.path, run, run_options, console=console)
     except (Stopped, KeyboardInterrupt) as stopped:
-        console.out(f"Stopped. {display.how_to_go_on(folder, run)}")
+        console.out(f"Stopped. {display.resume_hint(folder, run)}")
         raise SystemExit(exit_code(stopped)) from None
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OSError(f"{error}. {display.how_to_go_on(folder, run)}") from error
+        raise OSError(f"{error}. {display.resume_hint(folder, run)}") from error
     for line in ([scores] if scores else []) + display.summary(folder, run):
         console.out(line)
 

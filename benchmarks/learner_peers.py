@@ -24,7 +24,7 @@ from rich.table import Table
 
 import agents.networks
 import trap_tube_jax as tt
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.command_line import parse
 from agents.examples import plain_ppo
 from benchmarks import harness
@@ -138,7 +138,7 @@ class Speed:
 
 def our_program(config: Config) -> Program:
     """Compiles an iteration of `agents.ppo`."""
-    learner = make_train(config)
+    learner = make_learner(config)
 
     def iterate(state: Any) -> tuple[Any, jax.Array]:
         after, _ = learner.iterate(state)

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 import trap_tube_jax as tt
-from agents.experiments import figures, tables
+from agents.sweeps import figures, tables
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import Episodes, take
 from agents.acting.rollout import Trajectory
@@ -61,7 +61,7 @@ class Part:
 
 def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
     """Measures the iteration and its parts after `warm` iterations of training."""
-    learner = make_train(config)
+    learner = make_learner(config)
     state = jax.jit(learner.init)(jax.random.key(0))
     iterate = jax.jit(learner.iterate)
     for _ in range(warm):

@@ -13,24 +13,24 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import trap_tube_jax as tt
 from agents.arrays import key_data, to_arrays
-from agents.parallel.devices import EPISODES, ONE_DEVICE, Placement, become_devices
-from agents.ppo.learner import make_train
+from agents.parallel.devices import EPISODES, ONE_DEVICE, Placement, split_cpu
+from agents.ppo.learner import make_learner
 from small_runs import small_config
 
 SIZES = {"episodes_per_iteration": 16, "minibatch_size": 8, "epochs": 2, "replay_capacity": 5}
 CONFIG = small_config(**SIZES, replay_fractions=(0.25, 0.25))
 
 
-def make_learner(axis=ONE_DEVICE):
+def small_learner(axis=ONE_DEVICE):
     """A learner on a board that random actions solve soon."""
     base = tt.State.from_ascii(["TA.F........", *["." * 12] * 11])
-    return make_train(CONFIG, tt.Environment(base=base, max_steps=6), axis)
+    return make_learner(CONFIG, tt.Environment(base=base, max_steps=6), axis)
 
 
 def train(iterations):
     """Trains on two devices; returns the final state where it is, all metrics and the placement."""
     placement = Placement.of(2, CONFIG)
-    learner = make_learner(placement.axis)
+    learner = small_learner(placement.axis)
     state, rows = placement.put(jax.jit(learner.init)(jax.random.key(0))), []
     iterate = jax.jit(placement.shard(learner.iterate), donate_argnums=0)
     for _ in range(iterations):
@@ -45,7 +45,7 @@ def train_seeds():
     This is the program of agents/parallel/README.md. Returns arrays [2, ...] of the first and of
     the second time, in the same order of seeds, and the number of devices.
     """
-    learner = make_learner()
+    learner = small_learner()
     mesh = jax.make_mesh((2,), ("seeds",), axis_types=(AxisType.Auto,))
     init = jax.jit(jax.vmap(learner.init))
     iterate = jax.jit(jax.vmap(learner.iterate), donate_argnums=0)
@@ -72,7 +72,7 @@ def unequal_copies(state):
 
 def gradient_gap():
     """The largest relative difference between the gradient of a batch and that of two halves."""
-    learner = make_learner()
+    learner = small_learner()
     state = jax.jit(learner.init)(jax.random.key(1))
 
     @jax.jit
@@ -126,10 +126,10 @@ def shape(x):
 
 
 def main():
-    become_devices(2)
+    split_cpu(2)
     shared, rows, placement = train(3)
     state = placement.local(shared)
-    learner = make_learner()
+    learner = small_learner()
     alone, metrics = jax.eval_shape(
         learner.iterate, jax.eval_shape(learner.init, jax.random.key(0))
     )

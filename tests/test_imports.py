@@ -35,8 +35,9 @@ AGENTS = (
     ("ppo",),
     ("pretrained", "runs"),
     ("train",),
-    ("experiments", "profiles", "sweep"),
-    ("evaluate", "examples", "profile"),
+    ("profiles", "sweeps"),
+    ("sweep",),
+    ("evaluate", "examples", "experiments", "profile"),
 )
 PACKAGES = ("trap_tube_jax", "agents", "benchmarks")  # a package never imports a later one
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())

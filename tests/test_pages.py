@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from agents.experiments import tables
+from agents.sweeps import tables
 from paths import ROOT
 from settings import HAS_DEFAULT_DRAWS
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
@@ -183,7 +183,7 @@ def test_stated_results_are_those_of_the_records():
     rows[BEST].append(f"| mean | {cells(table.mean())} |")
     for name, own in percent_solved("exp2_curiosities").groupby("algorithm"):
         rows[CURIOSITIES].append(f"| `{name}` | {means(own.drop(columns='base'))} |")
-    solved = rows_of("exp1", "curves").query("evaluation == 1")
+    solved = rows_of("exp1", "curves").query("validation_success == 1")
     first = solved.pivot_table("episodes", "seed", "algorithm", "min").reindex(range(5))
     for seed, (ppo, icm) in first.map("{:,.0f}".format).replace("nan", "–").iterrows():
         rows[PAPER].append(f"| {seed} | {icm} | {ppo} |")

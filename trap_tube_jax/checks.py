@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-LARGEST_SEED = 2**32 - 1  # `jax.random.key` keeps the low 32 bits only
-MOST_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
+MAX_SEED = 2**32 - 1  # `jax.random.key` keeps the low 32 bits only
+MAX_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
 
 
 def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None = None) -> int:
@@ -64,7 +64,7 @@ def check_seed(seed: Any) -> int:
     Raises:
       ValueError: naming the seed and the bounds.
     """
-    return check_integer("seed", seed, 0, LARGEST_SEED)
+    return check_integer("seed", seed, 0, MAX_SEED)
 
 
 def check_own_state(state: Any, kind: type) -> None:

@@ -41,7 +41,7 @@ from trap_tube_jax.transfers import (
     transfer_name,
 )
 
-LARGEST_TIME = 2**31 - 1  # `State.time` is an i32
+MAX_TIME = 2**31 - 1  # `State.time` is an i32
 
 _PAPER_TRANSFERS = (perceptual, structural, symbolic)  # known to be valid, so never tried
 
@@ -97,7 +97,7 @@ class Environment(ByValue):
                 f"transfers must be a sequence of functions (key, state) -> state, "
                 f"got {transfers!r}"
             )
-        self.max_steps = check_integer("max_steps", max_steps, maximum=LARGEST_TIME)
+        self.max_steps = check_integer("max_steps", max_steps, maximum=MAX_TIME)
         self.transfers = tuple(transfers)
         own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code

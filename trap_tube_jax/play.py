@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
-from trap_tube_jax.checks import LARGEST_SEED, check_seed
+from trap_tube_jax.checks import MAX_SEED, check_seed
 from trap_tube_jax.command_line import add_import_option, plain_errors
 from trap_tube_jax.dynamics import holds_tool
 from trap_tube_jax.environment import Environment
@@ -100,7 +100,7 @@ def press(game: Game, key: str) -> Game:
     if key in GRASP_KEYS:
         return dataclasses.replace(game, grasp=GRASP_KEYS[key], message="")
     if key in NEXT_TASK_KEYS:
-        seed = (game.seed + NEXT_TASK_KEYS[key]) % (LARGEST_SEED + 1)
+        seed = (game.seed + NEXT_TASK_KEYS[key]) % (MAX_SEED + 1)
         return _deal(game.env, game.name, seed)
     if key not in MOVE_KEYS and key != HINT_KEY:
         return game

@@ -1,7 +1,7 @@
 """Several devices for one run, which share the episodes of every iteration; see README.md.
 
 placement = Placement.of(2, config)
-learner = make_train(config, axis=placement.axis)
+learner = make_learner(config, axis=placement.axis)
 iterate = jax.jit(placement.shard(learner.iterate), donate_argnums=0)
 state, metrics = iterate(placement.put(state))
 """
@@ -22,7 +22,7 @@ Tree = TypeVar("Tree")
 EPISODES = "episodes"  # the axis of the mesh
 
 
-def become_devices(devices: int | None) -> None:
+def split_cpu(devices: int | None) -> None:
     """Splits the CPU into devices, unless JAX_NUM_CPU_DEVICES does; call it before JAX starts."""
     if devices is not None and devices > 1 and jax.config.values["jax_num_cpu_devices"] < 0:
         with contextlib.suppress(RuntimeError):  # JAX has started: `Placement.of` says what it has

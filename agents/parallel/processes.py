@@ -32,7 +32,7 @@ def join(distributed: Sequence[str] | None) -> None:
         ) from error
 
 
-def agree(number: int | None) -> int | None:
+def max_over_processes(number: int | None) -> int | None:
     """Returns the maximum over processes, None if all pass None or 0; each process must call it."""
     if jax.process_count() == 1:
         return number

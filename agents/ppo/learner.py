@@ -19,7 +19,7 @@ import optax
 from agents.acting.encodings import encode_episodes
 from agents.acting.episodes import Episodes, take
 from agents.acting.rollout import Trajectory, rollout
-from agents.config import LARGEST, Config
+from agents.config import MAX_INT32, Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
 from agents.networks.layers import init_module
@@ -304,7 +304,7 @@ class Learner:
         return metrics
 
 
-def make_train(
+def make_learner(
     config: Config, env: Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
     """Builds the learner of some settings.
@@ -340,10 +340,10 @@ def make_train(
             f"None; got {config.max_transitions:,}"
         )
     steps = config.iterations * longest
-    if min(steps, config.max_transitions or steps) > LARGEST:
+    if min(steps, config.max_transitions or steps) > MAX_INT32:
         raise ValueError(
             f"iterations={config.iterations} of {config.episodes_per_iteration} episodes of "
-            f"{env.max_steps} steps are {steps:,} steps; allowed: at most {LARGEST:,}"
+            f"{env.max_steps} steps are {steps:,} steps; allowed: at most {MAX_INT32:,}"
         )
     curiosity = curiosities.factory(config.curiosity)(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))

@@ -6,8 +6,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import trap_tube_jax as tt
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import RunFolder
 from agents.runs.metrics import Row, read_rows
+from agents.runs.run import Run
 
 
 class ProgressLine(Progress):
@@ -32,7 +33,8 @@ class ProgressLine(Progress):
         """Shows an iteration, given its row of metrics."""
         text = (
             f"{row['episodes']:,} episodes, {row['success']:.1%} solved, "
-            f"{row['evaluation']:.1%} greedily, {row['transitions_per_second']:,.0f} steps/s"
+            f"{row['validation_success']:.1%} greedily, "
+            f"{row['transitions_per_second']:,.0f} steps/s"
         )
         done = row["iteration"]
         if self.console.is_terminal:
@@ -45,7 +47,7 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
     """Returns the facts that a run ends with, one a line."""
     own, config, lines = tt.task_set(run.config.env_id), run.config, []
     threshold = config.stop_when_solved or 1.0
-    solving = read_rows(folder.metrics).query("evaluation >= @threshold")["episodes"]
+    solving = read_rows(folder.metrics).query("validation_success >= @threshold")["episodes"]
     if len(solving):
         share = "" if threshold == 1 else f"{100 * threshold:g} % of "
         more = "; --stop-when-solved 0 trains on" if config.stop_when_solved else ""
@@ -61,7 +63,7 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
     return lines
 
 
-def how_to_go_on(folder: RunFolder, run: Run) -> str:
+def resume_hint(folder: RunFolder, run: Run) -> str:
     """Says how an interrupted run goes on."""
     if not folder.config.is_file():
         return f"{folder.path} holds no run to continue."

@@ -1,121 +1,18 @@
-"""The folder of one run: its files, its settings and options in `config.json`, and its lock."""
+"""The folder of one run: its files and its lock."""
 
 import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
 
 import filelock
 
-from agents.command_line import option
-from agents.config import Config
 from agents.files import read_json, write_json
+from agents.runs.run import Run, RunOptions
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import MOST_TASKS, check_integer
 from trap_tube_jax.imports import import_modules
-from trap_tube_jax.registry import task_set
 
 CONFIG_FILE = "config.json"
-MAX_SEED = 2**31 - 1
-# Settings that may change when a run is resumed: they decide only where it ends.
-EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """One training run; together with the code it determines the result.
-
-    Attributes:
-      config: the settings.
-      seed: seed of all draws.
-      algorithm: name in tables; `ppo+<curiosity>` if empty.
-      imports: modules that registered names of the settings. They are recorded, and imported
-        again only at the caller's request.
-    """
-
-    config: Config
-    seed: int = 0
-    algorithm: str = ""
-    imports: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Completes task set and algorithm; ValueError names an unknown set or a wrong seed."""
-        check_integer("seed", self.seed, 0, MAX_SEED)
-        env_id = task_set(self.config.env_id).id
-        object.__setattr__(self, "config", dataclasses.replace(self.config, env_id=env_id))
-        if not self.algorithm:
-            curiosity = self.config.curiosity
-            name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"
-            object.__setattr__(self, "algorithm", name)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, for JSON."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Any) -> Self:
-        """Inverts `to_dict`; ValueError names a setting that is unknown or not allowed."""
-        config = Config.from_dict(values["config"])
-        return cls(**{**values, "config": config, "imports": tuple(values["imports"])})
-
-    def check_continues(self, before: "Run") -> None:
-        """Raises ValueError unless resuming `before` trains as this run alone would have."""
-        old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
-        scheduled = old["lr_decay_fraction"] > 0 or old["intrinsic_coef_init"] > 0
-        free = {*EXTENDABLE, "config", "imports"} - ({"iterations"} if scheduled else set())
-        for name, value in old.items():
-            if name not in free and new[name] != value:
-                reason = "schedules span this number; " if name == "iterations" else ""
-                raise ValueError(
-                    f"the run has {name}={value}, not {new[name]}; {reason}"
-                    f"only {', '.join(sorted(free & set(EXTENDABLE)))} may change in a run; train "
-                    "with other settings under another --name"
-                )
-
-
-@dataclasses.dataclass(frozen=True)
-class DeviceOptions:
-    """Options that take effect before JAX starts.
-
-    Attributes:
-      devices: devices that share the run, by default one, or all if distributed.
-    """
-
-    devices: int | None = option(None, "devices and hosts")
-
-
-@dataclasses.dataclass(frozen=True)
-class RunOptions(DeviceOptions):
-    """Options for carrying out a run; on one device, none of them changes what it learns.
-
-    Attributes:
-      checkpoint_every: iterations between checkpoints.
-      evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation
-        selects the parameters that the run reports.
-      sets: sets to evaluate on, by default the paper's eight and the training set.
-      reported: test tasks per set in the final evaluation, by default `eval_episodes`.
-      report: writes curves, page and GIF at the end.
-      tensorboard: logs metrics for TensorBoard.
-      wandb: logs metrics to Weights & Biases; offline with WANDB_MODE=offline.
-    """
-
-    checkpoint_every: int = option(10, "run")
-    evaluate_every: int = option(0, "run")
-    sets: tuple[str, ...] | None = option(None, "run")
-    reported: int | None = option(None, "run")
-    report: bool = option(True, "run")
-    tensorboard: bool = option(False, "run")
-    wandb: bool = option(False, "run")
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for a number that is too small or an unknown set."""
-        check_integer("checkpoint_every", self.checkpoint_every)
-        check_integer("evaluate_every", self.evaluate_every, minimum=0)
-        if self.reported is not None:
-            check_integer("reported", self.reported, maximum=MOST_TASKS)
-        for name in self.sets or ():
-            task_set(name)
 
 
 class RunFolder:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from agents.runs.folder import Run
 from agents.runs.metrics import Row
+from agents.runs.run import Run
 
 
 @contextlib.contextmanager

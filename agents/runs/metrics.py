@@ -14,7 +14,7 @@ from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import Purpose
 
 Row = Mapping[str, Any]
-NO_ROWS = "iteration,purpose,task_set,tasks,solved,evaluation,episodes\n"
+NO_ROWS = "iteration,purpose,task_set,tasks,solved,validation_success,episodes\n"
 Frame = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
 
 
@@ -77,7 +77,7 @@ def is_last(row: Row, config: Config) -> bool:
     """Returns whether training ends with the iteration of this row."""
     if row["iteration"] >= config.iterations:
         return True
-    if 0 < config.stop_when_solved <= row["evaluation"]:
+    if 0 < config.stop_when_solved <= row["validation_success"]:
         return True
     limit = config.max_transitions
     longest = config.episodes_per_iteration * config.step_limit(config.env_id)

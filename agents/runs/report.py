@@ -20,8 +20,9 @@ import numpy as np
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, Evaluator
 from agents.files import write_bytes
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import RunFolder
 from agents.runs.metrics import Frame, read_rows
+from agents.runs.run import Run
 from trap_tube_jax import solver
 from trap_tube_jax.objects import DIRECTION_NAMES, NO_DIRECTION
 from trap_tube_jax.rendering import episode_frames, save_gif
@@ -34,7 +35,7 @@ PAGE = Path(__file__).with_name("report.html")  # its $names are filled in
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00")  # colour-blind safe
 
 PANELS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    ("tasks solved", "fraction", ("success", "evaluation")),
+    ("tasks solved", "fraction", ("success", "validation_success")),
     ("episode length", "steps", ("episode_length",)),
     ("intrinsic reward", "mean per step, unscaled", ("intrinsic_reward",)),
     ("losses", "weighted", ("policy_loss", "value_loss", "forward_loss", "inverse_loss")),

@@ -23,14 +23,15 @@ from agents.arrays import from_arrays
 from agents.networks.agent import PARTS
 from agents.parallel import processes
 from agents.parallel.devices import Placement
-from agents.ppo.learner import Learner, TrainState, make_train
+from agents.ppo.learner import Learner, TrainState, make_learner
 from agents.runs import checkpoint, report
 from agents.runs.display import ProgressLine
-from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy, save
 from agents.runs.loggers import open_loggers
 from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read_rows, rewind_rows
 from agents.runs.provenance import note_provenance
+from agents.runs.run import Run, RunOptions
 from agents.runs.stopping import Stopped, stop_signals
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.scoring.scores import Scores
@@ -101,7 +102,7 @@ class Session:
         self.run, self.options, self.console = run, options, console
         self.stored, self.folder, self.stop_file = stored, folder, stop_file
         self.placement = Placement.of(options.devices, run.config)
-        self.learner = make_train(run.config, axis=self.placement.axis)
+        self.learner = make_learner(run.config, axis=self.placement.axis)
         self.sets = options.sets or own_and_paper_sets(run.config)
         key = jax.random.key(run.seed)
         shapes = jax.eval_shape(self.learner.init, key)
@@ -152,7 +153,7 @@ class Session:
                 log(row)
                 progress.show(row)
                 # A signal may reach any process: all have to agree on it.
-                number = processes.agree(request())
+                number = processes.max_over_processes(request())
                 due = self.iteration % self.options.checkpoint_every == 0
                 if due or number or self.done:
                     self._save()
@@ -170,7 +171,7 @@ class Session:
             self.console.out("Tested before; python -m agents.evaluate plays other sets and tasks.")
             return None
         self.console.out("Evaluating ...")
-        tasks = self.options.reported or self.run.config.eval_episodes
+        tasks = self.options.test_tasks or self.run.config.eval_episodes
         evaluator = Evaluator.of_sets(self.run.config, self.sets, tasks)
         played = evaluator(policy.params)
         scores = evaluator.scores(played)
@@ -193,7 +194,9 @@ class Session:
                 f"training diverged in iteration {iteration}: a loss or a gradient is not "
                 f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
             )
-        host["evaluation"] = host["evaluation"].mean()  # in float64, to compare with thresholds
+        host["validation_success"] = host[
+            "validation_success"
+        ].mean()  # in float64, to compare with thresholds
         self.last = {
             "iteration": iteration,
             **{name: host[name].item() for name in sorted(host)},
@@ -261,7 +264,7 @@ def best_iteration(rows: Any, own: str) -> int | None:
 def make_advance(learner: Learner) -> Advance:
     """Returns a function that trains for one iteration and plays the validation tasks greedily.
 
-    The metrics include `evaluation`, bool[B], whether each task is solved.
+    The metrics include `validation_success`, bool[B], whether each task is solved.
     """
     config = learner.config
     tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")
@@ -271,7 +274,7 @@ def make_advance(learner: Learner) -> Advance:
         outcome = evaluate(learner.agent, after.params, learner.env, tasks)
         return after, {
             **metrics,
-            "evaluation": outcome.solved,
+            "validation_success": outcome.solved,
             "episodes": after.iteration * config.episodes_per_iteration,
             "transitions": after.transitions,
             "steps": after.transitions - state.transitions,

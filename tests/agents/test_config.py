@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.config import PRESETS
 from refusal import assert_refused
 
@@ -18,7 +18,7 @@ def test_presets_survive_json_and_train_without_curiosity_and_in_an_environment_
     assert Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
     own = tt.make("sy", max_steps=9)
     for each in (config, Config.preset(name, curiosity="none")):
-        assert make_train(each, own).env is own
+        assert make_learner(each, own).env is own
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_numpy_scalars_are_those_of_python():
 def test_the_limit_of_steps_allows_an_iteration():
     config = Config(env_id="Unknown-v0", max_transitions=51_199)  # a policy's, without its set
     words = ["takes up to 51,200 steps, or be None; got 51,199"]
-    assert_refused(words, make_train, config, tt.make("base"))
+    assert_refused(words, make_learner, config, tt.make("base"))
 
 
 def test_unknown_preset_lists_the_known():
@@ -79,7 +79,7 @@ def test_unknown_preset_lists_the_known():
 def test_the_sets_own_limit_holds_unless_the_settings_give_one(own_task_sets):
     tt.register("Short-v0", (), max_steps=30)
     config = Config(env_id="Short-v0")
-    assert make_train(config).env.max_steps == config.step_limit("Short-v0") == 30
+    assert make_learner(config).env.max_steps == config.step_limit("Short-v0") == 30
     assert config.step_limit("p") == 50
     longer = Config(env_id="Short-v0", max_steps=60)
-    assert make_train(longer).env.max_steps == longer.step_limit("p") == 60
+    assert make_learner(longer).env.max_steps == longer.step_limit("p") == 60

@@ -13,9 +13,10 @@ import pytest
 
 import agents
 import trap_tube_jax as tt
-from agents import make_train, train
+from agents import make_learner, train
 from agents.files import read_json
-from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.folder import RunFolder
+from agents.runs.run import Run, RunOptions
 from agents.train import main
 from paths import ROOT
 from refusal import assert_refused, refused
@@ -82,7 +83,7 @@ def test_the_pages_other_commands_run(here):
 
 def test_the_pages_curiosity_pays_for_a_moved_tool(here):
     import_modules(["my_module"])
-    learner = make_train(
+    learner = make_learner(
         small_config(env_id="cold", curiosity="tool-moved", encoder="flat", max_steps=None)
     )
     assert learner.env.max_steps == 30
@@ -99,7 +100,7 @@ def test_the_pages_curiosity_pays_for_a_moved_tool(here):
 def test_devices_and_processes_are_ready_before_a_module_starts_jax(here, capsys, monkeypatch):
     ready = []
     monkeypatch.setattr(
-        train, "become_devices", lambda count: ready.append((count, "my_module" in sys.modules))
+        train, "split_cpu", lambda count: ready.append((count, "my_module" in sys.modules))
     )
     monkeypatch.setattr(train.processes, "join", ready.append)
     arguments = "--import my_module --env nowhere --devices 2 --distributed a:1 2 0"

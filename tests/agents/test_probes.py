@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import probes
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.acting.rollout import Trajectory, rollout
 from agents.networks.core import Core
 
@@ -56,7 +56,7 @@ def learn() -> Learner:
 
 def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajectory]:
     env = probes.Probe(kind)
-    train = make_train(CONFIG, env)
+    train = make_learner(CONFIG, env)
     init_key, reset_key = jax.random.split(key)
     state, _ = jax.lax.scan(
         lambda state, _: train.iterate(state), train.init(init_key), length=ITERATIONS

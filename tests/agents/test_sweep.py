@@ -13,12 +13,13 @@ import pytest
 from rich.console import Console
 
 import small_runs
-from agents import sweep
+from agents import experiments, sweep
 from agents.config import Config
-from agents.experiments import __main__ as experiments
-from agents.experiments import workers
-from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.folder import RunFolder
+from agents.runs.run import Run, RunOptions
 from agents.runs.stopping import Stopped
+from agents.sweeps import workers
+from agents.sweeps.launcher import launch
 from paths import ROOT
 from refusal import refused
 
@@ -29,13 +30,13 @@ SETTINGS = [
 NEAR_FOOD = ["--import", "agents.examples.near_food", "--env", "near-food", "--sets", "near-food"]
 
 
-def launch(monkeypatch, tmp_path, train_run, names=("a", "b", "c")):
+def launch_three(monkeypatch, tmp_path, train_run, names=("a", "b", "c")):
     """Launches runs in a thread; returns the failed ones' names and what was printed."""
     monkeypatch.setattr(workers, "train_run", train_run)
     console = Console(record=True, width=60)
     runs = {tmp_path / name: Run(Config()) for name in names}
     with ThreadPoolExecutor(1) as executor:
-        failed = sweep.launch(runs, RunOptions(), executor, console)
+        failed = launch(runs, RunOptions(), executor, console)
     return [path.name for path in failed], console.export_text()
 
 
@@ -46,7 +47,7 @@ def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
             raise ValueError("no such luck")
 
     names = ("a", "b[red]", "c")
-    failed, shown = launch(monkeypatch, tmp_path, train_run, names)
+    failed, shown = launch_three(monkeypatch, tmp_path, train_run, names)
     assert failed == ["b[red]"]
     failure = f"b[red]: failed: no such luck; see {tmp_path / 'b[red].log'}"
     for words in ("a: done", failure, "[3/3] c: done"):
@@ -57,7 +58,7 @@ def test_workers_may_run_in_another_folder(monkeypatch, tmp_path):
     found = []
     monkeypatch.chdir(tmp_path)
     train_run = lambda path, *_, stop_file, **__: found.append((path, stop_file))  # noqa: E731
-    launch(monkeypatch, Path(), train_run, "a")
+    launch_three(monkeypatch, Path(), train_run, "a")
     assert found == [(tmp_path / "a", tmp_path / ".stop")]
 
 
@@ -75,10 +76,10 @@ def test_a_signal_stops_all_runs_and_a_second_one_at_once(monkeypatch, tmp_path,
         raise Stopped(signal.SIGTERM)
 
     with pytest.raises(Stopped if signals == 1 else KeyboardInterrupt):
-        launch(monkeypatch, tmp_path, train_run)
+        launch_three(monkeypatch, tmp_path, train_run)
     assert begun == ["a"]
     assert (tmp_path / ".stop").exists() == (signals == 2), "else a late process would train"
-    launch(monkeypatch, tmp_path, lambda path, *_, **__: begun.append(path.name))
+    launch_three(monkeypatch, tmp_path, lambda path, *_, **__: begun.append(path.name))
     assert begun == ["a", "a", "b", "c"]
 
 
@@ -140,7 +141,7 @@ def test_named_grids_are_known_and_their_points_are_fixed(capsys):
 def test_a_grid_from_its_command_to_its_table(capsys, tmp_path):
     root = tmp_path / "x"
     command = ["--processes", "1", "--out", str(tmp_path), "--name", "x", "--no-report"]
-    command += ["--sets", "base", "p", "--evaluate-every", "1", "--reported", "3"]
+    command += ["--sets", "base", "p", "--evaluate-every", "1", "--test-tasks", "3"]
     command += ["--settings", *SETTINGS, "iterations=2", "max_transitions=null,1000000"]
     command += ["--only", "max_transitions=null"]
 

@@ -13,9 +13,10 @@ from agents import evaluate
 from agents.config import PRESETS, Config
 from agents.files import read_json
 from agents.runs import session
-from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.folder import RunFolder
 from agents.runs.loading import save
 from agents.runs.provenance import commit
+from agents.runs.run import Run, RunOptions
 from agents.train import main, parse, run_path
 from refusal import refused
 from small_runs import final_state, options, read_iterations, run, start, untimed
@@ -185,7 +186,7 @@ def test_a_stop_before_the_first_file_promises_nothing(capsys, monkeypatch, tmp_
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "make_train", stop)
+    monkeypatch.setattr(session, "make_learner", stop)
     with pytest.raises(SystemExit) as exit_info:
         main(["--out", str(tmp_path), "--name", "x"])
     assert exit_info.value.code == 130
@@ -212,16 +213,16 @@ def test_options_take_precedence_over_every_preset(preset):
 
 def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     stored = Run(Config.preset("paper", hidden=32), 5, "mine", ("json",))
-    how = RunOptions(reported=7, sets=("p", "st"))
+    how = RunOptions(test_tasks=7, sets=("p", "st"))
     RunFolder(tmp_path / "x").note(stored, how)
     arguments = ["--resume", str(tmp_path / "x")]
     found, *wanted = parse(arguments)
     assert wanted == [stored, how]
     assert run_path(found, stored) == tmp_path / "x"
-    _, *wanted = parse([*arguments, "--iterations", "999", "--reported", "2"])
+    _, *wanted = parse([*arguments, "--iterations", "999", "--test-tasks", "2"])
     expected = dataclasses.replace(stored.config, iterations=999)
     run = dataclasses.replace(stored, config=expected)
-    assert wanted == [run, dataclasses.replace(how, reported=2)]
+    assert wanted == [run, dataclasses.replace(how, test_tasks=2)]
 
 
 def test_help_documents_every_setting(capsys, monkeypatch):

@@ -21,7 +21,7 @@ import numpy as np
 from flax import struct
 from jax.core import Tracer
 
-from trap_tube_jax.environment import LARGEST_TIME, Environment, action_from_index
+from trap_tube_jax.environment import MAX_TIME, Environment, action_from_index
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import MAX_STEPS, NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
@@ -82,7 +82,7 @@ class _TrapTube(environment.Environment):
             self._name = repr(task_set)
         self._default_max_steps = task_set.max_steps
         self._env = copy.copy(task_set)
-        self._env.max_steps = LARGEST_TIME  # the limit in the parameters replaces it
+        self._env.max_steps = MAX_TIME  # the limit in the parameters replaces it
         self.flat_actions = flat_actions
 
     @property

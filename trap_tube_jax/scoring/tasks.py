@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.checks import MOST_TASKS, check_integer
+from trap_tube_jax.checks import MAX_TASKS, check_integer
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
 from trap_tube_jax.state import State
@@ -65,7 +65,7 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     Raises:
       ValueError: `num_tasks` is not from 1 to 1,000,000, or `purpose` is unknown.
     """
-    check_integer("the number of evaluation tasks", num_tasks, maximum=MOST_TASKS)
+    check_integer("the number of evaluation tasks", num_tasks, maximum=MAX_TASKS)
     count = num_tasks if env.transfers else 1
     # Transfers are compiled one by one: the sets share them, so eight sets take three
     # compilations, and a transfer has the same bits in each.

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from trap_tube_jax.checks import MOST_TASKS, check_integer, check_seed
+from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
 from trap_tube_jax.command_line import add_import_option, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.objects import DIRECTION_NAMES
@@ -68,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
 def _survey(options: argparse.Namespace) -> None:
     from trap_tube_jax.solver.pictures import save_histogram  # noqa: PLC0415  matplotlib is slow
 
-    tasks = check_integer("tasks", options.tasks, maximum=MOST_TASKS)
+    tasks = check_integer("tasks", options.tasks, maximum=MAX_TASKS)
     keys = jax.random.split(jax.random.key(check_seed(options.seed)), tasks)
     lengths = {}
     for entry in [task_set(name) for name in options.sets]:

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from agents import make_train
+from agents import make_learner
 from agents.acting.encodings import encode_episodes
 from agents.ppo import learner
 from small_runs import small_config
@@ -12,7 +12,7 @@ from small_runs import small_config
 
 @pytest.mark.parametrize("curiosity", ["icm", "none", pytest.param("rnd", marks=pytest.mark.slow)])
 def test_the_loss_and_its_gradient_are_those_of_the_plain_encoding(curiosity, monkeypatch):
-    train = make_train(small_config(env_id="psy", curiosity=curiosity))
+    train = make_learner(small_config(env_id="psy", curiosity=curiosity))
 
     def plain_encoding(encode_rows, params, episodes, *, chunk):
         del encode_rows, chunk

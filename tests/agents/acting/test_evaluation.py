@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.acting.evaluation import Evaluation, Evaluator, own_and_paper_sets
 from agents.ppo.learner import Learner
 from easy import assert_same
@@ -110,7 +110,7 @@ def test_keys_of_tasks_are_never_drawn_in_training(monkeypatch):
     config = Config.from_dict(
         {**CONFIG.to_dict(), "episodes_per_iteration": 4, "minibatch_size": 2}
     )
-    learner = make_train(config, env)
+    learner = make_learner(config, env)
     seen.clear()
     first_key = jax.jit(lambda key: learner.init(key).key)
     shapes = jax.eval_shape(learner.init, jax.random.key(0))._replace(key=None)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents import make_train
+from agents import make_learner
 from agents.acting.episodes import Episodes
 from agents.curiosity import Curiosity, Experience
 from agents.networks import make_encoder
@@ -110,7 +110,7 @@ def config_of_jax(request):
 @pytest.mark.parametrize("name", ["icm", "noveld", "effects"])
 def test_training_keeps_its_types_whatever_users_set(name, config_of_jax):
     """Nothing is computed, only traced."""
-    learner = make_train(small_config(curiosity=name, env_id="sy"))
+    learner = make_learner(small_config(curiosity=name, env_id="sy"))
     state = jax.eval_shape(learner.init, jax.random.key(0))
     after, metrics = jax.eval_shape(learner.iterate, state)
     assert after == state

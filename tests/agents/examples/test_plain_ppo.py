@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.examples import plain_ppo
 from agents.examples.near_food import NEAR_FOOD
 
@@ -58,7 +58,7 @@ def plain_params(params):
 
 
 def test_rewards_advantages_and_losses_are_those_of_the_learner():
-    learner, plain = make_train(CONFIG), plain_ppo.PlainPPO(CONFIG)
+    learner, plain = make_learner(CONFIG), plain_ppo.PlainPPO(CONFIG)
     state = jax.jit(learner.init)(jax.random.key(0))
 
     @jax.jit

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.acting.episodes import Episodes
 from agents.ppo import advantages
 from easy import assert_same
@@ -76,7 +76,7 @@ def test_two_streams_step_by_step():
 
 def test_without_curiosity_the_task_has_the_only_value():
     config = Config.preset("best", hidden=4, filters=(4, 4), curiosity="none")
-    params = jax.eval_shape(make_train(config).init, jax.random.key(0)).params
+    params = jax.eval_shape(make_learner(config).init, jax.random.key(0)).params
     assert params["heads"]["params"]["value"]["kernel"].shape == (4, 1)
     value = jax.random.normal(jax.random.key(2), (7, 8, 1))
     ones = jnp.ones((6, 8))

@@ -14,7 +14,7 @@ import optax
 import pytest
 
 import trap_tube_jax as tt
-from agents import Config, make_train
+from agents import Config, make_learner
 from agents.acting.episodes import Episodes
 from agents.acting.frames import Frame
 from agents.acting.rollout import Trajectory
@@ -86,7 +86,7 @@ def data(keys: jax.Array) -> list[tuple[int, ...]]:
 @pytest.fixture(scope="module")
 def scripted() -> tuple[Learner, TrainState, Any]:
     """A scripted learner, its first state, and its iteration, compiled; keys may be used again."""
-    scripted = Scripted(**vars(make_train(BEST)))
+    scripted = Scripted(**vars(make_learner(BEST)))
 
     def iterate(state):
         replay = state.task_replay._replace(keys=jax.random.clone(state.task_replay.keys))
@@ -96,7 +96,7 @@ def scripted() -> tuple[Learner, TrainState, Any]:
 
 
 def test_new_tasks_are_new_and_others_are_of_the_lists():
-    best = make_train(BEST)
+    best = make_learner(BEST)
     task_replay = best.init(jax.random.key(0)).task_replay
     drawn = data(best.draw_tasks(task_replay, jax.random.key(1)))
     once, twice = data(task_replay.keys[0]), data(task_replay.keys[1])
@@ -139,7 +139,7 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, c
 
 def test_episodes_are_played_facing_the_food():
     keys = jax.random.split(jax.random.key(1), 64)
-    best = make_train(BEST)
+    best = make_learner(BEST)
     params = jax.eval_shape(best.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
     played = jax.jit(best.play)(params, keys, jax.random.key(2))
@@ -171,7 +171,7 @@ class Counting(Learner):
 
 def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
     updates = BEST.gradient_steps
-    counting = Counting(**{**vars(make_train(BEST)), "optimizer": recorder(updates)})
+    counting = Counting(**{**vars(make_learner(BEST)), "optimizer": recorder(updates)})
     params = jnp.zeros(EPISODES)
     state = TrainState(params, counting.optimizer.init(params), *[None] * 6)  # pyright: ignore
     number: Any = jnp.arange(EPISODES)[None]
@@ -188,7 +188,7 @@ def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
 @pytest.mark.slow
 def test_seeds_side_by_side_are_those_alone():
     """With the cache of encodings and the loops of the real rollout; up to rounding."""
-    plain = make_train(dataclasses.replace(PLAIN, env_id="sy"))
+    plain = make_learner(dataclasses.replace(PLAIN, env_id="sy"))
     both = jax.vmap(plain.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))
     together, alone = jax.jit(jax.vmap(plain.iterate))(both), jax.jit(plain.iterate)
     for seed in range(2):
@@ -200,7 +200,7 @@ def test_seeds_side_by_side_are_those_alone():
 
 
 def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key():
-    best = make_train(dataclasses.replace(BEST, epochs=1))
+    best = make_learner(dataclasses.replace(BEST, epochs=1))
     state = jax.jit(best.init)(jax.random.key(0))
     assert state.params["heads"]["params"]["value"]["kernel"].shape == (4, 2)
     iterate = jax.jit(best.iterate)
@@ -242,7 +242,7 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     """By parameters of 0: all actions and motions are as likely, and all values 0."""
     weights = {"value_coef": 0.5, "entropy_coef": 0.1, "motion_coef": 0.25, "curiosity_coef": 3.0}
     two_heads = {"curiosity": "effects", "value_heads": "separate", "bootstrap": "value"}
-    made = make_train(Config(**{**SETTINGS, **weights, **two_heads}))
+    made = make_learner(Config(**{**SETTINGS, **weights, **two_heads}))
     own = Returning(losses={"own_loss": jnp.ones((2, 1))})
     params = jax.eval_shape(made.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
@@ -271,7 +271,7 @@ def with_curiosity(monkeypatch):
 
     def build(curiosity, **arguments):
         monkeypatch.setattr(curiosities, "factory", lambda name: lambda config, env: curiosity)
-        return make_train(PLAIN, **arguments)
+        return make_learner(PLAIN, **arguments)
 
     return build
 
@@ -300,7 +300,7 @@ def test_an_encoder_of_maps_is_refused(monkeypatch):
 
     monkeypatch.setitem(encoders, "maps", lambda config: Maps())
     with pytest.raises(ValueError, match=r"encoder 'maps' .*\(1, 12, 12, 3\)"):
-        make_train(Config(encoder="maps")).init(jax.random.key(0))
+        make_learner(Config(encoder="maps")).init(jax.random.key(0))
 
 
 def test_devices_average_floats_only(with_curiosity):
@@ -320,4 +320,4 @@ def test_devices_average_floats_only(with_curiosity):
 )
 def test_settings_that_cannot_be_trained_with_are_refused(settings, env, message):
     with pytest.raises(ValueError, match=message):
-        make_train(Config(**settings), env)
+        make_learner(Config(**settings), env)

@@ -9,7 +9,7 @@ import pytest
 
 from agents import Config
 from agents.curiosity.icm import ICM
-from agents.ppo.learner import make_train
+from agents.ppo.learner import make_learner
 from paths import DATA
 from reference_update import Recording, make_trajectory
 
@@ -24,7 +24,7 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def ours(recording: Recording) -> dict[str, Any]:
-    learner = make_train(CONFIG)
+    learner = make_learner(CONFIG)
     state = learner.init(jax.random.key(0))
     params = recording.params("param", state.params)
 

@@ -8,7 +8,8 @@ import pytest
 
 from agents.config import Config
 from agents.files import read_json, write_json
-from agents.runs.folder import Run, RunFolder, RunOptions, check_name
+from agents.runs.folder import RunFolder, check_name
+from agents.runs.run import Run, RunOptions
 from refusal import assert_refused
 
 
@@ -22,11 +23,11 @@ def test_a_run_is_the_same_after_json():
 @pytest.mark.parametrize(
     ("make", "values", "words"),
     [
-        (partial(Run, Config()), {"seed": -1}, ["seed must be an integer >= 0 and <= 2147483647"]),
+        (partial(Run, Config()), {"seed": -1}, ["seed must be an integer >= 0 and <= 4294967295"]),
         (partial(Run, Config()), {"seed": 1.0}, ["seed must be an integer", "1.0"]),
         (RunOptions, {"checkpoint_every": 0}, ["checkpoint_every must be an integer >= 1, got 0"]),
         (RunOptions, {"evaluate_every": -1}, ["evaluate_every must be an integer >= 0, got -1"]),
-        (RunOptions, {"reported": 10**9}, ["reported must be", "<= 1000000, got 1000000000"]),
+        (RunOptions, {"test_tasks": 10**9}, ["test_tasks must be", "<= 1000000, got 1000000000"]),
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
         *(
             (check_name, {"name": name}, ["a folder's name without a path", repr(name)])
@@ -59,7 +60,7 @@ def test_only_the_end_of_a_run_may_change(before, after, words):
 
 
 def test_a_folder_holds_a_run_and_its_options(tmp_path):
-    run, options = Run(Config(hidden=8)), RunOptions(reported=5, sets=("base",))
+    run, options = Run(Config(hidden=8)), RunOptions(test_tasks=5, sets=("base",))
     RunFolder(tmp_path / "x").path.mkdir()
     RunFolder(tmp_path / "x").note(run, options)
     assert RunFolder(tmp_path / "x").read() == (run, options)

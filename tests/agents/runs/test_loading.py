@@ -14,8 +14,9 @@ from agents import pretrained
 from agents.arrays import to_arrays
 from agents.config import Config
 from agents.runs import checkpoint
-from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy, save
+from agents.runs.run import Run, RunOptions
 from easy import assert_same, enable_x64
 from tiny_policy import CONFIG, random_params, random_policy
 

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from agents.runs.folder import Run, RunOptions
+from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run
 from small_runs import small_config
 

@@ -13,7 +13,7 @@ from trap_tube_jax.scoring.scores import Score, Scores
 
 def row(iteration, **values):
     counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 1.0 * iteration}
-    return {"iteration": iteration, "evaluation": 0.0, **counts, **values}
+    return {"iteration": iteration, "validation_success": 0.0, **counts, **values}
 
 
 def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
@@ -66,9 +66,9 @@ def test_a_score_is_a_row():
     [
         ({"iterations": 4}, {}, True),
         ({"iterations": 5}, {}, False),
-        ({"stop_when_solved": 0.5}, {"evaluation": 0.5}, True),
-        ({"stop_when_solved": 0.6}, {"evaluation": 0.5}, False),
-        ({}, {"evaluation": 1.0}, False),
+        ({"stop_when_solved": 0.5}, {"validation_success": 0.5}, True),
+        ({"stop_when_solved": 0.6}, {"validation_success": 0.5}, False),
+        ({}, {"validation_success": 1.0}, False),
         ({"max_transitions": 600}, {"transitions": 200}, False),  # 8 * 50 more fit in
         ({"max_transitions": 600}, {"transitions": 201}, True),
     ],

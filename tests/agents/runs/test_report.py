@@ -16,8 +16,9 @@ from rich.console import Console
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluator
 from agents.runs import display, report
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
+from agents.runs.run import Run
 from small_runs import small_config
 from tiny_policy import food_next_to_agent, random_params
 from trap_tube_jax.objects import DIRECTION_NAMES
@@ -28,7 +29,7 @@ CONFIG = small_config(curiosity="effects", stop_when_solved=0.0)
 
 def row(iteration, **values):
     counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 1.0}
-    shares = {"success": 0.25, "evaluation": 0.5, "loss": math.nan, "policy_loss": math.nan}
+    shares = {"success": 0.25, "validation_success": 0.5, "loss": math.nan, "policy_loss": math.nan}
     rate = {"transitions_per_second": 6000.0, "intrinsic_reward": 0.1}
     return {"iteration": iteration, **counts, **shares, **rate, **values}
 
@@ -101,7 +102,7 @@ def test_curves_of_a_run_that_solves_nothing_say_so(tmp_path):
     """As many panels as if it did."""
     heights = []
     for share in (0.0, 0.5):
-        rows = pd.DataFrame([row(i, success=share, evaluation=share) for i in (1, 2)])
+        rows = pd.DataFrame([row(i, success=share, validation_success=share) for i in (1, 2)])
         report.save_curves(rows, tmp_path / "x.png", "no formula: $^$")
         with Image.open(tmp_path / "x.png") as picture:
             heights.append(picture.height)
@@ -144,8 +145,8 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
 )
 def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
     run, folder = Run(small_config(iterations=7, **settings)), RunFolder(tmp_path)
-    solved = [row(2, evaluation=1.0, episodes=episodes)] if episodes else []
-    rows = [row(1), *solved, row(3, evaluation=1.0, episodes=9999)] if solved else [row(1)]
+    solved = [row(2, validation_success=1.0, episodes=episodes)] if episodes else []
+    rows = [row(1), *solved, row(3, validation_success=1.0, episodes=9999)] if solved else [row(1)]
     append_rows(folder.metrics, rows)
     assert "report.html" not in "".join(display.summary(folder, run)), "with --no-report"
     folder.page.touch()
@@ -157,6 +158,6 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
 
 def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
     run, folder = Run(small_config(stop_when_solved=0.995)), RunFolder(tmp_path)
-    append_rows(folder.metrics, [row(1, evaluation=0.996)])
+    append_rows(folder.metrics, [row(1, validation_success=0.996)])
     solved = "First solved 99.5 % of base after 8 episodes; --stop-when-solved 0 trains on."
     assert display.summary(folder, run)[0] == solved

@@ -17,10 +17,11 @@ import agents
 from agents.acting import evaluation
 from agents.ppo.learner import Learner
 from agents.runs import checkpoint, session
-from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
 from agents.runs.results import metrics, results
+from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped
 from small_runs import final_state, small_config, untimed
@@ -28,7 +29,7 @@ from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks
 
 ITERATIONS = 6
 TRACKED = RunOptions(
-    checkpoint_every=2, evaluate_every=2, sets=("base", "p"), reported=3, report=False
+    checkpoint_every=2, evaluate_every=2, sets=("base", "p"), test_tasks=3, report=False
 )
 PLAIN = RunOptions(checkpoint_every=2, sets=("base",), report=False)
 ASKED: list[tuple[str, str]] = []  # sets and purposes of the tasks that `whole` has drawn
@@ -133,7 +134,7 @@ def _raise(error):
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(session, "make_advance", None)
     before, output = (copy / "evaluations.csv").read_bytes(), io.StringIO()
-    more = dataclasses.replace(TRACKED, reported=9)
+    more = dataclasses.replace(TRACKED, test_tasks=9)
     assert train_run(copy, small_run(), more, console=Console(file=output)) is None
     assert (copy / "evaluations.csv").read_bytes() == before
     assert "agents.evaluate plays other" in output.getvalue()
@@ -234,7 +235,7 @@ def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypa
     replace_training(monkeypatch, lambda *returned: returned)
     run = Run(small_config(iterations=3, stop_when_solved=1.0))
     train_run(tmp_path / "x", run, PLAIN)
-    assert [row["evaluation"] for row in untimed(tmp_path / "x")] == ["1.0"]
+    assert [row["validation_success"] for row in untimed(tmp_path / "x")] == ["1.0"]
 
 
 def test_without_evaluation_the_final_policy_is_tested_on_all_sets(tmp_path):

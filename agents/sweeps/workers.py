@@ -14,10 +14,10 @@ from typing import Any
 import jax
 from rich.console import Console
 
-from agents.parallel.devices import become_devices
+from agents.parallel.devices import split_cpu
 from agents.runs.compilation import enable_cache
-from agents.runs.folder import Run, RunOptions
 from agents.runs.provenance import cores
+from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run
 from agents.runs.stopping import Stopped
 from trap_tube_jax.imports import import_modules, needs_extra
@@ -66,7 +66,7 @@ def train_logged(path: Path, run: Run, options: RunOptions, stop_file: Path) -> 
         return "stopped"
     with log_of(path).open("a", buffering=1, encoding="utf-8") as log:
         try:
-            become_devices(options.devices)  # first, because a module may start JAX
+            split_cpu(options.devices)  # first, because a module may start JAX
             import_modules(run.imports)
             enable_cache()
             train_run(path, run, options, console=Console(file=log), stop_file=stop_file)

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from agents.experiments.figures import COLORS, WIDTH, make_panels
 from agents.profiles.tasks import PARTS, Sampling
+from agents.sweeps.figures import COLORS, WIDTH, make_panels
 from trap_tube_jax.rendering import render
 from trap_tube_jax.scoring.scores import wilson_interval
 from trap_tube_jax.state import take

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 
 from agents import sweep
-from agents.experiments.grids import GRIDS
+from agents.sweeps.grids import GRIDS
 
 PROGRAM = "python -m agents.experiments"
 

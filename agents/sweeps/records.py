@@ -11,13 +11,13 @@ from pathlib import Path
 import pandas as pd
 
 import agents
-from agents.experiments import figures, tables
 from agents.files import read_json, write_bytes, write_json
 from agents.runs.results import find_runs, metrics
+from agents.sweeps import figures, tables
 from trap_tube_jax.registry import task_set
 
 COUNTS = ["iteration", "episodes", "transitions", "seconds"]
-CURVES = ["algorithm", "seed", *COUNTS, "success", "evaluation"]
+CURVES = ["algorithm", "seed", *COUNTS, "success", "validation_success"]
 WIDTH = 80
 
 

@@ -71,7 +71,9 @@ def training_table(curves: Frame, threshold: float, with_paper: bool) -> Frame:
     columns = ("solved", "episodes to solve", "steps", "minutes")
     rows: dict[Any, tuple[str, ...]] = {}
     for name, own in curves.groupby("algorithm", sort=False):
-        episodes = own[own["evaluation"] >= threshold].groupby("seed")["episodes"].min().to_numpy()
+        episodes = (
+            own[own["validation_success"] >= threshold].groupby("seed")["episodes"].min().to_numpy()
+        )
         ends = own.groupby("seed")[["transitions", "seconds"]].max()
         steps, seconds = ends.mean()
         solved = f"{len(episodes)} of {len(ends)}"

@@ -11,8 +11,9 @@ from typing import Any
 import trap_tube_jax as tt
 from agents.command_line import option
 from agents.config import Config
-from agents.ppo.learner import make_train
-from agents.runs.folder import Run, RunFolder, RunOptions, check_name
+from agents.ppo.learner import make_learner
+from agents.runs.folder import RunFolder, check_name
+from agents.runs.run import Run, RunOptions
 
 COMMA = re.compile(r",(?![^\[]*\])")  # but not those of a list
 
@@ -58,17 +59,17 @@ class Grid:
 
     Attributes:
       options: defaults of its command line.
-      run: defaults of how each run is trained and evaluated.
+      run_options: defaults of the options of every run.
       settings: settings of all points, which the command line may replace.
       points: settings by the name of the point.
     """
 
     options: Options = dataclasses.field(default_factory=Options)
-    run: RunOptions = dataclasses.field(default_factory=RunOptions)
+    run_options: RunOptions = dataclasses.field(default_factory=RunOptions)
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     points: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=lambda: {"": {}})
 
-    def runs(self, name: str, options: Options) -> dict[Path, Run]:
+    def make_runs(self, name: str, options: Options) -> dict[Path, Run]:
         """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
         if options.seeds < 1:
             raise ValueError(f"seeds must be >= 1, got {options.seeds}")
@@ -110,7 +111,7 @@ class Grid:
                 raise ValueError(f"no point {name!r}; allowed: {', '.join(configs)}")
         chosen = {name: configs[name] for name in options.only or configs}
         for config in chosen.values():
-            make_train(config)  # refuses what cannot be trained with
+            make_learner(config)  # refuses what cannot be trained with
         return chosen
 
 
@@ -134,8 +135,8 @@ def _value(text: str) -> Any:
 
 # Source of `exp1` and `exp2`: the paper's section "Results".
 PAPER_POINTS = {"ppo": {"curiosity": "none"}, "ppo+icm": {"curiosity": "icm"}}
-PAPER_RUN = RunOptions(evaluate_every=1, reported=1000)
-BEST_RUN = RunOptions(evaluate_every=20, reported=1000)
+PAPER_RUN = RunOptions(evaluate_every=1, test_tasks=1000)
+BEST_RUN = RunOptions(evaluate_every=20, test_tasks=1000)
 CURIOSITIES = ("icm", "rnd", "noveld", "effects")
 
 GRIDS = {
@@ -146,7 +147,8 @@ GRIDS = {
         Options(preset="paper", env="pstsy", seeds=5), PAPER_RUN, {"iterations": 500}, PAPER_POINTS
     ),
     "fast": Grid(
-        Options(preset="fast", env="base", seeds=10), RunOptions(evaluate_every=100, reported=1000)
+        Options(preset="fast", env="base", seeds=10),
+        RunOptions(evaluate_every=100, test_tasks=1000),
     ),
     "best": Grid(Options(preset="best", env="pstsy", seeds=5), BEST_RUN),
     "curiosities": Grid(

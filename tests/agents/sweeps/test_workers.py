@@ -6,9 +6,9 @@ import signal
 import pytest
 
 from agents.config import Config
-from agents.experiments import workers
-from agents.runs.folder import Run, RunOptions
+from agents.runs.run import Run, RunOptions
 from agents.runs.stopping import Stopped
+from agents.sweeps import workers
 
 
 def test_a_killed_process_costs_one_call():
@@ -44,10 +44,10 @@ def test_a_run_is_logged_next_to_its_folder(tmp_path, monkeypatch, raises, outco
 
 def test_devices_are_split_before_modules_are_imported(tmp_path, monkeypatch):
     order = []
-    for name in ("become_devices", "import_modules", "train_run"):
+    for name in ("split_cpu", "import_modules", "train_run"):
         monkeypatch.setattr(workers, name, lambda *_, name=name, **__: order.append(name))
     workers.train_logged(tmp_path / "a", Run(Config()), RunOptions(devices=2), tmp_path / ".stop")
-    assert order == ["become_devices", "import_modules", "train_run"]
+    assert order == ["split_cpu", "import_modules", "train_run"]
 
 
 def test_dask_is_an_extra(monkeypatch):

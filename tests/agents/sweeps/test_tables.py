@@ -7,10 +7,11 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from agents.experiments import figures, report, tables
 from agents.files import read_json
-from agents.runs.folder import Run, RunFolder
+from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
+from agents.runs.run import Run
+from agents.sweeps import figures, records, tables
 from paths import ROOT
 from small_runs import small_config
 
@@ -44,7 +45,8 @@ def curves(algorithm="ppo", evaluations=((0, 1), (0, 0, 1))):
     return pd.DataFrame(
         {
             "algorithm": algorithm, "seed": seed, "iteration": i, "episodes": 100 * i,
-            "transitions": 1000 * i, "seconds": 60.0 * i, "success": share / 2, "evaluation": share,
+            "transitions": 1000 * i, "seconds": 60.0 * i, "success": share / 2,
+            "validation_success": share,
         }
         for seed, shares in enumerate(evaluations)
         for i, share in enumerate(shares, 1)
@@ -139,9 +141,9 @@ def test_many_algorithms_are_points_and_bars_but_not_lines(tmp_path):
 @pytest.mark.parametrize("record", RECORDS)
 def test_the_tables_of_the_records_fit_a_terminal(record, tmp_path):
     copy = shutil.copytree(RESULTS / record, tmp_path / record)
-    shown = report.write(copy)
+    shown = records.write(copy)
     assert "**Test tasks solved, %**" in (copy / "table.md").read_text()
-    assert max(map(len, shown.splitlines()[:-5])) <= report.WIDTH
+    assert max(map(len, shown.splitlines()[:-5])) <= records.WIDTH
 
 
 def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
@@ -149,7 +151,7 @@ def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
         folder = RunFolder(tmp_path / name)
         folder.note(Run(small_config(env_id=name, stop_when_solved=threshold)))
         append_rows(folder.metrics, curves(evaluations=((0, 1),)).to_dict("records"))
-    report.collect(tmp_path, "")
+    records.collect(tmp_path, "")
     about = read_json(tmp_path / "grid.json")
     assert about["title"].endswith(": trained on base or {Sy}")
     assert about["train_set"] == "training set"

@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
-from agents.experiments.grids import GRIDS, Grid, Options
-from agents.runs.folder import Run, RunFolder, RunOptions
+from agents.runs.folder import RunFolder
+from agents.runs.run import Run, RunOptions
+from agents.sweeps.grids import GRIDS, Grid, Options
 from refusal import assert_refused
 from trap_tube_jax.imports import import_modules
 
@@ -48,7 +49,7 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, o
     given = Options(("curiosity=none,icm",), ("agents.examples.near_food",), seeds=2, seed=3)
     given = dataclasses.replace(given, env="near-food", out=tmp_path)
     import_modules(given.imports)
-    runs = Grid().runs("sweep", given)
+    runs = Grid().make_runs("sweep", given)
     assert [str(path.relative_to(tmp_path)) for path in runs] == [
         f"sweep-fast-near-food/curiosity={name}-seed{seed}"
         for seed in (3, 4)
@@ -69,7 +70,7 @@ def test_the_papers_experiments(name, short, iterations):
     for config in found.values():
         assert (config.env_id, config.iterations, config.eval_episodes) == (short, iterations, 128)
     assert (grid.options.preset, grid.options.seeds) == ("paper", 5)
-    assert grid.run == RunOptions(evaluate_every=1, reported=1000)
+    assert grid.run_options == RunOptions(evaluate_every=1, test_tasks=1000)
 
 
 def test_a_named_grid_keeps_its_settings_unless_given():
@@ -78,18 +79,18 @@ def test_a_named_grid_keeps_its_settings_unless_given():
         given = dataclasses.replace(grid.options, settings=settings, only=("ppo+effects",))
         ((name, config),) = grid.configs(given).items()
         assert (name, config.curiosity, config.iterations) == ("ppo+effects", "effects", iterations)
-    assert next(iter(grid.runs("curiosities", grid.options))).parent.name == "curiosities"
+    assert next(iter(grid.make_runs("curiosities", grid.options))).parent.name == "curiosities"
     other = dataclasses.replace(grid.options, preset="fast")
-    assert next(iter(grid.runs("curiosities", other))).parent.name == "curiosities-fast-pstsy"
+    assert next(iter(grid.make_runs("curiosities", other))).parent.name == "curiosities-fast-pstsy"
 
 
 def test_a_stored_run_with_other_settings_is_refused(tmp_path):
     given = Options(settings=("clip_eps=0.3",), out=tmp_path)
-    ((path, run),) = Grid().runs("sweep", given).items()
+    ((path, run),) = Grid().make_runs("sweep", given).items()
     other = Run(dataclasses.replace(run.config, clip_eps=0.2), algorithm="fast")
     path.mkdir(parents=True)
     RunFolder(path).note(other)
-    assert_refused(["clip_eps=0.2, not 0.3", "another --name"], Grid().runs, "sweep", given)
+    assert_refused(["clip_eps=0.2, not 0.3", "another --name"], Grid().make_runs, "sweep", given)
     RunFolder(path).note(run)
     longer = dataclasses.replace(given, settings=("clip_eps=0.3", "iterations=200"))
-    assert Grid().runs("sweep", longer)[path].config.iterations == 200
+    assert Grid().make_runs("sweep", longer)[path].config.iterations == 200

@@ -7,8 +7,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from agents.experiments import tables
 from agents.runs.metrics import Frame
+from agents.sweeps import tables
 from trap_tube_jax.scoring.tasks import label
 
 WIDTH = 8.3  # inches, as in a page 830 pixels wide
@@ -40,7 +40,7 @@ def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
     own = about["train_set"]
     panels = {
         "training": curves.assign(value=curves["success"]),
-        f"greedy, {label(own)}": curves.assign(value=curves["evaluation"]),
+        f"greedy, {label(own)}": curves.assign(value=curves["validation_success"]),
     }
     greedy = results[results["purpose"] == "validation"]
     greedy = greedy.assign(value=greedy["solved"] / greedy["tasks"])
