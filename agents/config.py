@@ -8,12 +8,21 @@ import difflib
 from functools import partial
 from typing import Any, Literal, Self, get_args, get_origin
 
+import jax
 import numpy as np
 
 from agents import registry
+from trap_tube_jax.environment import Environment
+from trap_tube_jax.objects import AGENT, FOOD, base_palette
 from trap_tube_jax.registry import task_set
+from trap_tube_jax.transfers import perceptual, structural, symbolic
 
 MAX_INT32 = 2**31 - 1  # the largest i32, in which training counts
+KEEP_COLORS = {
+    perceptual,
+    structural,
+    symbolic,
+}  # transfers after which agent and food look the same
 GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
 
@@ -89,8 +98,6 @@ class Config:
       embedding: units of each embedding of actions and reward.
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.
-      encode_chunk_size: distinct observations encoded at once; affects speed, and results only
-        through the order of float32 sums.
     """
 
     env_id: str = _task("TrapTube-v0", flags=("--env",))
@@ -135,7 +142,6 @@ class Config:
     hidden: int = _network(64, 1, 65_536)
     embedding: int = _network(8, 1, 65_536)
     recurrent: bool = _network(True)
-    encode_chunk_size: int = _network(64, 1, 1_000_000)
 
     def __post_init__(self) -> None:
         """Raises ValueError for an invalid setting, naming its value and the allowed ones."""
@@ -201,6 +207,34 @@ class Config:
         """Returns the steps after which an episode of a task set is truncated."""
         return task_set(name).max_steps if self.max_steps is None else self.max_steps
 
+    def validate(self, env: Environment) -> None:
+        """Raises ValueError unless these settings can be trained with in an environment."""
+        for name in ("num_features", "max_steps"):
+            if getattr(self, name) not in (None, getattr(env, name)):
+                raise ValueError(
+                    f"the environment's {name} is {getattr(env, name)}, the config's "
+                    f"{getattr(self, name)}; they must agree"
+                )
+        if self.align_to_food or self.encoder == "objects":
+            _check_known_colors(env)
+        longest = self.episodes_per_iteration * env.max_steps
+        if self.max_transitions is not None and self.max_transitions < longest:
+            raise ValueError(
+                f"max_transitions must allow an iteration, which takes up to {longest:,} steps, or "
+                f"be None; got {self.max_transitions:,}"
+            )
+        steps = self.iterations * longest
+        if min(steps, self.max_transitions or steps) > MAX_INT32:
+            raise ValueError(
+                f"iterations={self.iterations} of {self.episodes_per_iteration} episodes of "
+                f"{env.max_steps} steps are {steps:,} steps; allowed: at most {MAX_INT32:,}"
+            )
+        if self.iterations * self.gradient_steps > MAX_INT32:
+            raise ValueError(
+                f"iterations={self.iterations} of {self.gradient_steps} gradient steps are "
+                f"{self.iterations * self.gradient_steps:,}; allowed: at most {MAX_INT32:,}"
+            )
+
     @property
     def num_value_heads(self) -> int:
         """V, the number of value heads."""
@@ -263,9 +297,23 @@ PRESETS: dict[str, dict[str, Any]] = {
         "encoder": "objects",
         "filters": (64, 64),
         "hidden": 128,
-        "encode_chunk_size": 256,
     },
 }
+
+
+def _check_known_colors(env: Environment) -> None:
+    """Raises ValueError if agent or food may have another colour than in the base task."""
+    known = base_palette(env.num_features)[[AGENT, FOOD]].tolist()
+    palettes: Any = [env.base.palette]
+    if not set(env.transfers) <= KEEP_COLORS:
+        states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 16))
+        palettes = states.palette
+    for palette in np.asarray(palettes)[:, [AGENT, FOOD]].tolist():
+        if palette != known:
+            raise ValueError(
+                "align_to_food and encoder='objects' know agent and food by the colours of the "
+                f"base task, {known}; in this environment they may be {palette}"
+            )
 
 
 def _plain(value: Any) -> Any:

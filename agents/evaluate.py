@@ -7,9 +7,9 @@ from pathlib import Path
 import pandas as pd
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator, own_and_paper_sets
 from agents.command_line import option, parse
 from agents.runs import compilation
+from agents.runs.evaluator import Evaluator, own_and_paper_sets
 from agents.runs.loading import load
 from agents.runs.metrics import evaluation_rows
 from agents.runs.report import save_first_solved

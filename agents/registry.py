@@ -4,6 +4,8 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from flax.errors import FlaxError
+
 from trap_tube_jax.checks import check_registered_name
 
 
@@ -44,8 +46,9 @@ encoders = Registry("encoder")
 
 @contextlib.contextmanager
 def contract(kind: str, name: str) -> Iterator[None]:
-    """Turns a failed assertion about a registered object into a ValueError that names it."""
+    """Turns an error of a registered object into a ValueError of one line that names it."""
     try:
         yield
-    except AssertionError as error:
-        raise ValueError(f"{kind} {name!r} returns wrong shapes or dtypes: {error}") from error
+    except (AssertionError, FlaxError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{kind} {name!r} breaks its contract: {reason}") from error

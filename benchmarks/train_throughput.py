@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from agents import Config, make_learner
-from agents.acting.encodings import encode_episodes
-from agents.acting.episodes import Episodes, take
+from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
 from agents.command_line import parse
 from agents.curiosity import Experience
@@ -25,6 +24,7 @@ from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
 from trap_tube_jax import task_set
 from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.state import take
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,9 +95,8 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
 
 
 def encode(learner: Learner, params: Params, episodes: Episodes) -> jax.Array:
-    """Encodes all observations of episodes to f32[T + 1, B, F]."""
-    read, chunk = {"encoder": params["encoder"]}, learner.config.encode_chunk_size
-    return encode_episodes(learner.agent.encode_rows, read, episodes, chunk=chunk)
+    """Encodes all observations of episodes to f32[B, T + 1, F], for the policy alone."""
+    return learner.encoding.encode_episodes(params, episodes)[0]
 
 
 def encoder_gradients(learner: Learner, params: Params, batch: Batch) -> Params:
@@ -107,18 +106,18 @@ def encoder_gradients(learner: Learner, params: Params, batch: Batch) -> Params:
         features = encode(learner, params, part.episodes)
         return jnp.sum(features * jnp.cos(jnp.arange(features.shape[-1]))[None, None])
 
-    def gradient(places: jax.Array) -> Params:
-        return jax.grad(loss)(params, take(batch, places))
+    def gradient(index: jax.Array) -> Params:
+        return jax.grad(loss)(params, take(batch, index))
 
     return _sum_over_minibatches(learner.config, gradient, params)
 
 
 def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax.Array) -> Params:
-    """Sums the gradients of GRU, heads and curiosity, from features f32[T + 1, B, F]."""
+    """Sums the gradients of GRU, heads and curiosity, from features f32[B, T + 1, F]."""
 
-    def gradient(places: jax.Array) -> Params:
+    def gradient(index: jax.Array) -> Params:
         by_params, by_features = jax.grad(_core_loss, (1, 2))(
-            learner, params, features[:, places], take(batch, places)
+            learner, params, features[index], take(batch, index)
         )
         # The gradient with respect to the features is part of the work, so the result must depend
         # on it.
@@ -130,7 +129,13 @@ def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax
 def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batch) -> jax.Array:
     """Returns the sum of squares of what all loss terms but motion's are computed from."""
     agent, curiosity, episodes = learner.agent, learner.curiosity, part.episodes
-    embedding, following = agent.unroll(params, features, episodes.action, episodes.reward)
+    embedding, following = agent.unroll(
+        params,
+        features,
+        episodes.action,
+        episodes.reward,
+        with_next=curiosity.needs_next_embedding,
+    )
     actions = agent.embed_action(params, episodes.action)
     experience = Experience(episodes, features[..., :0], embedding, following, actions)
     own = curiosity.losses(params["curiosity"], experience)
@@ -148,8 +153,8 @@ def _minibatches(config: Config) -> jax.Array:
 def _sum_over_minibatches(
     config: Config, gradient: Callable[[jax.Array], Params], params: Params
 ) -> Params:
-    def add(total: Params, places: jax.Array) -> tuple[Params, None]:
-        return jax.tree.map(jnp.add, total, gradient(places)), None
+    def add(total: Params, index: jax.Array) -> tuple[Params, None]:
+        return jax.tree.map(jnp.add, total, gradient(index)), None
 
     zero = jax.tree.map(jnp.zeros_like, params)
     return jax.lax.scan(add, zero, _minibatches(config))[0]

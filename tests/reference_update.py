@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.acting.episodes import Episodes
-from agents.acting.frames import Frame
+from agents.acting.episodes import Episodes, cells_of
 from agents.acting.rollout import Trajectory
+from agents.acting.symmetry import Symmetry
 from agents.networks.agent import Agent, Params
-from trap_tube_jax.objects import AGENT, BASE_COLORS, BOARD_SIZE, FOOD, GROUND, TOOL, TUBE1
+from trap_tube_jax.objects import AGENT, BASE_COLORS, FOOD, GROUND, TOOL, TUBE1
 
 PARAMETER_NAMES = {
     "encoder/conv1": "conv1",
@@ -52,10 +52,6 @@ class Recording:
         """The array as recorded."""
         return self.arrays[name]
 
-    def steps(self, name: str) -> np.ndarray:
-        """An array [episode, time, ...] as [time, episode, ...]."""
-        return np.swapaxes(self.arrays[name], 0, 1)
-
     def params(self, prefix: str, like: Params) -> Params:
         """The parameters (or gradients) under `prefix`, in the structure of `like`."""
 
@@ -87,44 +83,37 @@ def parse_state(image: np.ndarray) -> tt.State:
 
 
 def replay(initial: tt.State, action: jax.Array) -> jax.Array:
-    """The cells u8[T + 1, B, 3, 2] of B episodes under actions i32[T, B, 2]."""
+    """The cells u8[T + 1, 3, 2] of an episode under actions i32[T, 2]."""
     env = tt.Environment()
 
-    def cells(state: tt.State) -> jax.Array:
-        return jnp.stack([state.agent, state.tool, state.food], axis=1).astype(jnp.uint8)
-
     def body(state: tt.State, action_t: jax.Array) -> tuple[tt.State, jax.Array]:
-        state, _ = jax.vmap(env.step)(state, action_t)
-        return state, cells(state)
+        state, _ = env.step(state, action_t)
+        return state, cells_of(state)
 
     _, after = jax.lax.scan(body, initial, action)
-    return jnp.concatenate([cells(initial)[None], after])
+    return jnp.concatenate([cells_of(initial)[None], after])
 
 
 def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Trajectory:
     """The recorded episodes as the agent with `params` would have stored them."""
-    images = recording.steps("batch/observation_rgb")
-    states = [parse_state(image) for image in images[0]]
+    images = recording["batch/observation_rgb"]
+    states = [parse_state(image) for image in images[:, 0]]
     initial = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    action = jnp.asarray(recording.steps("batch/action"), jnp.int32)
-    reward = jnp.asarray(recording.steps("batch/reward"))
-    cells = replay(initial, action)
+    action = jnp.asarray(recording["batch/action"], jnp.int32)
+    reward = jnp.asarray(recording["batch/reward"])
     features = jax.vmap(lambda image: agent.encode(params, image))(jnp.asarray(images))
     embedding, _ = agent.unroll(params, features, action, reward)
     actions, value = agent.policy_and_value(params, embedding)
-    boards = np.reshape(images, (-1, BOARD_SIZE**2 * 3))
-    _, observation_id = np.unique(boards, axis=0, return_inverse=True)
     return Trajectory(
-        frame=Frame.of(jnp.zeros(action.shape[1], jnp.int32)),
+        symmetry=Symmetry.from_index(jnp.zeros(len(action), jnp.int32)),
         episodes=Episodes(
             layout=initial,
-            cells=cells,
+            cells=jax.vmap(replay)(initial, action),
             action=action,
             reward=reward,
             discount=jnp.full_like(reward, 1e9),  # which the baseline does not look at
-            mask=jnp.asarray(recording.steps("batch/weight")),
-            observation_id=jnp.asarray(observation_id.reshape(images.shape[:2]), jnp.int32),
+            mask=jnp.asarray(recording["batch/weight"]),
         ),
         log_prob=actions.log_prob(action),
-        value=jnp.concatenate([value, jnp.full_like(value[:1], 1e9)]),
+        value=jnp.concatenate([value, jnp.full_like(value[:, :1], 1e9)], axis=1),
     )

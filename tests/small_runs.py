@@ -14,7 +14,6 @@ SETTINGS = {
     "minibatch_size": 4,
     "epochs": 1,
     "max_steps": 6,
-    "encode_chunk_size": 8,
     "filters": (2, 2),
     "hidden": 4,
     "embedding": 2,

@@ -31,7 +31,7 @@ AGENTS = (
     ("parallel",),
     ("networks",),
     ("acting",),
-    ("curiosity",),
+    ("curiosity", "fast"),
     ("ppo",),
     ("pretrained", "runs"),
     ("train",),
@@ -100,6 +100,16 @@ def test_imports_run_downward():
         for name, tree in TREES.items()
     }
     graphlib.TopologicalSorter(graph).prepare()  # raises if a module needs itself
+
+
+def test_the_fast_path_has_one_door():
+    """Without its folder and its tests, everything else works; see `agents.ppo.machine`."""
+    users = {
+        name
+        for name, names in IMPORTS.items()
+        if any(used.startswith("agents.fast") for used in names)
+    }
+    assert {name for name in users if not name.startswith("agents.fast")} == {"agents.ppo.machine"}
 
 
 def modules_after(program: str, folder: pathlib.Path) -> list[set[str]]:

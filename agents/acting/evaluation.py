@@ -1,22 +1,15 @@
-"""Greedy evaluation on the fixed tasks of the benchmark's protocol, by the network's fast path."""
+"""Greedy play of given tasks."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
-import numpy as np
 
-import trap_tube_jax as tt
-from agents.acting.frames import Frame
+from agents.acting.encoding import Encoding
 from agents.acting.rollout import rollout
-from agents.config import Config
+from agents.acting.symmetry import Symmetry
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.scoring.benchmark import blocks, score_of
-from trap_tube_jax.scoring.scores import Scores
-from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, Purpose, evaluation_tasks
-from trap_tube_jax.state import State, take
+from trap_tube_jax.state import State
 
 
 class Evaluation(NamedTuple):
@@ -36,82 +29,19 @@ class Evaluation(NamedTuple):
     value: jax.Array
 
 
-def evaluate(agent: Agent, params: Params, env: Environment, tasks: State) -> Evaluation:
+def evaluate(
+    agent: Agent,
+    params: Params,
+    env: Environment,
+    tasks: State,
+    encoding: Encoding | None = None,
+) -> Evaluation:
     """Plays each of B tasks at time 0 once, with the most probable actions. Pure; jit it.
 
-    `env` gives the dynamics and the step limit; its transfers are not used.
+    `env` gives the dynamics and the step limit; its transfers are not used. `encoding` encodes
+    observations, by default one by one.
     """
-    played = rollout(agent, params, env, tasks, key=None)
-    action = played.episodes.action.swapaxes(0, 1)
-    action = jax.vmap(Frame.original_action)(played.frame, action)
-    value = played.value[:-1, :, 0].swapaxes(0, 1)
+    played = rollout(agent, params, env, tasks, None, encoding)
+    action = jax.vmap(Symmetry.original_action)(played.symmetry, played.episodes.action)
+    value = played.value[:, :-1, 0]
     return Evaluation(played.episodes.solved, played.episodes.length, action, value)
-
-
-class Evaluator:
-    """Greedy play on the tasks of several sets, compiled once for any parameters."""
-
-    def __init__(self, config: Config, tasks: Mapping[str, State]):
-        """Prepares the play of each set's tasks by policies of these settings.
-
-        If `config.max_steps` is None, the limits of the registered sets hold; ValueError names one
-        that is not registered.
-        """
-        self.tasks = dict(tasks)
-        self.limits = {name: config.step_limit(name) for name in self.tasks}
-        self._ends = np.cumsum([len(states.time) for states in self.tasks.values()])
-        together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
-        self._blocks = [take(together, block) for block in blocks(int(self._ends[-1]))]
-        # All sets are played up to the largest limit; a call cuts off steps beyond a set's.
-        longest = max(self.limits.values())
-        env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
-        agent = Agent(config)
-        self._play: Any = jax.jit(lambda params, states: evaluate(agent, params, env, states))
-
-    @classmethod
-    def of_sets(
-        cls, config: Config, sets: Sequence[str], num_tasks: int, purpose: Purpose = "test"
-    ) -> "Evaluator":
-        """Makes an evaluator of registered task sets, whose step limits hold, as in the protocol.
-
-        Raises:
-          ValueError: unknown set, or no task.
-        """
-        names = [tt.task_set(name).short for name in sets]
-        features = config.num_features
-        config = dataclasses.replace(config, max_steps=None)
-        return cls(config, {x: evaluation_tasks(x, num_tasks, features, purpose) for x in names})
-
-    def __call__(self, params: Params) -> dict[str, Evaluation]:
-        """Plays all tasks; returns NumPy arrays by the names of the sets."""
-        played = [jax.tree.map(np.asarray, self._play(params, states)) for states in self._blocks]
-        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *played)
-        outcomes = {}
-        for name, start, end in zip(self.tasks, [0, *self._ends], self._ends, strict=False):
-            outcome, limit = take(whole, slice(start, end)), self.limits[name]
-            outcomes[name] = outcome._replace(
-                solved=outcome.solved & (outcome.length <= limit),
-                length=np.minimum(outcome.length, limit),
-            )
-        return outcomes
-
-    def scores(
-        self,
-        played: Mapping[str, Evaluation],
-        shortest: Mapping[str, np.ndarray] | None = None,
-    ) -> Scores:
-        """Computes the score of every set from the outcomes that a call returned.
-
-        `shortest` has the lengths i32[B] of each set's shortest plans, to compare with.
-        """
-        made = []
-        for name, outcome in played.items():
-            found = np.asarray(outcome.solved), np.asarray(outcome.length)
-            plans = None if shortest is None else shortest[name]
-            made.append(score_of(name, self.tasks[name], *found, self.limits[name], plans))
-        return Scores(PROTOCOL, tt.__version__, None, tuple(made))
-
-
-def own_and_paper_sets(config: Config) -> tuple[str, ...]:
-    """Returns the short names of the paper's eight sets and of the training set."""
-    return tuple(dict.fromkeys((*ALL_SETS, tt.task_set(config.env_id).short)))

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
-from agents.acting.frames import Frame
-from agents.acting.repeats import Repeats
+from agents.acting.step import Memory, choose
+from agents.acting.symmetry import Symmetry
 from agents.config import Config
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.objects import BOARD_SIZE
@@ -15,26 +16,24 @@ from trap_tube_jax.objects import BOARD_SIZE
 class Carry(NamedTuple):
     """Memory of a policy between the steps of B episodes.
 
+    Every array has B rows, so an episode can be reset by replacing its row with `initial`'s.
+
     Attributes:
-      embedding: f32[B, hidden], the state of the GRU.
-      action_tm1: i32[B, 2], the previous (grasp, move) in the frame; zeros before the first step.
-      frame: the frames, three arrays bool[B], fixed by each episode's first observation.
+      memory: memory of the agent, which acts on turned boards.
+      symmetry: B symmetries that turn the boards, fixed by the first observation of an episode.
       is_first: bool[B], true before the first step.
-      repeats: what greedy play has tried; None without `repeat_penalty`.
     """
 
-    embedding: jax.Array
-    action_tm1: jax.Array
-    frame: Frame
+    memory: Memory
+    symmetry: Symmetry
     is_first: jax.Array
-    repeats: Repeats | None
 
 
-class Policy(NamedTuple):
+class Policy(struct.PyTreeNode):
     """A trained network that acts from observations alone.
 
-    Start every episode with `initial`. The network always gets a previous reward of 0, as in
-    training until an episode ends.
+    Start every episode with `initial`. The previous-reward input is always 0, since only the last
+    step pays. A policy is a pytree whose leaves are its parameters.
 
     Attributes:
       name: the policy's name in tables.
@@ -44,21 +43,18 @@ class Policy(NamedTuple):
       greedy: takes the most probable actions after `repeat_penalty`; otherwise draws them.
     """
 
-    name: str
-    config: Config
+    name: str = struct.field(pytree_node=False)
+    config: Config = struct.field(pytree_node=False)
     params: Params
-    iteration: int
-    greedy: bool = True
+    iteration: int = struct.field(pytree_node=False)
+    greedy: bool = struct.field(pytree_node=False, default=True)
 
     def initial(self, batch: int) -> Carry:
         """Returns the carry before the first step of `batch` episodes."""
-        zeros = jnp.zeros(batch, jnp.int32)
         return Carry(
-            embedding=Agent(self.config).initial_state(self.params, batch),
-            action_tm1=jnp.zeros((batch, 2), jnp.int32),
-            frame=Frame.of(zeros),
-            is_first=zeros == 0,
-            repeats=Repeats.empty(batch) if self.config.repeat_penalty else None,
+            memory=Memory.empty(Agent(self.config), self.params, batch, greedy=self.greedy),
+            symmetry=Symmetry.from_index(jnp.zeros(batch, jnp.int32)),
+            is_first=jnp.ones(batch, bool),
         )
 
     def act(
@@ -72,12 +68,12 @@ class Policy(NamedTuple):
           key: PRNG key of the draws; unused if `greedy`.
 
         Returns:
-          The actions i32[B, 2], (grasp, move) each, and the next carry.
+          The actions i32[B, 2], (grasp, move), and the next carry.
 
         Raises:
           ValueError: shape or dtype of `observation` is wrong, or a key is missing.
         """
-        wanted = (len(carry.action_tm1), BOARD_SIZE, BOARD_SIZE, self.config.num_features)
+        wanted = (len(carry.is_first), BOARD_SIZE, BOARD_SIZE, self.config.num_features)
         if observation.shape != wanted or observation.dtype != jnp.uint8:
             raise ValueError(
                 f"observation must be uint8{list(wanted)}, "
@@ -85,22 +81,14 @@ class Policy(NamedTuple):
             )
         if key is None and not self.greedy:
             raise ValueError("a policy that draws its actions needs a key; greedy ones do not")
-        agent, frame = Agent(self.config), carry.frame
+        agent = Agent(self.config)
+        symmetry = carry.symmetry
         if self.config.align_to_food:
-            first = jax.vmap(Frame.facing_food)(observation)
-            frame = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, frame)
-            observation = jax.vmap(Frame.picture)(frame, observation)
+            first = jax.vmap(Symmetry.facing_food)(observation)
+            symmetry = jax.tree.map(lambda x, y: jnp.where(carry.is_first, x, y), first, symmetry)
+            observation = jax.vmap(Symmetry.transform_board)(symmetry, observation)
         features = agent.encode(self.params, observation)
-        reward_tm1 = jnp.zeros(len(observation), jnp.float32)
-        embedding = agent.step(self.params, carry.embedding, features, carry.action_tm1, reward_tm1)
-        actions, _ = agent.policy_and_value(self.params, embedding)
-        repeats = carry.repeats
-        if key is not None and not self.greedy:
-            action = actions.sample(key)
-        elif repeats is None:
-            action = actions.mode()
-        else:
-            penalty = self.config.repeat_penalty
-            action, repeats = repeats.choose(actions, penalty, observation)
-        after = Carry(embedding, action, frame, jnp.zeros_like(carry.is_first), repeats)
-        return jax.vmap(Frame.original_action)(frame, action), after
+        step_key = None if self.greedy else key
+        choice, memory = choose(agent, self.params, carry.memory, features, observation, step_key)
+        action = jax.vmap(Symmetry.original_action)(symmetry, choice.action)
+        return action, Carry(memory, symmetry, jnp.zeros_like(carry.is_first))

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from agents.networks.actions import ActionDistribution
-from agents.networks.grouping import hash_rows
+from agents.networks.hashing import hash_rows
 from trap_tube_jax.environment import action_to_index
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 
@@ -28,8 +28,8 @@ class Repeats(NamedTuple):
     """The last observations of B episodes and the actions taken there, newest first.
 
     Attributes:
-      board: i32[MEMORY, B], hashes of the observations.
-      action: i32[MEMORY, B], 4 * grasp + move; -1 before the first step.
+      board: i32[B, MEMORY], hashes of the observations.
+      action: i32[B, MEMORY], 4 * grasp + move; -1 before the first step.
     """
 
     board: jax.Array
@@ -38,8 +38,8 @@ class Repeats(NamedTuple):
     @staticmethod
     def empty(batch: int) -> "Repeats":
         """Returns the memory of `batch` episodes before their first step."""
-        nothing = jnp.full((MEMORY, batch), -1, jnp.int32)
-        return Repeats(nothing, nothing)
+        # Two arrays, since a buffer can be donated only once.
+        return Repeats(*(jnp.full((batch, MEMORY), -1, jnp.int32) for _ in range(2)))
 
     def choose(
         self, actions: ActionDistribution, penalty: float, observation: jax.Array
@@ -47,11 +47,15 @@ class Repeats(NamedTuple):
         """Returns the best actions i32[B, 2] at boards u8[B, 12, 12, N], and the next memory."""
         # Different observations hardly ever have the same hash.
         board = hash_rows(observation.reshape(len(observation), -1)).astype(jnp.int32)
-        is_same = (self.board == board[None]).astype(jnp.float32)
+        is_same = (self.board == board[:, None]).astype(jnp.float32)
         taken = jax.nn.one_hot(self.action, NUM_ACTIONS, dtype=jnp.float32)
-        counts = jnp.einsum("tb,tba->ba", is_same, taken)
+        counts = jnp.einsum("bt,bta->ba", is_same, taken)
         counts = counts.reshape(-1, NUM_DIRECTIONS, NUM_DIRECTIONS)
         action = actions.mode(penalty * counts)
         newest = Repeats(board, action_to_index(action))
-        add = lambda x, old: jnp.concatenate([x[None], old[:-1]])  # noqa: E731
-        return action, jax.tree.map(add, newest, self)
+        return action, jax.tree.map(_push, self, newest)
+
+
+def _push(rows: jax.Array, newest: jax.Array) -> jax.Array:
+    """Puts `newest` [B] before rows [B, K], whose last entries drop out."""
+    return jnp.concatenate([newest[:, None], rows[:, :-1]], axis=1)

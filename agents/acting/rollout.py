@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents.acting.encodings import Cache
+from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes, cells_of
-from agents.acting.frames import Frame
-from agents.acting.repeats import Repeats
+from agents.acting.step import Memory, choose
+from agents.acting.symmetry import Symmetry
 from agents.networks.agent import Agent, Params
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.observation import observe
@@ -22,64 +22,60 @@ class Trajectory(NamedTuple):
     """Episodes and the network's outputs, under the parameters that acted.
 
     Attributes:
-      frame: B frames in which the episodes were played.
-      episodes: B episodes of T steps, in these frames.
-      log_prob: f32[T, B], of the actions.
-      value: f32[T + 1, B, V], one value per head for every observation, including the last.
+      symmetry: B symmetries, by which the boards were turned before the episodes were played.
+      episodes: B episodes of T steps, on the turned boards.
+      log_prob: f32[B, T], of the actions.
+      value: f32[B, T + 1, V], one value per head for every observation, including the last.
     """
 
-    frame: Frame
+    symmetry: Symmetry
     episodes: Episodes
     log_prob: jax.Array
     value: jax.Array
 
 
 def rollout(
-    agent: Agent, params: Params, env: Environment, initial: State, key: jax.Array | None
+    agent: Agent,
+    params: Params,
+    env: Environment,
+    initial: State,
+    key: jax.Array | None,
+    encoding: Encoding | None = None,
 ) -> Trajectory:
     """Plays one episode of T = `env.max_steps` steps from each of B states at time 0.
 
-    Draws the actions with `key`; None takes the most probable ones after `repeat_penalty`. With
-    `align_to_food` the agent acts in frames that face the food.
+    Args:
+      agent: functions of the policy network.
+      params: its parameters.
+      env: dynamics and step limit; its transfers are not used.
+      initial: B states. With `align_to_food` their boards are turned first.
+      key: PRNG key of the draws; None takes the most probable actions after `repeat_penalty`.
+      encoding: encodes observations; by default every one by itself.
     """
-    batch, penalty = len(initial.time), agent.config.repeat_penalty
-    frame = Frame.of(jnp.zeros(batch, jnp.int32))
+    encoding = encoding or Encoding(agent)
+    symmetry = Symmetry.from_index(jnp.zeros(len(initial.time), jnp.int32))
     if agent.config.align_to_food:
-        frame = jax.vmap(Frame.facing_food)(jax.vmap(observe)(initial))
-        initial = jax.vmap(Frame.state)(frame, initial)
+        symmetry = jax.vmap(Symmetry.facing_food)(jax.vmap(observe)(initial))
+        initial = jax.vmap(Symmetry.transform_state)(symmetry, initial)
 
-    def step(carry: Any, time: jax.Array) -> Any:
-        state, embedding, action_tm1, reward_tm1, repeats, cache = carry
-        features, cache = cache.encode(agent, params, state, time)
-        embedding = agent.step(params, embedding, features, action_tm1, reward_tm1)
-        actions, value = agent.policy_and_value(params, embedding)
-        if key is not None:
-            action = actions.sample(jax.random.fold_in(key, time))
-        elif repeats is None:
-            action = actions.mode()
-        else:
-            action, repeats = repeats.choose(actions, penalty, jax.vmap(observe)(state))
-        after, timestep = jax.vmap(env.step)(state, action)
-        taken = {
-            "action": action,
-            "reward": timestep.reward,
-            "discount": timestep.discount,
-            "mask": (~state.done).astype(jnp.float32),
-        }
-        outputs = (cells_of(state), value, taken, actions.log_prob(action))
-        return (after, embedding, action, timestep.reward, repeats, cache), outputs
+    def step(carry: tuple[State, Memory, Any], time: jax.Array) -> Any:
+        state, memory, encoded = carry
+        features, encoded = encoding.step(params, state, time, encoded)
+        step_key = None if key is None else jax.random.fold_in(key, time)
+        observation = jax.vmap(observe)(state)
+        choice, memory = choose(agent, params, memory, features, observation, step_key)
+        after, timestep = jax.vmap(env.step)(state, choice.action)
+        cells = jax.vmap(cells_of)(state)
+        memory = memory._replace(reward_tm1=timestep.reward)
+        mask = (~state.done).astype(jnp.float32)
+        return (after, memory, encoded), (cells, choice, timestep.reward, timestep.discount, mask)
 
-    first = (
-        initial,
-        agent.initial_state(params, batch),
-        jnp.zeros((batch, 2), jnp.int32),
-        jnp.zeros(batch, jnp.float32),
-        Repeats.empty(batch) if penalty and key is None else None,
-        Cache.empty(agent, params, initial, env.max_steps),
-    )
+    memory = Memory.empty(agent, params, len(initial.time), greedy=key is None)
+    carry = (initial, memory, encoding.start(params, initial, env.max_steps))
     # One extra step records the last observation; states no longer change in this step.
     times = jnp.arange(env.max_steps + 1, dtype=jnp.int32)
-    (*_, cache), (cells, value, *outputs) = jax.lax.scan(step, first, times)
-    taken, log_prob = jax.tree.map(lambda x: x[:-1], outputs)
-    episodes = Episodes(initial, cells, **taken, observation_id=cache.observation_id())
-    return Trajectory(frame, episodes, log_prob, value)
+    _, recorded = jax.lax.scan(step, carry, times)
+    cells, choice, *outcome = jax.tree.map(lambda x: x.swapaxes(0, 1), recorded)
+    reward, discount, mask = (x[:, :-1] for x in outcome)
+    episodes = Episodes(initial, cells, choice.action[:, :-1], reward, discount, mask)
+    return Trajectory(symmetry, episodes, choice.log_prob[:, :-1], choice.value)

@@ -20,10 +20,11 @@ class Experience(NamedTuple):
 
     Attributes:
       episodes: B episodes of T steps.
-      features: f32[T + 1, B, F], the observations encoded by `Curiosity.encode`.
-      embedding: f32[T, B, H], the GRU's output h at the step.
-      next_embedding: f32[T, B, H], h', its output after the step, in a second pass.
-      action_embedding: f32[T, B, E], the policy's embedding of the action.
+      features: f32[B, T + 1, F], the observations encoded by `Curiosity.encode`.
+      embedding: f32[B, T, H], the GRU's output h at the step.
+      next_embedding: f32[B, T, H], h', its output after the step, in a second pass; None unless
+        the curiosity `needs_next_embedding`.
+      action_embedding: f32[B, T, E], the policy's embedding of the action.
     """
 
     episodes: Episodes
@@ -37,7 +38,12 @@ class Curiosity:
     """An intrinsic reward. This base class pays 0 and has no parameters and no memory.
 
     All methods are pure functions of arrays. Attributes are settings and modules, never arrays.
+
+    Attributes:
+      needs_next_embedding: whether rewards or losses read `Experience.next_embedding`.
     """
+
+    needs_next_embedding = False
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws parameters, trained together with the policy's; {} if there are none.
@@ -58,14 +64,14 @@ class Curiosity:
         return jnp.zeros((len(observation), 0), jnp.float32)
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
-        """Returns the reward f32[T, B] of every step, before scaling, and the new memory.
+        """Returns the reward f32[B, T] of every step, before scaling, and the new memory.
 
         Values after an episode's end are ignored.
         """
         return jnp.zeros_like(experience.episodes.reward), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
-        """Returns terms of the loss, f32[T, B] each; {} if nothing is trained.
+        """Returns terms of the loss, f32[B, T] each; {} if nothing is trained.
 
         Names end in `_loss`. Values must be finite after an episode's end, too.
         """

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.acting.episodes import CELL_AGENT, CELL_FOOD, CELL_TOOL, Episodes, first_visits
+from agents.acting.episodes import Episodes
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.networks.grouping import hash_rows
+from agents.curiosity.first_visits import first_visits
+from agents.networks.hashing import hash_rows
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 
 NUM_KINDS = 3
@@ -49,7 +50,7 @@ class Effects(Curiosity):
 
 
 def new_effects(episodes: Episodes) -> jax.Array:
-    """Returns f32[3, T, B], 1 where a step has an effect that is new to the episode.
+    """Returns f32[3, B, T], 1 where a step has an effect that is new to the episode.
 
     Food and tool: the object moves to a cell where it has not been. Only agent, food and tool move.
     So the tool's cell is new exactly where the board without agent and food looks new in the
@@ -57,14 +58,20 @@ def new_effects(episodes: Episodes) -> jax.Array:
 
     Grasp: the grasped cell has a colour that the episode has not grasped before.
     """
-    cell = episodes.cells.astype(jnp.int32)
-    cell = cell[..., 0] * BOARD_SIZE + cell[..., 1]
-    moved = [first_visits(cell[..., thing])[1:] for thing in (CELL_FOOD, CELL_TOOL)]
-    hand = episodes.cells[:-1, :, CELL_AGENT].astype(jnp.int32)
+    new_cells = [
+        first_visits(_cell_index(cells))[:, 1:] for cells in (episodes.food, episodes.tool)
+    ]
+    hand = episodes.agent[:, :-1].astype(jnp.int32)
     hand = hand + jnp.asarray(DIRECTIONS)[episodes.action[..., 0]]
     on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
     hand = jnp.clip(hand, 0, BOARD_SIZE - 1)
-    time, episode = np.indices(hand.shape[:2], np.int32)
-    color = hash_rows(episodes.observations()[time, episode, hand[..., 0], hand[..., 1]])
-    is_new = first_visits(jnp.where(on_board, color, OFF_BOARD))
-    return jnp.stack([*moved, jnp.where(on_board, is_new, 0.0)])
+    episode, time = np.indices(hand.shape[:2], np.int32)
+    color = hash_rows(episodes.observations()[episode, time, hand[..., 0], hand[..., 1]])
+    new_colors = first_visits(jnp.where(on_board, color, OFF_BOARD))
+    return jnp.stack([*new_cells, jnp.where(on_board, new_colors, 0.0)])
+
+
+def _cell_index(cells: jax.Array) -> jax.Array:
+    """Returns the indices i32[...] of cells u8[..., 2], row by row."""
+    cells = cells.astype(jnp.int32)
+    return cells[..., 0] * BOARD_SIZE + cells[..., 1]

@@ -43,6 +43,8 @@ class ICM(Curiosity):
     No gradient is stopped, so both losses train the policy's encoder.
     """
 
+    needs_next_embedding = True
+
     def __init__(self, config: Config):
         self._models: Any = Models(config.hidden)
         self._widths = (config.hidden, config.hidden, 2 * config.embedding)
@@ -66,6 +68,6 @@ class ICM(Curiosity):
         }
 
     def predict(self, params: Params, experience: Experience) -> Any:
-        """Returns the squared errors f32[T, B, H] of predicted h', and the inferred action."""
+        """Returns the squared errors f32[B, T, H] of predicted h', and the inferred action."""
         embeddings = experience.embedding, experience.next_embedding
         return self._models.apply(params, *embeddings, experience.action_embedding)

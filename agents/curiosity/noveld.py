@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from agents.acting.episodes import first_visits
 from agents.curiosity.base import Experience, Params
+from agents.curiosity.first_visits import first_visits
 from agents.curiosity.rnd import RND
 
 ALPHA = 0.5  # as in the paper
@@ -24,5 +24,5 @@ class NovelD(RND):
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns the rise of novelty, at first visits."""
         novelty = jnp.linalg.norm(experience.features, axis=-1)
-        rise = jnp.maximum(novelty[1:] - ALPHA * novelty[:-1], 0.0)
-        return rise * first_visits(experience.episodes.observation_id)[1:], memory
+        rise = jnp.maximum(novelty[:, 1:] - ALPHA * novelty[:, :-1], 0.0)
+        return rise * first_visits(experience.episodes.position_ids())[:, 1:], memory

@@ -50,8 +50,8 @@ class RND(Curiosity):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns the sum over units of the squared errors at the next observation."""
-        return jnp.sum(jnp.square(experience.features[1:]), axis=-1), memory
+        return jnp.sum(jnp.square(experience.features[:, 1:]), axis=-1), memory
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """Returns the mean over units of the same errors."""
-        return {"forward_loss": jnp.mean(jnp.square(experience.features[1:]), axis=-1)}
+        return {"forward_loss": jnp.mean(jnp.square(experience.features[:, 1:]), axis=-1)}

@@ -119,8 +119,13 @@ def log_prob(logits: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def discounted_sum(x: jax.Array, discount: float) -> jax.Array:
-    """Returns y_t, the sum of discount^(s - t) x_s over s >= t, f32[B, T]."""
-    return x @ jnp.tril(jax.scipy.linalg.toeplitz(discount ** jnp.arange(x.shape[1])))
+    """Returns y_t = x_t + discount * y_{t+1} for x f32[B, T], from the last step backwards."""
+
+    def add(y: jax.Array, x_t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        y = x_t + discount * y
+        return y, y
+
+    return jax.lax.scan(add, jnp.zeros_like(x[:, 0]), x.T, reverse=True)[1].T
 
 
 class PlainPPO:
@@ -196,9 +201,9 @@ class PlainPPO:
         advantage = mask * jax.nn.standardize(advantage, (0, 1), epsilon=1e-8, where=mask > 0)
         return variance, (episode, advantage, discounted_sum(reward, config.discount))
 
-    def update(self, state: TrainState, batch: Batch, places: jax.Array) -> tuple[TrainState, Any]:
-        """Takes a gradient step on the episodes at `places`; returns the terms of the loss, too."""
-        minibatch = jax.tree.map(lambda x: x[places], batch)
+    def update(self, state: TrainState, batch: Batch, index: jax.Array) -> tuple[TrainState, Any]:
+        """Takes a gradient step on the episodes of `index`; returns the terms of the loss, too."""
+        minibatch = jax.tree.map(lambda x: x[index], batch)
         gradient, terms = jax.grad(self.loss, has_aux=True)(state.params, minibatch)
         return state.apply_gradients(grads=gradient), terms
 
@@ -228,8 +233,8 @@ def main(env: str = NEAR_FOOD.short, iterations: int = 10) -> float:
     state, success = learner.init(jax.random.key(0)), 0.0
     for iteration in range(1, iterations + 1):
         state, batch, minibatches = collect(state)
-        for places in minibatches:
-            state, _ = update(state, batch, places)
+        for index in minibatches:
+            state, _ = update(state, batch, index)
         success = float(batch[0].reward.sum(axis=1).mean())
         print(f"iteration {iteration}: {success:.0%} of the episodes solved")
     return success

@@ -16,5 +16,14 @@ encoders["objects"] = lambda config: ObjectEncoder(config.filters)
 
 
 def make_encoder(config: Config) -> nn.Module:
-    """Builds the encoder that `config.encoder` names."""
-    return encoders.factory(config.encoder)(config)
+    """Builds the encoder that `config.encoder` names; no two calls share parameters.
+
+    Raises:
+      ValueError: the registered factory does not return a Flax Linen module.
+    """
+    module = encoders.factory(config.encoder)(config)
+    if not isinstance(module, nn.Module):
+        raise ValueError(
+            f"encoder {config.encoder!r} must be a flax.linen.Module, got {type(module).__name__}"
+        )
+    return module.clone()

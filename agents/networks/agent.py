@@ -11,7 +11,6 @@ from agents.networks import make_encoder
 from agents.networks.actions import ActionDistribution
 from agents.networks.core import Core, Heads
 from agents.networks.layers import draw
-from agents.networks.windows import encode_rows
 from agents.registry import contract
 from trap_tube_jax.objects import BOARD_SIZE
 
@@ -21,22 +20,27 @@ PARTS = ("encoder", "core", "heads")  # the policy network's parameters
 
 
 class Agent:
-    """Functions of the policy network; their parameters are a dictionary of `PARTS`."""
+    """Functions of the policy network; their parameters are a dictionary of `PARTS`.
 
-    def __init__(self, config: Config):
+    `scan_unroll` is that of `Core`.
+    """
+
+    def __init__(self, config: Config, scan_unroll: int = 1):
         self.config = config
         # Typed as anything, because `apply` returns the results of any method.
         self.encoder: Any = make_encoder(config)
-        self.core: Any = Core(config.hidden, config.embedding, config.recurrent)
+        self.core: Any = Core(config.hidden, config.embedding, config.recurrent, scan_unroll)
         self.heads: Any = Heads(config.num_value_heads)
 
     def init(self, key: jax.Array) -> Params:
         """Draws the parameters."""
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
-        # Only Flax's own layers, in a registered encoder, use the folded key; see `draw`.
-        features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
         with contract("encoder", self.config.encoder):
+            # Only Flax's own layers, in a registered encoder, use the folded key; see `draw`.
+            features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
             chex.assert_shape(features, (1, None))  # [M, F]
+            chex.assert_type(features, jnp.float32)
+            assert set(encoder) <= {"params"}, f"collections {', '.join(encoder)}, not params alone"
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
         params = {
@@ -50,21 +54,34 @@ class Agent:
         """Encodes observations u8[M, 12, 12, N] to f32[M, F]; reads only `params["encoder"]`."""
         return self.encoder.apply(params["encoder"], observation)
 
-    def encode_rows(self, params: Params, observation: jax.Array, remembered: Any = None) -> Any:
-        """Encodes observations by the fast path; see `windows.encode_rows`."""
-        return encode_rows(self.encoder, params["encoder"], observation, remembered)
-
     def initial_state(self, params: Params, batch: int) -> jax.Array:
         """Returns the GRU's state f32[batch, hidden] before the first step."""
         return self.core.apply(params["core"], batch, method=Core.initial_state)
 
-    def step(self, params: Params, state: jax.Array, *inputs: jax.Array) -> jax.Array:
-        """Returns the GRU's state f32[..., hidden] after a step; `inputs` are those of `Core`."""
-        return self.core.apply(params["core"], state, *inputs)
+    def step(
+        self,
+        params: Params,
+        state: jax.Array,
+        features: jax.Array,
+        action_tm1: jax.Array,
+        reward_tm1: jax.Array,
+    ) -> jax.Array:
+        """Returns the GRU's state f32[..., hidden] after a step; see `Core.inputs`."""
+        return self.core.apply(params["core"], state, features, action_tm1, reward_tm1)
 
-    def unroll(self, params: Params, *inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def unroll(
+        self,
+        params: Params,
+        features: jax.Array,
+        action: jax.Array,
+        reward: jax.Array,
+        *,
+        with_next: bool = False,
+    ) -> tuple[jax.Array, jax.Array | None]:
         """Returns the GRU's outputs h at every step, and h' after it; see `Core.unroll`."""
-        return self.core.apply(params["core"], *inputs, method=Core.unroll)
+        return self.core.apply(
+            params["core"], features, action, reward, with_next, method=Core.unroll
+        )
 
     def policy_and_value(
         self, params: Params, state: jax.Array

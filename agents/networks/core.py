@@ -7,6 +7,7 @@ Source: paper, section "Results"; agents/agent.md, "Network".
 """
 
 import functools
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -24,12 +25,17 @@ class Core(nn.Module):
       z, r, n = x W + b_0 and z', r', n' = h R + b_1, each split in three;
       h_t = s(z + z') h_tm1 + (1 - s(z + z')) tanh(n + s(r + r') n').
 
-    Attributes are the settings of these names in `Config`.
+    Attributes:
+      hidden: units of the GRU.
+      embedding: units of each embedding of actions and reward.
+      recurrent: keeps the state between steps.
+      scan_unroll: steps of `unroll` per iteration of its loop; affects only speed.
     """
 
     hidden: int
     embedding: int
     recurrent: bool = True
+    scan_unroll: int = 1
 
     def setup(self) -> None:
         """Declares the parameters."""
@@ -40,8 +46,8 @@ class Core(nn.Module):
         self.reward_embedding = dense(self.embedding)
         self.mix = dense(self.hidden)
         gates = 3 * self.hidden
-        self.input_kernel = self.param("input_kernel", hidden_init, (self.hidden, gates))
-        self.state_kernel = self.param("state_kernel", hidden_init, (self.hidden, gates))
+        self.input_kernel: Any = self.param("input_kernel", hidden_init, (self.hidden, gates))
+        self.state_kernel: Any = self.param("state_kernel", hidden_init, (self.hidden, gates))
         self.bias = self.param("bias", nn.initializers.zeros, (2, gates), jnp.float32)
         self.initial = self.param("initial", nn.initializers.zeros, (self.hidden,), jnp.float32)
 
@@ -88,29 +94,35 @@ class Core(nn.Module):
         return update * state + (1 - update) * candidate
 
     def unroll(
-        self, features: jax.Array, action: jax.Array, reward: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+        self, features: jax.Array, action: jax.Array, reward: jax.Array, with_next: bool
+    ) -> tuple[jax.Array, jax.Array | None]:
         """Runs the GRU over episodes, from the initial state.
 
         Args:
-          features: f32[T + 1, B, F], the encoded observations.
-          action: i32[T, B, 2], (grasp, move).
-          reward: f32[T, B].
+          features: f32[B, T + 1, F], the encoded observations.
+          action: i32[B, T, 2], (grasp, move).
+          reward: f32[B, T].
+          with_next: computes h', too.
 
         Returns:
-          h at every step, f32[T, B, hidden], and h' after every step. h' starts from the initial
-          state at the second observation (agents/agent.md, "Curiosity"). An unused h' is not
-          computed.
+          h at every step, f32[B, T, hidden], and h' after every step, or None. h' starts from the
+          initial state at the second observation (agents/agent.md, "Curiosity").
         """
-        tm1 = [jnp.concatenate([jnp.zeros_like(x[:1]), x]) for x in (action, reward)]
-        inputs = self.inputs(features, *tm1)
+        action_tm1 = jnp.pad(action, ((0, 0), (1, 0), (0, 0)))
+        reward_tm1 = jnp.pad(reward, ((0, 0), (1, 0)))
+        inputs = self.inputs(*(x.swapaxes(0, 1) for x in (features, action_tm1, reward_tm1)))
+        batch = inputs.shape[1]
+        parts = [inputs[:-1], inputs[1:]] if with_next else [inputs[:-1]]
+        inputs = jnp.concatenate(parts, axis=1)  # one scan for both, over twice the batch
 
-        def body(state: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def step(state: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
             state = self.advance(state, x)
             return state, state
 
         start = self.initial_state(inputs.shape[1])
-        return jax.lax.scan(body, start, inputs[:-1])[1], jax.lax.scan(body, start, inputs[1:])[1]
+        _, h = jax.lax.scan(step, start, inputs, unroll=self.scan_unroll)
+        h = h.swapaxes(0, 1)
+        return h[:batch], (h[batch:] if with_next else None)
 
 
 class Heads(nn.Module):

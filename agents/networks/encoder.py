@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.networks.convolution import Conv, max_pool
+from agents.networks.layers import Conv
 from trap_tube_jax.objects import BOARD_SIZE
 
 
@@ -66,3 +66,9 @@ def coordinates_of_cells() -> np.ndarray:
     radius = np.hypot(row, column)
     coordinates = 2 * np.stack([column, row, radius / radius.max()], axis=-1) - 1
     return coordinates.astype(np.float32)
+
+
+def max_pool(x: jax.Array) -> jax.Array:
+    """Takes maxima over 2x2 blocks: f32[M, H, W, C] to f32[M, H / 2, W / 2, C]."""
+    count, height, width, channels = x.shape
+    return jnp.max(x.reshape(count, height // 2, 2, width // 2, 2, channels), axis=(2, 4))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.networks.grouping import hash_rows
+from agents.networks.hashing import hash_rows
 from agents.networks.layers import dense
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS
 from trap_tube_jax.state import base_state

@@ -50,12 +50,12 @@ def update_variance(
 ) -> jax.Array:
     """Moves the variances f32[2] of both rewards towards those of B episodes.
 
-    `intrinsic_reward` is f32[T, B]. Iteration 0 replaces the variances. With separate value heads,
+    `intrinsic_reward` is f32[B, T]. Iteration 0 replaces the variances. With separate value heads,
     the second variance is that of the discounted intrinsic returns.
     """
     if config.value_heads == "separate":
         discount = jnp.full_like(intrinsic_reward, config.discount)
-        intrinsic_reward = returns.discounted_sum(intrinsic_reward, discount)
+        intrinsic_reward = jax.vmap(returns.discounted_sum)(intrinsic_reward, discount)
     rewards = (episodes.reward, intrinsic_reward)
     new = jnp.stack([jnp.var(reward, where=episodes.mask > 0) for reward in rewards])
     keep = jnp.where(iteration == 0, jnp.float32(0), jnp.float32(config.reward_ema_decay))
@@ -75,36 +75,55 @@ def estimate(
     Args:
       config: settings.
       episodes: B episodes of T steps.
-      intrinsic_reward: f32[T, B], 0 after an episode's end.
+      intrinsic_reward: f32[B, T], 0 after an episode's end.
       intrinsic_coef: weight of the intrinsic reward.
-      value: f32[T + 1, B, V], values of all observations. With separate value heads, the first head
+      value: f32[B, T + 1, V], values of all observations. With separate value heads, the first head
         values the extrinsic reward and the second the intrinsic reward; V = 1 without a curiosity.
       variance: f32[2], as returned by `update_variance`; the deviation 0 counts as 1.
 
     Returns:
-      Advantages f32[T, B] and value targets f32[T, B, V].
+      Advantages f32[B, T] and value targets f32[B, T, V].
     """
-    mask, reward = episodes.mask, episodes.reward
     extrinsic_std, intrinsic_std = jnp.where(variance > 0, jnp.sqrt(variance), 1.0)
+    novelty = intrinsic_reward / intrinsic_std
+    reward = episodes.reward
     if config.value_heads == "shared":
-        reward = reward / extrinsic_std + intrinsic_coef * intrinsic_reward / intrinsic_std
-    task, task_target = advantages_and_targets(config, reward, episodes, value[..., 0])
+        reward = reward / extrinsic_std + intrinsic_coef * novelty
+    advantage, target = advantages_and_targets(config, reward, episodes, value[..., 0])
     if config.num_value_heads == 1:
-        return task, task_target[..., None]
-    continues = jnp.concatenate([mask, jnp.zeros_like(mask[:1])]) > 0
-    own = jnp.where(continues, value[..., 1], jnp.mean(value[0, :, 1]))
-    discount = jnp.full_like(intrinsic_reward, config.discount)
-    reward = INTRINSIC_RETURN_STD * intrinsic_reward / intrinsic_std
-    curiosity = returns.generalized_advantages(reward, discount, own, mask, config.gae_lambda)
-    advantage = returns.normalize(task, mask, VARIANCE_FLOOR)
-    advantage += intrinsic_coef * returns.normalize(curiosity, mask, VARIANCE_FLOOR)
-    return advantage, jnp.stack([task_target, curiosity + own[:-1]], axis=-1)
+        return advantage, target[..., None]
+    novelty_advantage, novelty_target = non_episodic(config, novelty, episodes, value[..., 1])
+    advantage = returns.normalize(advantage, episodes.mask, VARIANCE_FLOOR)
+    novelty_advantage = returns.normalize(novelty_advantage, episodes.mask, VARIANCE_FLOOR)
+    targets = jnp.stack([target, novelty_target], axis=-1)
+    return advantage + intrinsic_coef * novelty_advantage, targets
+
+
+def non_episodic(
+    config: Config, novelty: jax.Array, episodes: Episodes, value: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Estimates advantages and targets, f32[B, T] each, of an intrinsic reward of deviation 1.
+
+    The next episode follows an episode's end and is worth the mean of v_0.
+
+    Args:
+      config: settings.
+      novelty: f32[B, T], divided by the standard deviation of its returns.
+      episodes: B episodes of T steps.
+      value: f32[B, T + 1], values of all observations.
+    """
+    continues = jnp.pad(episodes.mask, ((0, 0), (0, 1))) > 0
+    value = jnp.where(continues, value, jnp.mean(value[:, 0]))
+    discount = jnp.full_like(novelty, config.discount)
+    reward = INTRINSIC_RETURN_STD * novelty
+    advantage = _generalized_advantages(reward, discount, value, episodes.mask, config.gae_lambda)
+    return advantage, advantage + value[:, :-1]
 
 
 def advantages_and_targets(
     config: Config, reward: jax.Array, episodes: Episodes, value: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Estimates advantages and value targets, f32[T, B] each, by the rule of `config.bootstrap`.
+    """Estimates advantages and value targets, f32[B, T] each, by the rule of `config.bootstrap`.
 
     `value`: gamma is 0 where a step terminates, a truncated episode bootstraps from the value of
     its last observation, and the target is A_t + v_t. `baseline`: gamma is constant, the last
@@ -112,17 +131,18 @@ def advantages_and_targets(
 
     Args:
       config: settings.
-      reward: f32[T, B], the reward to maximise.
+      reward: f32[B, T], the reward to maximise.
       episodes: B episodes of T steps.
-      value: f32[T + 1, B], values of all observations.
+      value: f32[B, T + 1], values of all observations.
     """
     discount = config.discount * episodes.discount
     if config.bootstrap == "baseline":
-        value = jnp.concatenate([value[:-1], value[-2:-1]])
+        value = jnp.concatenate([value[:, :-1], value[:, -2:-1]], axis=1)
         discount = jnp.full_like(reward, config.discount)
-    advantage = returns.generalized_advantages(
-        reward, discount, value, episodes.mask, config.gae_lambda
-    )
+    advantage = _generalized_advantages(reward, discount, value, episodes.mask, config.gae_lambda)
     if config.bootstrap == "baseline":
-        return advantage, returns.discounted_sum(reward, discount)
-    return advantage, advantage + value[:-1]
+        return advantage, jax.vmap(returns.discounted_sum)(reward, discount)
+    return advantage, advantage + value[:, :-1]
+
+
+_generalized_advantages = jax.vmap(returns.generalized_advantages, in_axes=(0, 0, 0, 0, None))

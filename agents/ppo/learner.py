@@ -7,31 +7,30 @@ Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO"
 """
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
-from agents.acting.encodings import encode_episodes
-from agents.acting.episodes import Episodes, take
+from agents.acting.encoding import Encoding
+from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory, rollout
-from agents.config import MAX_INT32, Config
+from agents.config import Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
 from agents.networks.layers import init_module
 from agents.parallel.devices import ONE_DEVICE, EpisodeAxis
-from agents.ppo import advantages, losses, returns
+from agents.ppo import advantages, losses, machine, returns
 from agents.ppo.motion import MotionHead, motion_loss
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
 from agents.registry import contract, curiosities
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, base_palette
+from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.registry import make
+from trap_tube_jax.state import take
 
 Metrics = dict[str, jax.Array]
 
@@ -66,9 +65,9 @@ class Batch(NamedTuple):
 
     Attributes:
       episodes: the episodes.
-      log_prob: f32[T, B], log-probabilities of the actions under the acting parameters.
-      advantage: f32[T, B], normalised.
-      value_target: f32[T, B, V], one for each value head.
+      log_prob: f32[B, T], log-probabilities of the actions under the acting parameters.
+      advantage: f32[B, T], normalised.
+      value_target: f32[B, T, V], one for each value head.
     """
 
     episodes: Episodes
@@ -77,16 +76,19 @@ class Batch(NamedTuple):
     value_target: jax.Array
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, eq=False)
 class Learner:
     """The parts of training as pure functions of arrays; holds no parameters.
 
-    `init` and `iterate` are all that training needs: jit `iterate`, and vmap both over seeds.
+    `init` and `iterate` are all that training needs: jit `iterate`, and vmap both over seeds. A
+    learner is a pytree without leaves, so it can be an argument of a jitted function.
 
     Attributes:
       config: settings.
       env: environment.
       agent: functions of the policy network.
+      encoding: encodes observations, one by one or faster.
       curiosity: intrinsic reward.
       optimizer: gradient clipping and Adam.
       axis: devices that share the episodes of an iteration.
@@ -95,13 +97,21 @@ class Learner:
     config: Config
     env: Environment
     agent: Agent
+    encoding: Encoding
     curiosity: Curiosity
     optimizer: optax.GradientTransformation
     axis: EpisodeAxis = ONE_DEVICE
 
-    @functools.partial(jax.jit, static_argnums=0)
+    @property
+    def path(self) -> str:
+        """Returns how observations are encoded: `plain`, or `fast` on a CPU."""
+        return self.encoding.name
+
     def init(self, key: jax.Array) -> TrainState:
         """Returns the first state."""
+        return jax.jit(self._init)(key)  # compiled as a whole in a fraction of the time
+
+    def _init(self, key: jax.Array) -> TrainState:
         config = self.config
         params_key, replay_key, key = jax.random.split(key, 3)
         agent_key, curiosity_key, motion_key = jax.random.split(params_key, 3)
@@ -167,12 +177,12 @@ class Learner:
     def play(self, params: Params, reset_keys: jax.Array, action_key: jax.Array) -> Trajectory:
         """Plays one episode from each reset key [B], with sampled actions."""
         initial, _ = jax.vmap(self.env.reset)(reset_keys)
-        return rollout(self.agent, params, self.env, initial, action_key)
+        return rollout(self.agent, params, self.env, initial, action_key, self.encoding)
 
     def intrinsic_reward(self, state: TrainState, trajectory: Trajectory) -> tuple[jax.Array, Any]:
         """Computes the curiosity's reward of every step, under the parameters that acted.
 
-        Returns the reward f32[T, B], 0 after an episode's end, and the curiosity's new memory.
+        Returns the reward f32[B, T], 0 after an episode's end, and the curiosity's new memory.
         """
         experience = self.experience(state.params, trajectory.episodes)
         mask, params = trajectory.episodes.mask, state.params["curiosity"]
@@ -184,7 +194,7 @@ class Learner:
     def make_batch(
         self, state: TrainState, trajectory: Trajectory, intrinsic_reward: jax.Array
     ) -> tuple[Batch, jax.Array]:
-        """Computes advantages and value targets, by intrinsic rewards f32[T, B].
+        """Computes advantages and value targets, by intrinsic rewards f32[B, T].
 
         Returns the batch, and the variances f32[2] of both rewards; see `agents.ppo.advantages`.
         """
@@ -213,10 +223,10 @@ class Learner:
         num_episodes = self.config.episodes_per_iteration // self.axis.size
         minibatch_size = self.config.minibatch_size // self.axis.size
 
-        def step(carry: tuple[Params, Any], places: jax.Array) -> tuple[Any, Metrics]:
+        def step(carry: tuple[Params, Any], index: jax.Array) -> tuple[Any, Metrics]:
             params, opt_state = carry
             gradient, metrics = self.axis.mean(
-                jax.grad(self.loss, has_aux=True)(params, take(batch, places))
+                jax.grad(self.loss, has_aux=True)(params, take(batch, index))
             )
             updates, opt_state = self.optimizer.update(gradient, opt_state, params)
             metrics["gradient_norm"] = optax.tree.norm(gradient)
@@ -275,16 +285,16 @@ class Learner:
 
     def experience(self, params: Params, episodes: Episodes) -> Experience:
         """Returns the curiosity's view of episodes under `params`, differentiable by them."""
-        read = {name: params[name] for name in ("encoder", "curiosity")}
-
-        def encode(params: Params, rows: jax.Array, remembered: Any) -> Any:
-            features, remembered = self.agent.encode_rows(params, rows, remembered)
-            return (features, self.curiosity.encode(params["curiosity"], rows)), remembered
-
-        features, own = encode_episodes(encode, read, episodes, chunk=self.config.encode_chunk_size)
-        embeddings = self.agent.unroll(params, features, episodes.action, episodes.reward)
+        features, curiosity_features = self.encoding.encode_episodes(params, episodes)
+        embedding, next_embedding = self.agent.unroll(
+            params,
+            features,
+            episodes.action,
+            episodes.reward,
+            with_next=self.curiosity.needs_next_embedding,
+        )
         action_embedding = self.agent.embed_action(params, episodes.action)
-        return Experience(episodes, own, *embeddings, action_embedding)
+        return Experience(episodes, curiosity_features, embedding, next_embedding, action_embedding)
 
     def play_metrics(
         self, episodes: Episodes, intrinsic_reward: jax.Array, solved: jax.Array
@@ -294,7 +304,6 @@ class Learner:
             {
                 "episode_length": jnp.mean(episodes.length.astype(jnp.float32)),
                 "intrinsic_reward": jnp.sum(intrinsic_reward) / jnp.sum(episodes.mask),
-                "distinct_observations": jnp.max(episodes.observation_id + 1).astype(jnp.float32),
             }
         )
         new, replayed = jnp.split(solved.astype(jnp.float32), [self.config.num_new])
@@ -307,7 +316,7 @@ class Learner:
 def make_learner(
     config: Config, env: Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
-    """Builds the learner of some settings.
+    """Builds the learner of some settings, as it suits the machine (`agents.ppo.machine`).
 
     Args:
       config: settings.
@@ -320,31 +329,7 @@ def make_learner(
     """
     if env is None:
         env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
-    for name in ("num_features", "max_steps"):
-        if getattr(config, name) not in (None, getattr(env, name)):
-            raise ValueError(
-                f"the environment's {name} is {getattr(env, name)}, the config's "
-                f"{getattr(config, name)}; they must agree"
-            )
-    palettes = (env.base.palette, base_palette(env.num_features))
-    own, known = (np.asarray(palette)[[AGENT, FOOD]].tolist() for palette in palettes)
-    if (config.align_to_food or config.encoder == "objects") and own != known:
-        raise ValueError(
-            "align_to_food and encoder='objects' know agent and food by the colours of the base "
-            f"task, {known}; this environment's are {own}"
-        )
-    longest = config.episodes_per_iteration * env.max_steps
-    if config.max_transitions is not None and config.max_transitions < longest:
-        raise ValueError(
-            f"max_transitions must allow an iteration, which takes up to {longest:,} steps, or be "
-            f"None; got {config.max_transitions:,}"
-        )
-    steps = config.iterations * longest
-    if min(steps, config.max_transitions or steps) > MAX_INT32:
-        raise ValueError(
-            f"iterations={config.iterations} of {config.episodes_per_iteration} episodes of "
-            f"{env.max_steps} steps are {steps:,} steps; allowed: at most {MAX_INT32:,}"
-        )
+    config.validate(env)
     curiosity = curiosities.factory(config.curiosity)(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))
     if axis.size > 1 and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in memory):
@@ -352,4 +337,6 @@ def make_learner(
             f"curiosity {config.curiosity!r} cannot train on several devices: they average its "
             "memory, so its arrays must be floats"
         )
-    return Learner(config, env, Agent(config), curiosity, make_optimizer(config), axis)
+    agent = machine.make_agent(config)
+    encoding = machine.make_encoding(agent, curiosity.encode)
+    return Learner(config, env, agent, encoding, curiosity, make_optimizer(config), axis)

@@ -29,13 +29,13 @@ class MotionHead(nn.Module):
 
 
 def motion_loss(logits: jax.Array, cells: jax.Array) -> jax.Array:
-    """Returns the cross-entropy f32[T, B] of the motion of a step, summed over things and axes.
+    """Returns the cross-entropy f32[B, T] of the motion of a step, summed over things and axes.
 
       loss_t = -sum log p(cells_{t+1} != cells_t)
 
     Args:
-      logits: f32[T, B, 3, 2].
-      cells: integer[T + 1, B, 3, 2], (row, column) of agent, tool and food.
+      logits: f32[B, T, 3, 2].
+      cells: integer[B, T + 1, 3, 2], (row, column) of agent, tool and food.
     """
-    moved = (cells[1:] != cells[:-1]).astype(jnp.float32)
+    moved = (cells[:, 1:] != cells[:, :-1]).astype(jnp.float32)
     return jnp.sum(optax.sigmoid_binary_cross_entropy(logits, moved), axis=(-2, -1))

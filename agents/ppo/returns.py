@@ -1,6 +1,6 @@
-"""Returns and advantages: functions of arrays.
+"""Returns and advantages of one episode: functions of arrays, to vmap over episodes.
 
-Episodes have T steps; step t leads from observation t to observation t + 1. `mask` is 1 on steps
+An episode has T steps; step t leads from observation t to observation t + 1. `mask` is 1 on steps
 before the episode's end, 0 after it.
 
 Source: agents/agent.md, "PPO".
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 
 def discounted_sum(x: jax.Array, discount: jax.Array) -> jax.Array:
-    """Computes y_t = x_t + discount_t * y_{t+1}, y_T = 0, for `x` and `discount` f32[T, ...]."""
+    """Computes y_t = x_t + discount_t * y_{t+1}, y_T = 0, for `x` and `discount` f32[T]."""
     chex.assert_equal_shape([x, discount])
 
     def body(y: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -30,16 +30,16 @@ def generalized_advantages(
     mask: jax.Array,
     lambda_: float | jax.Array,
 ) -> jax.Array:
-    """Computes generalised advantage estimates of padded episodes (Schulman et al., 2016).
+    """Computes the generalised advantage estimates f32[T] of an episode (Schulman et al., 2016).
 
       delta_t = mask_t (r_t + discount_t v_{t+1} - v_t),
       A_t = delta_t + discount_t * lambda * A_{t+1},  A_T = 0.
 
     Args:
-      reward: f32[T, ...].
-      discount: f32[T, ...], gamma, or 0 where a step terminates.
-      value: f32[T + 1, ...], values of all observations.
-      mask: f32[T, ...].
+      reward: f32[T].
+      discount: f32[T], gamma, or 0 where a step terminates.
+      value: f32[T + 1], values of all observations.
+      mask: f32[T].
       lambda_: scalar in [0, 1].
     """
     chex.assert_equal_shape([reward, discount, value[1:], mask])

@@ -7,10 +7,10 @@ import jax
 import numpy as np
 import pandas as pd
 
-from agents.acting.evaluation import Evaluator
 from agents.acting.policy import Policy
 from agents.profiles.subgoals import SUBGOALS, last_subgoals
 from agents.profiles.tasks import PARTS, STRENGTHS, Part, Sampling
+from agents.runs.evaluator import Evaluator
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.solver import solve_batch
 

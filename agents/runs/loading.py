@@ -52,11 +52,11 @@ def load(
         if iteration is not None:
             raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
         import_modules(imports)
-        return read_policy(path)._replace(greedy=greedy)
+        return read_policy(path).replace(greedy=greedy)
     run, options = folder.read(imports)
     name = f"seed {run.seed}"
     if iteration is None and options.evaluate_every and folder.best.is_file():
-        return read_policy(folder.best)._replace(name=name, greedy=greedy)
+        return read_policy(folder.best).replace(name=name, greedy=greedy)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)
     stored = {name: array for name, array in arrays.items() if name.startswith(prefixes)}

@@ -18,8 +18,9 @@ import jax
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluation, Evaluator
+from agents.acting.evaluation import Evaluation
 from agents.files import write_bytes
+from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import Frame, read_rows
 from agents.runs.run import Run

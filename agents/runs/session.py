@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator, evaluate, own_and_paper_sets
+from agents.acting.evaluation import evaluate
 from agents.acting.policy import Policy
 from agents.arrays import from_arrays
 from agents.networks.agent import PARTS
@@ -26,6 +26,7 @@ from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_learner
 from agents.runs import checkpoint, report
 from agents.runs.display import ProgressLine
+from agents.runs.evaluator import Evaluator, own_and_paper_sets
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy, save
 from agents.runs.loggers import open_loggers
@@ -271,7 +272,7 @@ def make_advance(learner: Learner) -> Advance:
 
     def advance(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         after, metrics = learner.iterate(state)
-        outcome = evaluate(learner.agent, after.params, learner.env, tasks)
+        outcome = evaluate(learner.agent, after.params, learner.env, tasks, learner.encoding)
         return after, {
             **metrics,
             "validation_success": outcome.solved,

@@ -90,11 +90,11 @@ def test_the_pages_curiosity_pays_for_a_moved_tool(here):
     start = jax.jit(learner.init)(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), 4)
     trajectory = jax.jit(learner.play)(start.params, keys, jax.random.key(2))
-    assert trajectory.episodes.action.shape == (30, 4, 2)
-    cells = jnp.zeros((31, 4, 3, 2), jnp.uint8).at[5:, 2, 1, 0].set(1)
+    assert trajectory.episodes.action.shape == (4, 30, 2)
+    cells = jnp.zeros((4, 31, 3, 2), jnp.uint8).at[2, 5:, 1, 0].set(1)
     trajectory = trajectory._replace(episodes=trajectory.episodes._replace(cells=cells))
     reward, _ = jax.jit(learner.intrinsic_reward)(start, trajectory)
-    np.testing.assert_array_equal(np.argwhere(reward), [[4, 2]])
+    np.testing.assert_array_equal(np.argwhere(reward), [[2, 4]])
 
 
 def test_devices_and_processes_are_ready_before_a_module_starts_jax(here, capsys, monkeypatch):

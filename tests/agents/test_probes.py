@@ -24,7 +24,6 @@ CONFIG = Config(
     filters=(8, 8),
     hidden=16,
     embedding=4,
-    encode_chunk_size=16,
     value_coef=0.5,
     entropy_coef=1e-3,
     learning_rate=5e-3,
@@ -68,21 +67,21 @@ def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajecto
 
 def test_value_of_a_certain_reward(learn):
     reward, played = learn("value")
-    np.testing.assert_allclose(played.value[0, :, 0], reward, rtol=0.1)
-    np.testing.assert_allclose(played.value[1:-1, :, 0] / reward, 0.0, atol=0.1)
+    np.testing.assert_allclose(played.value[:, 0, 0], reward, rtol=0.1)
+    np.testing.assert_allclose(played.value[:, 1:-1, 0] / reward, 0.0, atol=0.1)
 
 
 def test_value_is_discounted(learn):
     reward, played = learn("discount")
     for time in range(probes.STEPS):
         expected = reward * DISCOUNT ** (probes.STEPS - 1 - time)
-        np.testing.assert_allclose(played.value[time, :, 0], expected, rtol=0.1)
+        np.testing.assert_allclose(played.value[:, time, 0], expected, rtol=0.1)
 
 
 @pytest.mark.parametrize("kind", ["policy", "cue", "credit", "memory"])
 def test_policy_earns_all_there_is(learn, kind):
     _, played = learn(kind)
-    np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=0), 1)
+    np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=1), 1)
 
 
 def test_memory_needs_the_gru(learn):
@@ -94,7 +93,7 @@ def test_memory_needs_the_gru(learn):
 
     def earned(kind: str, seed: int) -> float:
         _, played = learn(kind, remembers=False, seed=seed)
-        return float(jnp.mean(jnp.sum(played.episodes.reward, axis=0)))
+        return float(jnp.mean(jnp.sum(played.episodes.reward, axis=1)))
 
     assert earned("memory", 0) < 0.8
     assert np.median([earned("cue", seed) for seed in range(3)]) == 1

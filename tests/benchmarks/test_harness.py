@@ -12,17 +12,18 @@ import jax.numpy as jnp
 import pytest
 
 from agents.command_line import parse
-from benchmarks import env_throughput, harness, learner_peers, peers, train_throughput
+from benchmarks import env_throughput, harness, learner_peers, peers, seeds, train_throughput
 from paths import ROOT
 
 TIMING = harness.Timing(compile_s=7.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
 RESULTS = ROOT / "benchmarks" / "results"
-MODULES = [env_throughput, peers, train_throughput, learner_peers]
+MODULES = [env_throughput, peers, train_throughput, learner_peers, seeds]
 OPTIONS = {
     "env_throughput": env_throughput.Options,
     "peers": peers.Options,
     "train_throughput": train_throughput.Options,
     "learner_peers": learner_peers.Options,
+    "seeds": seeds.Options,
 }
 
 

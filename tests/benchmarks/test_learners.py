@@ -1,11 +1,15 @@
 """Throughput of training: parts, and the plain program next to ours."""
 
+import importlib
+from types import SimpleNamespace
+
 import pytest
 
 from agents import Config
-from benchmarks import learner_peers, train_throughput
+from agents.command_line import parse
+from benchmarks import accelerator, learner_peers, seeds, train_throughput
 
-TINY = {"filters": (2, 3), "hidden": 4, "embedding": 2, "encode_chunk_size": 4}
+TINY = {"filters": (2, 3), "hidden": 4, "embedding": 2}
 CONFIG = Config(max_steps=4, episodes_per_iteration=4, minibatch_size=2, epochs=2, **TINY)
 STEPS = 4 * 4  # of an iteration
 
@@ -25,3 +29,37 @@ def test_all_programs_play_an_iteration(monkeypatch, timed):
     assert [speed.program for speed in speeds] == ["ours", "plain", "plain-by-step"]
     steps = [speed.steps_per_s * speed.timing.median_s for speed in speeds]
     assert steps == pytest.approx([STEPS] * 3)
+
+
+@pytest.mark.slow
+def test_seeds_in_one_program_play_their_iterations(monkeypatch, timed):
+    options = seeds.Options(iterations=2, repeats=3)
+    for count in (1, 3):
+        speed = seeds.measure(CONFIG, count, options)
+        assert speed.steps_per_s * speed.timing.median_s == pytest.approx(STEPS * 2 * count)
+
+
+@pytest.mark.parametrize("scale", ["MEASUREMENTS", "SMALL"])
+def test_an_accelerators_measurements_are_commands_that_exist(scale, monkeypatch, capsys):
+    """A failed one is named, and the others run."""
+    commands = []
+    codes = iter([1, *[0] * 9])
+
+    def run(command: list[str], **_: object) -> SimpleNamespace:
+        commands.append(command)
+        return SimpleNamespace(returncode=next(codes))
+
+    monkeypatch.setattr(accelerator.subprocess, "run", run)
+    small = scale == "SMALL"
+    failed = accelerator.main(accelerator.Options(small=small))
+    names = list(getattr(accelerator, scale))
+    assert failed == names[:1]
+    assert len(commands) == len(names)
+    for _, _, module, *words in commands:
+        options = importlib.import_module(module).Options
+        parse(options, words, module)
+
+
+def test_an_unknown_measurement_is_refused():
+    with pytest.raises(ValueError, match=r"no measurement 'gpu'; allowed: gpu_paper"):
+        accelerator.main(accelerator.Options(only=("gpu",)))

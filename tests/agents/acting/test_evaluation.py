@@ -9,8 +9,9 @@ import pytest
 
 import trap_tube_jax as tt
 from agents import Config, make_learner
-from agents.acting.evaluation import Evaluation, Evaluator, own_and_paper_sets
+from agents.acting.evaluation import Evaluation
 from agents.ppo.learner import Learner
+from agents.runs.evaluator import Evaluator, own_and_paper_sets
 from easy import assert_same
 from tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
 from trap_tube_jax.registry import PAPER_TASK_SETS

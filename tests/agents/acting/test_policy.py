@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator
 from agents.networks.agent import Agent
+from agents.runs.evaluator import Evaluator
 from easy import COPIES, assert_same
 from tiny_policy import CONFIG, FOOD_CELLS, STEPS, food_next_to_agent, random_policy
 from trap_tube_jax.scoring.tasks import evaluation_tasks
@@ -51,7 +51,7 @@ def test_a_policy_reaches_the_evaluators_outcomes(seed, settings):
     for index, count in enumerate(length):
         np.testing.assert_array_equal(actions[index, :count], played.action[index, :count])
     if settings.keys() & {"align_to_food", "repeat_penalty"}:
-        plain = policy._replace(config=CONFIG)
+        plain = policy.replace(config=CONFIG)
         assert not np.array_equal(actions, drive(plain, tasks)[2])
 
 
@@ -72,13 +72,13 @@ def test_driving_scoring_and_evaluating_have_one_result(own_task_sets):
 
 
 def test_a_policy_may_draw_its_actions():
-    policy = random_policy()._replace(greedy=False)
+    policy = random_policy().replace(greedy=False)
     observation = jax.vmap(tt.observe)(food_next_to_agent())
     draw = jax.jit(lambda key: policy.act(observation, policy.initial(4), key)[0])
     drawn = np.stack([draw(jax.random.key(seed)) for seed in range(8)])
     assert len(np.unique(drawn.reshape(8, -1), axis=0)) > 1
     np.testing.assert_array_equal(draw(jax.random.key(0)), drawn[0])
-    greedy = policy._replace(greedy=True)
+    greedy = policy.replace(greedy=True)
     for key in (None, jax.random.key(0), jax.random.key(1)):
         action, _ = greedy.act(observation, greedy.initial(4), key)
         np.testing.assert_array_equal(action, greedy.act(observation, greedy.initial(4))[0])
@@ -93,7 +93,7 @@ def test_a_policy_may_draw_its_actions():
     ],
 )
 def test_unusable_arguments_are_refused(batch, convert, key, message):
-    policy = random_policy()._replace(greedy=False)
+    policy = random_policy().replace(greedy=False)
     observation = convert(jax.vmap(tt.observe)(food_next_to_agent()))
     with pytest.raises(ValueError, match=message):
         policy.act(observation, policy.initial(batch), None if key is None else jax.random.key(key))
@@ -104,6 +104,6 @@ def test_copies_are_equal(copied):
     policy, agent = random_policy(), Agent(CONFIG)
     carry = policy.initial(2)
     assert_same(copied(policy).params, policy.params)
-    assert copied(policy)._replace(params=None) == policy._replace(params=None)
+    assert copied(policy).replace(params=None) == policy.replace(params=None)
     assert_same(copied(carry), carry)
     assert vars(copied(agent)) == vars(agent)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,38 +25,41 @@ def make(name: str, **settings: Any) -> Any:
     return curiosities.factory(name)(config, tt.make("sy"))
 
 
-def reward_of(name: str, features: Any, observation_id: Any) -> np.ndarray:
-    """Computes rewards [T, B] from features [T + 1, B, F]."""
+def reward_of(name: str, features: Any, column: Any) -> np.ndarray:
+    """Computes rewards [B, T] from features [B, T + 1, F] and the columns of the agent."""
     nothing: Any = None  # in place of arrays that these rewards do not use
-    episodes = Episodes(*[nothing] * 6, observation_id=jnp.array(observation_id))
+    column = jnp.array(column, jnp.uint8)
+    cells = jnp.zeros((*column.shape, 3, 2), jnp.uint8).at[:, :, 0, 1].set(column)
+    layout = jax.tree.map(lambda x: jnp.stack([x] * len(column)), tt.base_state())
+    episodes = Episodes(layout, cells, *[nothing] * 4)
     experience = Experience(episodes, jnp.array(features, jnp.float32))
     return np.asarray(make(name).reward({}, (), experience)[0])
 
 
 BY_HAND = {
     # The squared error at the next observation.
-    "rnd": ([[[3, 4]], [[1, 0]], [[6, 8]]], [[0], [1], [2]], [[1], [100]]),
+    "rnd": ([[[3, 4], [1, 0], [6, 8]]], [[0, 1, 2]], [[1, 100]]),
     # Errors of norms 5, 1, 10, 10 and 2, 4, 1, 9; the last observation of both has been seen.
     "noveld": (
-        [[[3, 4], [2, 0]], [[1, 0], [0, 4]], [[6, 8], [1, 0]], [[6, 8], [0, 9]]],
-        [[0, 5], [1, 6], [2, 7], [2, 5]],
-        [[0, 4 - 1], [10 - 0.5, 0], [0, 0]],
+        [[[3, 4], [1, 0], [6, 8], [6, 8]], [[2, 0], [0, 4], [1, 0], [0, 9]]],
+        [[0, 1, 2, 2], [5, 6, 7, 5]],
+        [[0, 10 - 0.5, 0], [4 - 1, 0, 0]],
     ),
 }
 
 
 @pytest.mark.parametrize("name", BY_HAND)
 def test_rewards_are_those_computed_by_hand(name):
-    features, observation_id, expected = BY_HAND[name]
-    np.testing.assert_allclose(reward_of(name, features, observation_id), expected, rtol=1e-5)
+    features, column, expected = BY_HAND[name]
+    np.testing.assert_allclose(reward_of(name, features, column), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", BY_HAND)
 def test_an_episodes_reward_does_not_depend_on_other_episodes(name):
-    features = np.random.default_rng(0).normal(size=(6, 8, 3))
-    ids = np.random.default_rng(1).integers(0, 4, size=(6, 8))
-    whole = reward_of(name, features, ids)
-    np.testing.assert_array_equal(reward_of(name, features[:, 4:], ids[:, 4:]), whole[:, 4:])
+    features = np.random.default_rng(0).normal(size=(8, 6, 3))
+    column = np.random.default_rng(1).integers(0, 4, size=(8, 6))
+    whole = reward_of(name, features, column)
+    np.testing.assert_array_equal(reward_of(name, features[4:], column[4:]), whole[4:])
     assert np.std(whole) > 0
 
 
@@ -66,7 +70,7 @@ def test_rnd_trains_the_predictor_alone():
     encode = jax.jit(curiosity.encode)
 
     def loss(params):
-        features = encode(params, board)[:, None]
+        features = encode(params, board)[None]
         experience = Experience(None, features)  # pyright: ignore
         return jnp.sum(curiosity.losses(params, experience)["forward_loss"])
 
@@ -82,7 +86,7 @@ def test_rnd_trains_the_predictor_alone():
 def test_encoders_of_a_curiosity_are_of_the_policys_kind(name):
     encoder = make_encoder(small_config(encoder="objects"))
     wanted, found = (
-        jax.tree.map(jnp.shape, jax.eval_shape(init, jax.random.key(0), BOARD))
+        jax.tree.map(jnp.shape, nn.meta.unbox(jax.eval_shape(init, jax.random.key(0), BOARD)))
         for init in (encoder.init, make(name, encoder="objects").init)
     )
     for part in ("target", "predictor"):

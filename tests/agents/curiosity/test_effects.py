@@ -29,13 +29,13 @@ def random_episodes(env: tt.Environment) -> Episodes:
             action = jnp.where(inputs[1], last, inputs[0])
             after, timestep = jax.vmap(env.step)(state, action)
             alive = 1.0 - (state.terminated | state.truncated)
-            return (after, action), (cells_of(after), action, timestep, alive)
+            return (after, action), (jax.vmap(cells_of)(after), action, timestep, alive)
 
         carry = (initial, drawn[0])
         _, (cells, action, timestep, mask) = jax.lax.scan(step, carry, (drawn, keeps))
-        cells = jnp.concatenate([cells_of(initial)[None], cells])
-        steps = (action, timestep.reward, timestep.discount, mask)
-        return Episodes(initial, cells, *steps, jnp.zeros(()))
+        cells = jnp.concatenate([jax.vmap(cells_of)(initial)[None], cells])
+        steps = (cells, action, timestep.reward, timestep.discount, mask)
+        return Episodes(initial, *(x.swapaxes(0, 1) for x in steps))
 
     return jax.jit(play)(jax.random.key(0))
 
@@ -80,9 +80,9 @@ def test_effects_can_be_read_off_the_observations(short):
         if bool(episodes.solved[index]):
             length -= 1  # the agent stands where the food was
         ground = np.asarray(episodes.layout.palette[index, 0])
-        grasps = np.asarray(episodes.action[:length, index, 0])
-        expected = read_off(boards[: length + 1, index], grasps, ground, own)
-        np.testing.assert_array_equal(found[:, :length, index], expected)
+        grasps = np.asarray(episodes.action[index, :length, 0])
+        expected = read_off(boards[index, : length + 1], grasps, ground, own)
+        np.testing.assert_array_equal(found[:, index, :length], expected)
         checked += expected.sum()
     assert checked > 0
 
@@ -92,27 +92,27 @@ def by_hand() -> Episodes:
     """Builds two episodes from columns of agent, tool and food; the second ends after 2 steps."""
     first = [(0, 1, 5), (0, 2, 5), (1, 1, 5), (1, 2, 6), (2, 3, 5)]
     second = [(0, 4, 7), (1, 4, 7), (1, 5, 8), (1, 6, 9), (1, 7, 10)]
-    column = jnp.array([first, second]).swapaxes(0, 1)
+    column = jnp.array([first, second])
     cells = jnp.stack([jnp.zeros_like(column), column], axis=-1).astype(jnp.uint8)
-    mask = jnp.array([[1, 1, 1, 1], [1, 1, 0, 0]], jnp.float32).T
+    mask = jnp.array([[1, 1, 1, 1], [1, 1, 0, 0]], jnp.float32)
     layout = jax.tree.map(lambda x: jnp.stack([x, x]), tt.base_state())
-    action = jnp.zeros((4, 2, 2), jnp.int32)
-    zeros = jnp.zeros((4, 2))
-    return Episodes(layout, cells, action, zeros, zeros + 1, mask, jnp.zeros((5, 2), jnp.int32))
+    action = jnp.zeros((2, 4, 2), jnp.int32)
+    zeros = jnp.zeros((2, 4))
+    return Episodes(layout, cells, action, zeros, zeros + 1, mask)
 
 
 def test_a_return_is_not_new(by_hand):
     food, tool, _ = np.asarray(new_effects(by_hand) * by_hand.mask[None])
-    np.testing.assert_array_equal(tool.T, [[1, 0, 0, 1], [0, 1, 0, 0]])
-    np.testing.assert_array_equal(food.T, [[0, 0, 1, 0], [0, 1, 0, 0]])
+    np.testing.assert_array_equal(tool, [[1, 0, 0, 1], [0, 1, 0, 0]])
+    np.testing.assert_array_equal(food, [[0, 0, 1, 0], [0, 1, 0, 0]])
 
 
 def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
     curiosity = Effects(Config(reward_ema_decay=0.75))
-    experience = Experience(by_hand, jnp.zeros((5, 2, 0)))
+    experience = Experience(by_hand, jnp.zeros((2, 5, 0)))
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)
     np.testing.assert_allclose(memory, [2 / 6, 3 / 6, 0], rtol=1e-6)
-    np.testing.assert_allclose(pay.T, [[2, 0, 3, 2], [0, 5, 0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(pay, [[2, 0, 3, 2], [0, 5, 0, 0]], rtol=1e-6)
     # Rates above 0 are moving averages.
     _, memory = curiosity.reward({}, jnp.array([0.5, 0.1, 0.2]), experience)
     expected = [0.75 * 0.5 + 0.25 / 3, 0.75 * 0.1 + 0.25 / 2, 0.75 * 0.2]

@@ -17,7 +17,6 @@ CONFIG = Config(
     filters=(3, 4),
     hidden=5,
     embedding=2,
-    encode_chunk_size=8,
 )
 
 
@@ -82,9 +81,8 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
         episodes.reward,
         episodes.mask,
         trajectory.log_prob,
-        trajectory.value[:-1, :, 0],
+        trajectory.value[:, :-1, 0],
     )
-    steps = jax.tree.map(lambda x: x.swapaxes(0, 1), (episodes.observations(), *steps))
     start = jax.jit(plain.init)(jax.random.key(0))
 
     def translated(params):  # in 64 bits where the plain program computes in these
@@ -92,11 +90,11 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
 
     plain_state = start.replace(params=translated(state.params))
     variance, (episode, advantage, target) = jax.jit(plain.prepare)(
-        plain_state, plain_ppo.Episode(*steps)
+        plain_state, plain_ppo.Episode(episodes.observations(), *steps)
     )
     total, terms = jax.jit(plain.loss)(translated(now), (episode, advantage, target))
     chex.assert_trees_all_close(
-        [variance, advantage.T, target.T[..., None], {**terms, "loss": total}],
+        [variance, advantage, target[..., None], {**terms, "loss": total}],
         [
             moments,
             batch.advantage,

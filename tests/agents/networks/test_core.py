@@ -17,13 +17,13 @@ def test_a_step_depends_on_the_past_only_with_memory(recurrent):
     config = Config(filters=(2, 2), hidden=4, embedding=2, recurrent=recurrent)
     agent = Agent(config)
     params = jax.jit(agent.init)(jax.random.key(0))
-    action, reward = jnp.zeros((STEPS, BATCH, 2), jnp.int32), jnp.zeros((STEPS, BATCH), jnp.float32)
-    features = jax.random.normal(jax.random.key(1), (STEPS + 1, BATCH, 2), jnp.float32)
+    action, reward = jnp.zeros((BATCH, STEPS, 2), jnp.int32), jnp.zeros((BATCH, STEPS), jnp.float32)
+    features = jax.random.normal(jax.random.key(1), (BATCH, STEPS + 1, 2), jnp.float32)
     unroll = jax.jit(agent.unroll)
     one, _ = unroll(params, features, action, reward)
-    other, _ = unroll(params, features.at[0].add(1.0), action, reward)
-    assert np.all(np.asarray(one[0]) != np.asarray(other[0]))
-    same_later = np.array_equal(one[1:], other[1:])
+    other, _ = unroll(params, features.at[:, 0].add(1.0), action, reward)
+    assert np.all(np.asarray(one[:, 0]) != np.asarray(other[:, 0]))
+    same_later = np.array_equal(one[:, 1:], other[:, 1:])
     assert same_later == (not recurrent)
 
 
@@ -33,3 +33,28 @@ def test_memory_changes_no_parameter():
         for recurrent in (True, False)
     ]
     assert jax.tree.all(jax.tree.map(lambda a, b: a.shape == b.shape, *shapes))
+
+
+def test_h_and_its_next_are_two_unrolls_of_the_gru():
+    """h' starts again at the second observation, with the action and reward before it."""
+    config = Config(filters=(2, 2), hidden=4, embedding=2)
+    agent = Agent(config)
+    params = jax.jit(agent.init)(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), 3)
+    features = jax.random.normal(keys[0], (BATCH, STEPS + 1, 2), jnp.float32)
+    action = jax.random.randint(keys[1], (BATCH, STEPS, 2), 0, 4)
+    reward = jax.random.normal(keys[2], (BATCH, STEPS), jnp.float32)
+    h, h_next = jax.jit(lambda: agent.unroll(params, features, action, reward, with_next=True))()
+    for found, first in ((h, 0), (h_next, 1)):
+        state = agent.initial_state(params, BATCH)
+        for t in range(STEPS):
+            before = first + t - 1
+            action_tm1 = action[:, before] if before >= 0 else jnp.zeros((BATCH, 2), jnp.int32)
+            reward_tm1 = reward[:, before] if before >= 0 else jnp.zeros(BATCH)
+            state = agent.step(params, state, features[:, first + t], action_tm1, reward_tm1)
+            np.testing.assert_allclose(found[:, t], state, rtol=1e-5, atol=1e-6)
+    for unroll in (1, 3):
+        other = Agent(config, scan_unroll=unroll)
+        again, nothing = jax.jit(other.unroll)(params, features, action, reward)
+        assert nothing is None
+        np.testing.assert_allclose(again, h, rtol=1e-5, atol=1e-6)

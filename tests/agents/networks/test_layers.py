@@ -6,12 +6,13 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from agents import Config
 from agents.curiosity.icm import Models
 from agents.networks import make_encoder
 from agents.networks.core import Core, Heads
-from agents.networks.layers import dense, draw, init_module, output_dense
+from agents.networks.layers import Undrawn, dense, draw, init_module, output_dense
 
 
 def test_kernels_have_the_variance_of_their_layer_and_biases_are_zero():
@@ -26,7 +27,7 @@ def test_kernels_have_the_variance_of_their_layer_and_biases_are_zero():
 def scales(module: nn.Module, *inputs: Any) -> dict[str, float]:
     """Returns by path each parameter's standard deviation times the root of its fan-in."""
     found = {}
-    params = jax.jit(module.init)(jax.random.key(0), *inputs)["params"]
+    params = nn.meta.unbox(jax.jit(module.init)(jax.random.key(0), *inputs))["params"]
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         (scale,) = set(np.ravel(leaf * np.sqrt(np.prod(leaf.shape[:-1]))).tolist())
         found["/".join(part.key for part in path)] = round(float(scale), 4)
@@ -49,7 +50,8 @@ def test_every_layer_has_the_scale_of_the_table_in_agent_md():
 
 
 def test_parameters_of_the_same_shape_differ():
-    one, other = draw(jax.random.key(0), [np.ones(9, np.float32), np.ones(9, np.float32)])
+    kernels = [Undrawn(jnp.ones(9, jnp.float32)) for _ in range(2)]
+    one, other = draw(jax.random.key(0), kernels)
     assert not np.any(np.isclose(one, other))
 
 
@@ -61,3 +63,19 @@ def test_layers_of_flax_start_as_flax_initialises_them():
     assert not np.any(np.isclose(one["layers_2"]["kernel"], other["layers_2"]["kernel"]))
     own: Any = nn.Dense(4).init(keys[0], jnp.ones((1, 4)))["params"]["kernel"]
     np.testing.assert_allclose(np.std(one["layers_2"]["kernel"]), np.std(own), rtol=0.5)
+
+
+class Own(nn.Module):
+    """A parameter of NumPy numbers beside a layer of ours."""
+
+    @nn.compact
+    def __call__(self, x):
+        scale: Any = self.param("scale", lambda key: np.ones(4, np.float32))
+        return dense(4)(x) * scale.reshape(1, -1)
+
+
+@pytest.mark.parametrize("module", [Own(), nn.remat(Own)()])
+def test_only_kernels_of_our_layers_are_drawn_whatever_surrounds_them(module):
+    params = init_module(module, jax.random.key(0), jnp.ones((1, 3)))["params"]
+    np.testing.assert_array_equal(params["scale"], 1)
+    assert len(np.unique(params["Dense_0"]["kernel"])) == 12

@@ -25,9 +25,9 @@ def test_the_intrinsic_weight_decays_geometrically():
 def plain_advantages(reward, discount, value, mask, lambda_):
     """Generalised advantages, step by step."""
     found, following = np.zeros_like(reward), 0.0
-    for t in reversed(range(len(reward))):
-        delta = mask[t] * (reward[t] + discount[t] * value[t + 1] - value[t])
-        found[t] = following = delta + discount[t] * lambda_ * following
+    for t in reversed(range(reward.shape[1])):
+        delta = mask[:, t] * (reward[:, t] + discount[:, t] * value[:, t + 1] - value[:, t])
+        found[:, t] = following = delta + discount[:, t] * lambda_ * following
     return found
 
 
@@ -42,24 +42,24 @@ def test_two_streams_step_by_step():
     config = Config.preset("best")
     gamma, lambda_, rate = config.discount, config.gae_lambda, config.reward_ema_decay
     rng = np.random.default_rng(0)
-    value, novelty = rng.normal(size=(6, 2, 2)), rng.random((5, 2))
-    mask, reward, going_on = np.ones((5, 2)), np.zeros((5, 2)), np.ones((5, 2))
-    mask[3:, 0], reward[2, 0], going_on[2:, 0] = 0, 1, 0
+    value, novelty = rng.normal(size=(2, 6, 2)), rng.random((2, 5))
+    mask, reward, going_on = np.ones((2, 5)), np.zeros((2, 5)), np.ones((2, 5))
+    mask[0, 3:], reward[0, 2], going_on[0, 2:] = 0, 1, 0
     novelty *= mask
 
     task = plain_advantages(reward, gamma * going_on, value[..., 0], mask, lambda_)
-    returns_to_come = np.zeros((6, 2))
+    returns_to_come = np.zeros((2, 6))
     for t in reversed(range(5)):
-        returns_to_come[t] = novelty[t] + gamma * returns_to_come[t + 1]
-    variance = rate * 4 + (1 - rate) * returns_to_come[:-1][mask > 0].var()
+        returns_to_come[:, t] = novelty[:, t] + gamma * returns_to_come[:, t + 1]
+    variance = rate * 4 + (1 - rate) * returns_to_come[:, :-1][mask > 0].var()
     own = value[..., 1].copy()
-    own[3:, 0] = own[5:] = own[0].mean()
-    paid, discount = 0.3 * novelty / np.sqrt(variance), np.full((5, 2), gamma)
+    own[0, 3:] = own[:, 5] = own[:, 0].mean()
+    paid, discount = 0.3 * novelty / np.sqrt(variance), np.full((2, 5), gamma)
     curiosity = plain_advantages(paid, discount, own, mask, lambda_)
 
     arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
     zero = jnp.zeros(())
-    episodes = Episodes(tt.base_state(), zero, zero, *arrays, zero)  # pyright: ignore
+    episodes = Episodes(tt.base_state(), zero, zero, *arrays)  # pyright: ignore
     old, intrinsic_reward = jnp.full(2, 4.0), jnp.float32(novelty)
     moments = advantages.update_variance(config, old, jnp.int32(3), episodes, intrinsic_reward)
     advantage, target = advantages.estimate(
@@ -67,8 +67,8 @@ def test_two_streams_step_by_step():
     )
     for found, expected in (
         (advantage, normal(task, mask) + 0.7 * normal(curiosity, mask)),
-        (target[..., 0], task + value[:-1, :, 0]),
-        (target[..., 1], curiosity + own[:-1]),
+        (target[..., 0], task + value[:, :-1, 0]),
+        (target[..., 1], curiosity + own[:, :-1]),
         (moments[1], variance),
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
@@ -78,10 +78,10 @@ def test_without_curiosity_the_task_has_the_only_value():
     config = Config.preset("best", hidden=4, filters=(4, 4), curiosity="none")
     params = jax.eval_shape(make_learner(config).init, jax.random.key(0)).params
     assert params["heads"]["params"]["value"]["kernel"].shape == (4, 1)
-    value = jax.random.normal(jax.random.key(2), (7, 8, 1))
-    ones = jnp.ones((6, 8))
-    episodes = Episodes(tt.base_state(), *[ones] * 6)
-    found = advantages.estimate(config, episodes, jnp.zeros((6, 8)), 3.0, value, jnp.zeros(2))
+    value = jax.random.normal(jax.random.key(2), (8, 7, 1))
+    ones = jnp.ones((8, 6))
+    episodes = Episodes(tt.base_state(), *[ones] * 5)
+    found = advantages.estimate(config, episodes, jnp.zeros((8, 6)), 3.0, value, jnp.zeros(2))
     expected = advantages.advantages_and_targets(config, ones, episodes, value[..., 0])
     assert_same((found[0], found[1][..., 0]), expected)
 
@@ -92,7 +92,7 @@ def test_variances_are_moving_averages():
         rewards, mask = rng.normal(3, 2, (2, 4, 5)), rng.integers(0, 2, (4, 5))
         arrays = (jnp.float32(x) for x in (rewards[0], mask, mask))
         zero = jnp.zeros(())
-        episodes = Episodes(tt.base_state(), zero, zero, *arrays, zero)  # pyright: ignore
+        episodes = Episodes(tt.base_state(), zero, zero, *arrays)  # pyright: ignore
         variance = advantages.update_variance(
             config, variance, jnp.int32(index), episodes, jnp.float32(rewards[1])
         )

@@ -16,8 +16,8 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.acting.episodes import Episodes
-from agents.acting.frames import Frame
 from agents.acting.rollout import Trajectory
+from agents.acting.symmetry import Symmetry
 from agents.arrays import to_arrays
 from agents.curiosity import Curiosity, Experience
 from agents.parallel.devices import EpisodeAxis
@@ -50,25 +50,24 @@ class Scripted(Learner):
 
     def play(self, params, reset_keys, action_key):
         del params, action_key
-        shape = (STEPS, len(reset_keys))
-        reward = jnp.zeros(shape).at[-1].set(SOLVED)
+        shape = (len(reset_keys), STEPS)
+        reward = jnp.zeros(shape).at[:, -1].set(SOLVED)
         episodes = Episodes(
             layout=jax.tree.map(lambda x: jnp.stack([x] * EPISODES), tt.base_state()),
-            cells=jnp.zeros((STEPS + 1, EPISODES, 3, 2), jnp.uint8),
+            cells=jnp.zeros((EPISODES, STEPS + 1, 3, 2), jnp.uint8),
             action=jnp.zeros((*shape, 2), jnp.int32),
             reward=reward,
             discount=1 - reward,
             mask=jnp.ones(shape),
-            observation_id=jnp.zeros((STEPS + 1, len(reset_keys)), jnp.int32),
         )
         value = jax.random.normal(
-            jax.random.key(3), (STEPS + 1, EPISODES, self.config.num_value_heads)
+            jax.random.key(3), (EPISODES, STEPS + 1, self.config.num_value_heads)
         )
-        frame = Frame.of(jnp.zeros(len(reset_keys), jnp.int32))
-        return Trajectory(frame, episodes, jnp.zeros(shape), value)
+        symmetry = Symmetry.from_index(jnp.zeros(len(reset_keys), jnp.int32))
+        return Trajectory(symmetry, episodes, jnp.zeros(shape), value)
 
     def intrinsic_reward(self, state, trajectory):
-        return jax.random.uniform(jax.random.key(4), (STEPS, EPISODES)), state.memory
+        return jax.random.uniform(jax.random.key(4), (EPISODES, STEPS)), state.memory
 
     def update(self, state, batch, key):
         return state.params, state.opt_state, {"advantage": batch.advantage}
@@ -166,7 +165,7 @@ class Counting(Learner):
     """Its gradient is 1 at the episodes of the minibatch."""
 
     def loss(self, params: Any, batch: Any):
-        return jnp.sum(params[batch.log_prob[0]]), {}
+        return jnp.sum(params[batch.log_prob]), {}
 
 
 def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
@@ -174,8 +173,8 @@ def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
     counting = Counting(**{**vars(make_learner(BEST)), "optimizer": recorder(updates)})
     params = jnp.zeros(EPISODES)
     state = TrainState(params, counting.optimizer.init(params), *[None] * 6)  # pyright: ignore
-    number: Any = jnp.arange(EPISODES)[None]
-    batch = learner.Batch(*[number] * 4)
+    index: Any = jnp.arange(EPISODES)
+    batch = learner.Batch(*[index] * 4)
     after, (count, seen), _ = counting.update(state, batch, jax.random.key(0))
     assert count == updates == 3 * 2
     np.testing.assert_array_equal(after, -3)
@@ -234,8 +233,8 @@ class Known(Learner):
 
     def experience(self, params, episodes):
         hidden, width = self.config.hidden, 2 * self.config.embedding
-        outputs = (jnp.zeros((2, 1, hidden)), None, jnp.zeros((2, 1, width)))
-        return Experience(episodes, jnp.zeros((3, 1, 0)), *outputs)
+        outputs = (jnp.zeros((1, 2, hidden)), None, jnp.zeros((1, 2, width)))
+        return Experience(episodes, jnp.zeros((1, 3, 0)), *outputs)
 
 
 def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
@@ -243,14 +242,14 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     weights = {"value_coef": 0.5, "entropy_coef": 0.1, "motion_coef": 0.25, "curiosity_coef": 3.0}
     two_heads = {"curiosity": "effects", "value_heads": "separate", "bootstrap": "value"}
     made = make_learner(Config(**{**SETTINGS, **weights, **two_heads}))
-    own = Returning(losses={"own_loss": jnp.ones((2, 1))})
+    own = Returning(losses={"own_loss": jnp.ones((1, 2))})
     params = jax.eval_shape(made.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
-    mask, cells = jnp.array([[1.0], [0.0]]), jnp.zeros((3, 1, 3, 2), jnp.uint8)
-    episodes = Episodes(tt.base_state(), cells, jnp.zeros((2, 1, 2), jnp.int32), *[mask] * 4)
-    old = jnp.full((2, 1), -2 * np.log(4) - np.log(1.5), jnp.float32)  # clipped to 1.2
-    target = jnp.array([[[3.0, 4.0]], [[9.0, 9.0]]])
-    batch = learner.Batch(episodes, old, jnp.array([[2.0], [9.0]]), target)
+    mask, cells = jnp.array([[1.0, 0.0]]), jnp.zeros((1, 3, 3, 2), jnp.uint8)
+    episodes = Episodes(tt.base_state(), cells, jnp.zeros((1, 2, 2), jnp.int32), *[mask] * 3)
+    old = jnp.full((1, 2), -2 * np.log(4) - np.log(1.5), jnp.float32)  # clipped to 1.2
+    target = jnp.array([[[3.0, 4.0], [9.0, 9.0]]])
+    batch = learner.Batch(episodes, old, jnp.array([[2.0, 9.0]]), target)
     total, found = Known(**{**vars(made), "curiosity": own}).loss(params, batch)
     expected = {
         "policy_loss": -1.2 * 2 / 2,
@@ -279,8 +278,8 @@ def with_curiosity(monkeypatch):
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
-        ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(6, 2\)"),
-        ({"reward": jnp.zeros((6, 2), jnp.int32)}, "'none' .*int32 != float32"),
+        ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(2, 6\)"),
+        ({"reward": jnp.zeros((2, 6), jnp.int32)}, "'none' .*int32 != float32"),
         ({"given": jnp.zeros(2, jnp.int32)}, r"'none' .*\(2,\) != \(\)"),
         ({"losses": ["policy_loss"]}, "must end in '_loss' .* got 'policy_loss'"),
         ({"losses": ["mine"]}, "'none': .* entropy_loss; got 'mine'"),

@@ -6,7 +6,7 @@ import numpy as np
 from agents.ppo.motion import motion_loss
 
 # The agent moves down, the food right; the tool stays.
-CELLS = jnp.array([[[[3, 3], [5, 5], [7, 7]]], [[[4, 3], [5, 5], [7, 8]]]], jnp.uint8)
+CELLS = jnp.array([[[[3, 3], [5, 5], [7, 7]], [[4, 3], [5, 5], [7, 8]]]], jnp.uint8)
 
 
 def test_motion_is_a_change_of_row_or_column():

@@ -79,38 +79,36 @@ def test_parameter_count(ours):
 
 def test_replayed_boards_are_the_recorded_ones(recording, ours):
     boards = jax.jit(lambda episodes: episodes.observations())(ours["trajectory"].episodes)
-    np.testing.assert_array_equal(boards, recording.steps("batch/observation_rgb"))
+    np.testing.assert_array_equal(boards, recording["batch/observation_rgb"])
 
 
 def test_network_outputs(recording, ours):
     trajectory, (error, inferred) = ours["trajectory"], ours["prediction"]
     embedding = ours["experience"].embedding
     actions, _ = ours["learner"].agent.policy_and_value(ours["params"], embedding)
-    assert_close(embedding, recording.steps("out/embedding"))
-    assert_close(trajectory.log_prob, recording.steps("out/log_probs"))
-    assert_close(actions.entropy(), recording.steps("out/entropy"))
-    assert_close(trajectory.value[:-1, :, 0], recording.steps("out/values"))
-    assert_close(ours["experience"].next_embedding, recording.steps("out/embedding_next"))
-    expected = recording.steps("out/embedding_next_pred") - recording.steps("out/embedding_next")
+    assert_close(embedding, recording["out/embedding"])
+    assert_close(trajectory.log_prob, recording["out/log_probs"])
+    assert_close(actions.entropy(), recording["out/entropy"])
+    assert_close(trajectory.value[:, :-1, 0], recording["out/values"])
+    assert_close(ours["experience"].next_embedding, recording["out/embedding_next"])
+    expected = recording["out/embedding_next_pred"] - recording["out/embedding_next"]
     assert_close(error, np.square(expected))
-    predicted = [recording.steps(f"out/{name}_pred") for name in ("move", "grasp")]
+    predicted = [recording[f"out/{name}_pred"] for name in ("move", "grasp")]
     assert_close(jax.nn.softmax(inferred.logits), np.stack(predicted, axis=-2))
 
 
 def test_rewards_and_targets(recording, ours):
     extrinsic_std, intrinsic_std = np.sqrt(ours["moments"])
-    mask = recording.steps("batch/weight")
+    mask = recording["batch/weight"]
     raw = ours["raw"]
-    assert_close(raw * mask, recording.steps("reward/intrinsic") * mask)
+    assert_close(raw * mask, recording["reward/intrinsic"] * mask)
     assert_close(extrinsic_std, recording["reward/extrinsic_std"])
     assert_close(intrinsic_std, recording["reward/intrinsic_std"])
     reward = ours["trajectory"].episodes.reward / extrinsic_std
     reward = reward + CONFIG.intrinsic_coef * raw * mask / intrinsic_std
-    assert_close(reward, recording.steps("reward/total") * mask)
-    assert_close(ours["batch"].advantage, recording.steps("target/advantages") * mask)
-    assert_close(
-        ours["batch"].value_target[..., 0] * mask, recording.steps("target/returns") * mask
-    )
+    assert_close(reward, recording["reward/total"] * mask)
+    assert_close(ours["batch"].advantage, recording["target/advantages"] * mask)
+    assert_close(ours["batch"].value_target[..., 0] * mask, recording["target/returns"] * mask)
 
 
 @pytest.mark.parametrize("index", range(5))

@@ -32,12 +32,12 @@ def test_the_rules_of_bootstrap_differ_at_the_end(bootstrap, end, advantage, tar
     """Rewards are 1, values 10, 20, 30, 40."""
     config = Config(discount=0.5, gae_lambda=0.0, bootstrap=bootstrap)
     nothing: Any = None
-    discount, mask = (jnp.array(x, jnp.float32)[:, None] for x in end)
-    episodes = Episodes(nothing, nothing, nothing, nothing, discount, mask, nothing)
-    value = jnp.array([10.0, 20.0, 30.0, 40.0])[:, None]
+    discount, mask = (jnp.array(x, jnp.float32)[None] for x in end)
+    episodes = Episodes(nothing, nothing, nothing, nothing, discount, mask)
+    value = jnp.array([[10.0, 20.0, 30.0, 40.0]])
     found = advantages.advantages_and_targets(config, mask, episodes, value)
-    np.testing.assert_allclose(found[0][:, 0], advantage)
-    np.testing.assert_allclose(found[1][: len(target), 0], target)
+    np.testing.assert_allclose(found[0][0], advantage)
+    np.testing.assert_allclose(found[1][0, : len(target)], target)
 
 
 def test_normalize():

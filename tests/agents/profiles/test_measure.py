@@ -47,7 +47,7 @@ def test_groups_by_plan_length_rise_and_hold_their_lengths(measured):
 
 
 def test_policies_that_see_different_features_are_refused(policy):
-    other = policy._replace(config=dataclasses.replace(policy.config, num_features=1))
+    other = policy.replace(config=dataclasses.replace(policy.config, num_features=1))
     with pytest.raises(ValueError, match=r"one num_features together, got \[1, 3\]"):
         profile({"mine": policy, "other": other})
 

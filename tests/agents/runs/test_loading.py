@@ -48,7 +48,7 @@ def test_runs_files_and_shipped_agents_are_loaded(run_path, tmp_path, monkeypatc
 def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path):
     path = shutil.copytree(run_path, tmp_path / "copy")
     folder = RunFolder(path)
-    save(folder.best, POLICY._replace(iteration=4))
+    save(folder.best, POLICY.replace(iteration=4))
     assert agents.load(path).iteration == 6, "resumed without --evaluate-every"
     folder.note(folder.read()[0], RunOptions(evaluate_every=2))
     policy = agents.load(path)
@@ -72,9 +72,9 @@ def test_unknown_sources_and_iterations_are_refused(run_path, source, message):
 def test_a_stored_policy_is_the_same(tmp_path):
     path = tmp_path / "mine.safetensors"
     curious = {**POLICY.params, "curiosity": {"of": np.ones(2)}}
-    save(path, POLICY._replace(params=curious))
+    save(path, POLICY.replace(params=curious))
     loaded = read_policy(path)
-    assert loaded._replace(params=None) == POLICY._replace(params=None)
+    assert loaded.replace(params=None) == POLICY.replace(params=None)
     assert_same(loaded.params, POLICY.params)
     with enable_x64(True):
         assert_same(read_policy(path).params, POLICY.params)

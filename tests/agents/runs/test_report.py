@@ -14,8 +14,8 @@ from PIL import Image
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluator
 from agents.runs import display, report
+from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
 from agents.runs.run import Run

@@ -14,9 +14,9 @@ import pytest
 from rich.console import Console
 
 import agents
-from agents.acting import evaluation
+from agents.acting.evaluation import Evaluation
 from agents.ppo.learner import Learner
-from agents.runs import checkpoint, session
+from agents.runs import checkpoint, evaluator, session
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
@@ -62,7 +62,7 @@ def whole(tmp_path_factory):
         return evaluation_tasks(name, number, features, purpose)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (evaluation, session):
+        for module in (evaluator, session):
             patch.setattr(module, "evaluation_tasks", record)
         train_run(path, small_run(), TRACKED)
     return path
@@ -230,7 +230,7 @@ def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch
 
 def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypatch):
     """Whose float32 mean is 0.99999994."""
-    solved = evaluation.Evaluation(jnp.full(41, True), *jnp.ones((3, 41)))
+    solved = Evaluation(jnp.full(41, True), *jnp.ones((3, 41)))
     monkeypatch.setattr(session, "evaluate", lambda *_: solved)
     replace_training(monkeypatch, lambda *returned: returned)
     run = Run(small_config(iterations=3, stop_when_solved=1.0))

@@ -1,8 +1,8 @@
-"""Frames of reference: the board turned and mirrored so that the food is ahead.
+"""Symmetries of the board, which turn and mirror it so that the food is ahead.
 
 The rules are invariant under the eight symmetries of the board, so an agent may see an image of the
 board and act in that image. Choosing the image by the direction of the food at the first
-observation leaves an eighth of the situations to learn. The frame is fixed for the whole episode.
+observation leaves an eighth of the situations to learn. The symmetry holds for the whole episode.
 
 Source: own; Puny et al. (2022) average over frames, and choose them.
 """
@@ -17,8 +17,8 @@ from trap_tube_jax.objects import AGENT, BOARD_SIZE, DOWN, FOOD, LEFT, NUM_DIREC
 from trap_tube_jax.state import State, base_state
 
 
-class Frame(NamedTuple):
-    """One of the eight images of the board.
+class Symmetry(NamedTuple):
+    """One of the eight symmetries of the board.
 
     The flags bool[] mirror the board along the main diagonal, then top to bottom, then left to
     right.
@@ -29,35 +29,36 @@ class Frame(NamedTuple):
     left_right: jax.Array
 
     @staticmethod
-    def of(number: jax.Array) -> "Frame":
-        """Returns frame `number` (0 to 7); 0 is the identity."""
-        return Frame(number % 2 == 1, number // 2 % 2 == 1, number // 4 == 1)
+    def from_index(index: jax.Array) -> "Symmetry":
+        """Returns symmetry `index` (0 to 7); 0 is the identity."""
+        return Symmetry(index % 2 == 1, index // 2 % 2 == 1, index // 4 == 1)
 
     @staticmethod
-    def facing_food(observation: jax.Array) -> "Frame":
-        """Returns the frame with the food below the agent, at most as far to the right as below.
+    def facing_food(observation: jax.Array) -> "Symmetry":
+        """Returns the symmetry that puts the food below the agent.
 
-        Finds both in u8[12, 12, N] by their colours; the identity if one is not visible.
+        The food is then at most as far to the right as below. Finds both in u8[12, 12, N] by their
+        colours; the identity if one is not visible.
         """
         palette = base_state(observation.shape[-1]).palette
         agent, food = (_first_cell(observation, palette[thing]) for thing in (AGENT, FOOD))
         offset = jnp.where(jnp.all(agent >= 0) & jnp.all(food >= 0), food - agent, 0)
         transposed = jnp.abs(offset[1]) > jnp.abs(offset[0])
         offset = jnp.where(transposed, offset[::-1], offset)
-        return Frame(transposed, offset[0] < 0, offset[1] < 0)
+        return Symmetry(transposed, offset[0] < 0, offset[1] < 0)
 
-    def picture(self, board: jax.Array) -> jax.Array:
+    def transform_board(self, board: jax.Array) -> jax.Array:
         """Returns the image of cells [12, 12, ...]."""
         board = jnp.where(self.transposed, board.swapaxes(0, 1), board)
         board = jnp.where(self.top_down, board[::-1], board)
         return jnp.where(self.left_right, board[:, ::-1], board)
 
-    def state(self, state: State) -> State:
+    def transform_state(self, state: State) -> State:
         """Returns the image of a state."""
         extent = jnp.where(self.transposed, state.tool_extent[::-1], state.tool_extent)
         one_cell = jnp.ones_like(extent)
         return state.replace(
-            board=self.picture(state.board),
+            board=self.transform_board(state.board),
             tool_extent=extent,
             agent=self._corner(state.agent, one_cell),
             tool=self._corner(state.tool, extent),
@@ -86,6 +87,6 @@ class Frame(NamedTuple):
 def _first_cell(observation: jax.Array, color: jax.Array) -> jax.Array:
     """Returns the first cell i32[2] of this colour u8[N]; (-1, -1) if there is none."""
     has_color = jnp.all(observation == color[None, None], axis=-1).reshape(-1)
-    place = jnp.argmax(has_color).astype(jnp.int32)
-    cell = jnp.stack([place // BOARD_SIZE, place % BOARD_SIZE])
+    index = jnp.argmax(has_color).astype(jnp.int32)
+    cell = jnp.stack([index // BOARD_SIZE, index % BOARD_SIZE])
     return jnp.where(jnp.any(has_color), cell, -1)

@@ -1,4 +1,4 @@
-"""The eight symmetries of the board, and the frame that faces the food."""
+"""The eight symmetries of the board, and the one that puts the food ahead."""
 
 import jax
 import jax.numpy as jnp
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.acting.frames import Frame
+from agents.acting.symmetry import Symmetry
 from trap_tube_jax.objects import AGENT, FOOD
 
-NUM_FRAMES = 8
-NUMBERS = range(NUM_FRAMES)
+NUM_SYMMETRIES = 8
+NUMBERS = range(NUM_SYMMETRIES)
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +28,11 @@ def states() -> tt.State:
 
 @pytest.fixture(scope="module")
 def images(states) -> tt.State:
-    """The image of every state in every frame, [8, B]."""
-    turn = jax.vmap(lambda frame, state: frame.state(state), in_axes=(None, 0))
-    return jax.jit(jax.vmap(turn, in_axes=(0, None)))(Frame.of(jnp.arange(NUM_FRAMES)), states)
+    """The image of every state under every symmetry, [8, B]."""
+    turn = jax.vmap(lambda symmetry, state: symmetry.transform_state(state), in_axes=(None, 0))
+    return jax.jit(jax.vmap(turn, in_axes=(0, None)))(
+        Symmetry.from_index(jnp.arange(NUM_SYMMETRIES)), states
+    )
 
 
 def mirrored(number: int, pictures: np.ndarray) -> np.ndarray:
@@ -52,7 +54,7 @@ def test_an_image_looks_like_the_mirrored_picture(states, images, number):
     expected = mirrored(number, np.asarray(observe(states)))
     found = observe(one_of(images, number))
     np.testing.assert_array_equal(found, expected)
-    pictures = jax.vmap(Frame.of(jnp.asarray(number)).picture)(observe(states))
+    pictures = jax.vmap(Symmetry.from_index(jnp.asarray(number)).transform_board)(observe(states))
     np.testing.assert_array_equal(pictures, expected)
 
 
@@ -63,22 +65,22 @@ def test_the_rules_are_the_same_in_an_image(states, images):
 
     @jax.jit
     def both(states, images):
-        def in_frame(number, turned):
-            frame = Frame.of(number)
-            after, _ = jax.vmap(env.step)(states, frame.original_action(actions))
-            return jax.vmap(frame.state)(after), jax.vmap(env.step)(turned, actions)[0]
+        def turned_step(number, turned):
+            symmetry = Symmetry.from_index(number)
+            after, _ = jax.vmap(env.step)(states, symmetry.original_action(actions))
+            return jax.vmap(symmetry.transform_state)(after), jax.vmap(env.step)(turned, actions)[0]
 
-        return jax.vmap(in_frame)(jnp.arange(NUM_FRAMES), images)
+        return jax.vmap(turned_step)(jnp.arange(NUM_SYMMETRIES), images)
 
     expected, found = both(states, images)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
-def test_a_state_and_its_images_are_equal_in_their_frames_that_face_the_food(states, images):
+def test_a_state_and_its_images_are_equal_once_turned_to_the_food(states, images):
 
     def seen(state):
-        frame = Frame.facing_food(tt.observe(state))
-        return frame.state(state)
+        symmetry = Symmetry.facing_food(tt.observe(state))
+        return symmetry.transform_state(state)
 
     turned = jax.jit(jax.vmap(jax.vmap(seen)))(images)
     offset = np.asarray(turned.food - turned.agent)
@@ -88,11 +90,13 @@ def test_a_state_and_its_images_are_equal_in_their_frames_that_face_the_food(sta
     unique = (offset[0, :, 0] > offset[0, :, 1]) & (offset[0, :, 1] > 0)
     assert 0.5 < unique.mean() < 1
     boards = np.asarray(jax.vmap(jax.vmap(tt.observe))(turned))
-    np.testing.assert_array_equal(boards[:, unique], np.repeat(boards[:1, unique], NUM_FRAMES, 0))
+    np.testing.assert_array_equal(
+        boards[:, unique], np.repeat(boards[:1, unique], NUM_SYMMETRIES, 0)
+    )
 
 
 @pytest.mark.parametrize("hidden", [AGENT, FOOD])
-def test_the_frame_is_the_identity_where_agent_or_food_is_hidden(hidden):
+def test_the_symmetry_is_the_identity_where_agent_or_food_is_hidden(hidden):
     shown = tt.base_state().palette[AGENT + FOOD - hidden]
     board = jnp.zeros((12, 12, 3), jnp.uint8).at[2, 7].set(shown)
-    assert not any(bool(part) for part in Frame.facing_food(board))
+    assert not any(bool(part) for part in Symmetry.facing_food(board))

@@ -1,4 +1,4 @@
-"""Fast path: applies a function to only the first rows, chunk by chunk, and differentiates it.
+"""Applies a function to only the first rows, chunk by chunk, and differentiates it.
 
 Observations repeat, and encoding them takes nearly all of the time. So distinct observations are
 put first, and only distinct observations are encoded. Chunks have a fixed size; their number
@@ -51,8 +51,8 @@ def _map_rows_forward(
 
     def body(index: jax.Array, tables: tuple[Any, Any]) -> tuple[Any, Any]:
         features, memory = fn(params, take(parts, index), None)
-        place = jnp.minimum(index, num_remembered)  # the last place is for all others
-        return _put(tables[0], index, features), _put(tables[1], place, memory)
+        row = jnp.minimum(index, num_remembered)  # the last row absorbs the overflow
+        return _put(tables[0], index, features), _put(tables[1], row, memory)
 
     tables = _table(num_chunks, shapes[0]), _table(num_remembered + 1, shapes[1])
     features, memory = jax.lax.fori_loop(0, _num_chunks(count, chunk), body, tables)
@@ -129,8 +129,8 @@ def _cut(rows: Any, chunk: int) -> tuple[Any, int, int]:
     return jax.tree.map(cut, rows), num_chunks, chunk
 
 
-def _put(table: Any, place: jax.Array, rows: Any) -> Any:
-    return jax.tree.map(lambda x, new: x.at[place].set(new), table, rows)
+def _put(table: Any, index: jax.Array, rows: Any) -> Any:
+    return jax.tree.map(lambda x, new: x.at[index].set(new), table, rows)
 
 
 def _table(length: int, shapes: Any) -> Any:

@@ -1,36 +1,35 @@
-"""Fast path: convolutions as matrix products of patches with the kernel, and max pooling.
+"""Convolutions as matrix products of patches with the kernel.
 
 On a CPU, matrix products are faster than XLA's convolutions, whose derivatives are slow. Results
 equal those of Flax's convolutions up to rounding.
 """
 
+import contextlib
 import functools
 import itertools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from agents.networks.layers import as_row, hidden_init
+from agents.networks.layers import Conv, as_row
 
 
-class Conv(nn.Module):
-    """A convolution with `size` x `size` kernels, stride 1 and `features` output channels.
+@contextlib.contextmanager
+def convolutions_as_products() -> Iterator[None]:
+    """Computes every `Conv` of Flax modules as a matrix product."""
 
-    Padding keeps the board's size; even kernels pad more below and to the right.
-    """
+    def replace(call: Callable[..., Any], args: Any, kwargs: Any, context: Any) -> Any:
+        if type(context.module) is not Conv or context.method_name != "__call__":
+            return call(*args, **kwargs)
+        (x,) = args
+        weights = context.module.variables["params"]
+        return convolve(x, weights["kernel"]) + as_row(weights["bias"], x.ndim)
 
-    features: int
-    size: int
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps f32[M, H, W, C_in] to f32[M, H, W, features]."""
-        shape = (self.size, self.size, x.shape[-1], self.features)
-        kernel = self.param("kernel", hidden_init, shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,), jnp.float32)
-        return convolve(x, kernel) + as_row(bias, x.ndim)
+    with nn.intercept_methods(replace):
+        yield
 
 
 def patches(x: jax.Array, size: int, stride: int = 1) -> jax.Array:
@@ -90,9 +89,3 @@ def _convolve_backward(residuals: Any, cotangent: jax.Array) -> tuple[jax.Array,
 
 
 convolve.defvjp(lambda x, kernel: (convolve(x, kernel), (x, kernel)), _convolve_backward)
-
-
-def max_pool(x: jax.Array) -> jax.Array:
-    """Takes maxima over 2x2 blocks: f32[M, H, W, C] to f32[M, H / 2, W / 2, C]."""
-    count, height, width, channels = x.shape
-    return jnp.max(x.reshape(count, height // 2, 2, width // 2, 2, channels), axis=(2, 4))

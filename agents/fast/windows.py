@@ -1,4 +1,4 @@
-"""Fast path: same features and gradient as encoder.py, its first layers once per distinct window.
+"""Encodes as networks/encoder.py does, its first layers once per distinct window.
 
 Up to its first pooling, the encoder maps a 4x4 window of the observation to the features of one 2x2
 block of the board. An observation is 36 windows, most of which repeat: one step changes a handful.
@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.networks import chunks
-from agents.networks.convolution import add_patches, convolve, max_pool, patches
-from agents.networks.encoder import Encoder, coordinates_of_cells, scaled
-from agents.networks.grouping import group_rows
+from agents.fast import chunks
+from agents.fast.convolution import add_patches, convolve, patches
+from agents.fast.grouping import group_rows
+from agents.networks.encoder import coordinates_of_cells, max_pool, scaled
 from agents.networks.layers import as_row
 from trap_tube_jax.objects import BOARD_SIZE
 
@@ -28,18 +28,13 @@ WINDOW_CHUNK = 128  # distinct windows encoded at once; affects results only by 
 Weights = Any  # nested dictionaries of arrays: the parameters of `Encoder`, or of a layer in it
 
 
-def encode_rows(
-    encoder: nn.Module, params: Any, observation: jax.Array, remembered: Any = None
-) -> tuple[Any, Any]:
-    """Encodes observations u8[M, 12, 12, N], by windows if the encoder is the paper's.
+def encode_rows(params: Any, observation: jax.Array, remembered: Any = None) -> tuple[Any, Any]:
+    """Encodes observations u8[M, 12, 12, N] by the parameters of `networks.encoder.Encoder`.
 
     Returns:
-      The features f32[M, F], and the memory for `chunks.map_rows`: results of matrix products, or
-      None with another encoder. Features by windows are differentiable only with respect to
-      `params`.
+      The features f32[M, F], differentiable only by `params`, and the memory for `chunks.map_rows`:
+      results of matrix products.
     """
-    if type(encoder) is not Encoder:  # a subclass may compute something else
-        return encoder.apply(params, observation), None
     weights = params["params"]
     window = cut_into_windows(observation)
     block = jnp.tile(jnp.arange(BLOCKS**2, dtype=jnp.uint8), len(observation))
@@ -51,7 +46,7 @@ def encode_rows(
 
     features: Any = chunks.map_rows(encode, WINDOW_CHUNK, weights, rows, groups.total)
     shape = (len(observation), BLOCKS, BLOCKS, -1)
-    x, spread = (table[groups.number].reshape(shape) for table in features)
+    x, spread = (table[groups.group_id].reshape(shape) for table in features)
     return encode_blocks(weights, x, spread, remembered)
 
 

@@ -3,17 +3,18 @@
 import functools
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.networks import chunks
-from agents.networks.convolution import convolve
+from agents.fast import chunks
+from agents.fast.convolution import convolutions_as_products, convolve
+from agents.fast.windows import encode_rows
 from agents.networks.encoder import Encoder
-from agents.networks.layers import init_module
-from agents.networks.windows import encode_rows
+from agents.networks.layers import Conv, init_module
 
 EPISODES, STEPS = 3, 6
 encoder = Encoder((4, 6))
@@ -63,8 +64,7 @@ plain = features_and_gradient(encoder.apply)
 
 
 def by_windows(params: Any, observation: jax.Array) -> Any:
-    fast = functools.partial(encode_rows, encoder)
-    return chunks.map_rows(fast, 4, params, observation, jnp.int32(len(observation)))
+    return chunks.map_rows(encode_rows, 4, params, observation, jnp.int32(len(observation)))
 
 
 # Nothing is remembered for the derivative, or all; compiled once for all task sets.
@@ -104,3 +104,18 @@ def test_convolution_and_its_derivatives_are_those_of_jax(size):
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
     for ours, theirs in zip(pulled, expected, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
+
+
+def test_layers_convolve_by_products_only_where_asked():
+    """One layer of the paper's encoder, and one of another kind, which stays as it is."""
+    x = jax.random.normal(jax.random.key(0), (2, 6, 6, 3))
+    ours, other = Conv(4, 3), nn.Conv(4, (3, 3), padding="VALID")
+    for layer in (ours, other):
+        params = init_module(layer, jax.random.key(1), x)
+        plain: Any = layer.apply(params, x)
+        with convolutions_as_products():
+            found: Any = layer.apply(params, x)
+            program = jax.make_jaxpr(layer.apply)(params, x)
+        np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-5)
+        primitives = {equation.primitive.name for equation in program.eqns}
+        assert ("conv_general_dilated" in primitives) == (layer is other)

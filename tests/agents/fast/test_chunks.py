@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.networks import chunks, grouping
+from agents.fast import chunks, grouping
 
 ROWS, WIDTH = 37, 5
 
@@ -19,13 +19,13 @@ def test_groups_hold_equal_rows_and_all_of_them_unless_hashes_collide(bits, monk
     _, expected = np.unique(rows, axis=0, return_inverse=True)
     if bits is None:
         groups = grouping.group(*jnp.asarray(rows.T))
-        np.testing.assert_array_equal(groups.number, expected)
+        np.testing.assert_array_equal(groups.group_id, expected)
     else:
         monkeypatch.setattr(grouping, "GROUPING_BITS", bits)
         groups = grouping.group_rows(jnp.asarray(rows))
-    representative = np.asarray(groups.representative)[np.asarray(groups.number)]
+    representative = np.asarray(groups.representative)[np.asarray(groups.group_id)]
     np.testing.assert_array_equal(rows[representative], rows)
-    assert groups.total == np.max(groups.number) + 1
+    assert groups.total == np.max(groups.group_id) + 1
     assert (groups.total > expected.max() + 1) == (bits == 0)
 
 

@@ -1,0 +1,9 @@
+"""The fast path of acting and learning on a CPU.
+
+Everything here is an optimisation: `FastEncoding` has the results of `agents.acting.Encoding` up to
+rounding. Without this folder everything else works as it is.
+"""
+
+from agents.fast.encoding import FastEncoding
+
+__all__ = ["FastEncoding"]

@@ -1,0 +1,35 @@
+"""Suits training to the machine: the one place that tells a CPU from an accelerator.
+
+A CPU gains from encoding each distinct observation once, in small chunks. A GPU or TPU loses by it:
+such a chunk is dozens of small kernels, launched by a loop whose length depends on the data. An
+accelerator gains from unrolling the GRU instead, whose kernels are small, too.
+"""
+
+import importlib.util
+
+import jax
+
+from agents.acting.encoding import EncodeFn, Encoding, no_features
+from agents.config import Config
+from agents.networks.agent import Agent
+
+UNROLLED_STEPS = 10  # of the GRU, per iteration of its loop on an accelerator
+
+
+def on_cpu() -> bool:
+    """Returns whether JAX computes on a CPU by default."""
+    return jax.default_backend() == "cpu"
+
+
+def make_agent(config: Config) -> Agent:
+    """Builds the policy network; its parameters are the same on every machine."""
+    return Agent(config, scan_unroll=1 if on_cpu() else UNROLLED_STEPS)
+
+
+def make_encoding(agent: Agent, encode_for_curiosity: EncodeFn = no_features) -> Encoding:
+    """Chooses the fast path on a CPU and the plain path elsewhere."""
+    if on_cpu() and importlib.util.find_spec("agents.fast") is not None:
+        from agents.fast import FastEncoding  # noqa: PLC0415  everything works without it
+
+        return FastEncoding(agent, encode_for_curiosity)
+    return Encoding(agent, encode_for_curiosity)

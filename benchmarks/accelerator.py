@@ -1,0 +1,89 @@
+"""All measurements of an accelerator in one command: `python -m benchmarks.accelerator`.
+
+Runs other benchmarks one after another, each in a process of its own, which it stops after a time
+limit. A benchmark that fails or is stopped does not keep the others from running. Every record is
+written as soon as it is measured.
+"""
+
+import dataclasses
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from agents.command_line import parse
+from trap_tube_jax.command_line import plain_errors
+
+# The module and its options, by the name of the record. `gpu_best_second_start` finds the programs
+# that `gpu_best_first_start` has compiled.
+MEASUREMENTS: dict[str, str] = {
+    "gpu_paper": "learner_peers --sets pstsy --networks paper --programs ours plain "
+    "--episodes-per-iteration 1024 --minibatch-size 128 --epochs 10",
+    "gpu_best": "seeds --preset best --seeds 1 8",
+    "gpu_fast": "seeds --preset fast --seeds 1 8",
+    "gpu_best_first_start": "seeds --preset best --seeds 8 --cache",
+    "gpu_best_second_start": "seeds --preset best --seeds 8 --cache",
+    "gpu_rejax": "learner_peers --sets base --networks dense",
+    "gpu_peers": "peers --num-envs 4096 65536 524288",
+}
+# The same on the smallest scale, to try the command on a CPU.
+SMALL: dict[str, str] = {
+    "gpu_paper": "learner_peers --sets pstsy --networks paper --programs ours plain "
+    "--episodes-per-iteration 4 --minibatch-size 4 --repeats 1",
+    "gpu_fast": "seeds --preset fast --sets base --seeds 1 2 --iterations 1 --repeats 1",
+    "gpu_peers": "peers --num-envs 16 --num-steps 8 --sets base",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Runs the benchmarks of a GPU or TPU and writes their records.
+
+    Attributes:
+      output: folder for the records; needs committed code. Without it, prints only.
+      only: names of the records to measure, by default all.
+      limit: seconds after which a benchmark is stopped.
+      small: measures almost nothing, to try the command.
+    """
+
+    output: Path | None = None
+    only: tuple[str, ...] = ()
+    limit: int = 500
+    small: bool = False
+
+
+def main(options: Options) -> list[str]:
+    """Runs the benchmarks; returns the names of those that failed.
+
+    Raises:
+      ValueError: a name is unknown.
+    """
+    measurements = SMALL if options.small else MEASUREMENTS
+    for name in options.only:
+        if name not in measurements:
+            raise ValueError(f"no measurement {name!r}; allowed: {', '.join(measurements)}")
+    names = options.only or tuple(measurements)
+    failed = [name for name in names if not run(name, measurements[name].split(), options)]
+    print(f"failed: {', '.join(failed) or 'none'}")
+    return failed
+
+
+def run(name: str, words: list[str], options: Options) -> bool:
+    """Runs one benchmark; returns whether it succeeded."""
+    command = [sys.executable, "-m", f"benchmarks.{words[0]}", *words[1:]]
+    if options.output is not None:
+        command += ["--output", str(options.output / f"{name}.json")]
+    print(f"== {name}: {' '.join(command[1:])}", flush=True)
+    start = time.perf_counter()
+    try:
+        code = subprocess.run(command, timeout=options.limit, check=False).returncode
+    except subprocess.TimeoutExpired:
+        code = None
+    outcome = "stopped" if code is None else f"exit code {code}"
+    print(f"== {name}: {outcome} after {time.perf_counter() - start:.0f} s", flush=True)
+    return code == 0
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        sys.exit(bool(main(parse(Options, None, "python -m benchmarks.accelerator"))))
