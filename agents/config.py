@@ -98,6 +98,7 @@ class Config:
       embedding: units of each embedding of actions and reward.
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.
+      previous_inputs: feeds the previous action and reward to the GRU.
     """
 
     env_id: str = _task("TrapTube-v0", flags=("--env",))
@@ -142,6 +143,7 @@ class Config:
     hidden: int = _network(64, 1, 65_536)
     embedding: int = _network(8, 1, 65_536)
     recurrent: bool = _network(True)
+    previous_inputs: bool = _network(True)
 
     def __post_init__(self) -> None:
         """Raises ValueError for an invalid setting, naming its value and the allowed ones."""

@@ -29,7 +29,13 @@ class Agent:
         self.config = config
         # Typed as anything, because `apply` returns the results of any method.
         self.encoder: Any = make_encoder(config)
-        self.core: Any = Core(config.hidden, config.embedding, config.recurrent, scan_unroll)
+        self.core: Any = Core(
+            config.hidden,
+            config.embedding,
+            config.recurrent,
+            config.previous_inputs,
+            scan_unroll,
+        )
         self.heads: Any = Heads(config.num_value_heads)
 
     def init(self, key: jax.Array) -> Params:
@@ -52,7 +58,8 @@ class Agent:
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Encodes observations u8[M, 12, 12, N] to f32[M, F]; reads only `params["encoder"]`."""
-        return self.encoder.apply(params["encoder"], observation)
+        with contract("encoder", self.config.encoder):
+            return self.encoder.apply(params["encoder"], observation)
 
     def initial_state(self, params: Params, batch: int) -> jax.Array:
         """Returns the GRU's state f32[batch, hidden] before the first step."""

@@ -29,12 +29,14 @@ class Core(nn.Module):
       hidden: units of the GRU.
       embedding: units of each embedding of actions and reward.
       recurrent: keeps the state between steps.
+      previous_inputs: reads the previous action and reward, besides the features.
       scan_unroll: steps of `unroll` per iteration of its loop; affects only speed.
     """
 
     hidden: int
     embedding: int
     recurrent: bool = True
+    previous_inputs: bool = True
     scan_unroll: int = 1
 
     def setup(self) -> None:
@@ -67,8 +69,10 @@ class Core(nn.Module):
           action_tm1: i32[..., 2], the previous (grasp, move); zeros at the first step.
           reward_tm1: f32[...], the previous reward; 0 at the first step.
         """
-        reward = nn.swish(self.reward_embedding(reward_tm1[..., None]))
-        parts = [features, self.embed_action(action_tm1), reward]
+        action = self.embed_action(action_tm1)  # in any case, since other networks read it
+        parts = [features]
+        if self.previous_inputs:
+            parts += [action, nn.swish(self.reward_embedding(reward_tm1[..., None]))]
         x = nn.swish(self.mix(jnp.concatenate(parts, axis=-1)))
         return x @ self.input_kernel + as_row(self.bias[0], x.ndim)
 

@@ -3,6 +3,7 @@
 import json
 import math
 
+import jax
 import numpy as np
 import pytest
 
@@ -19,6 +20,8 @@ def test_presets_survive_json_and_train_without_curiosity_and_in_an_environment_
     own = tt.make("sy", max_steps=9)
     for each in (config, Config.preset(name, curiosity="none")):
         assert make_learner(each, own).env is own
+    blind = make_learner(Config.preset(name, previous_inputs=False), own)
+    jax.eval_shape(blind.iterate, jax.eval_shape(blind.init, jax.random.key(0)))
 
 
 @pytest.mark.parametrize(

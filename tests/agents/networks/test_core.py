@@ -58,3 +58,18 @@ def test_h_and_its_next_are_two_unrolls_of_the_gru():
         again, nothing = jax.jit(other.unroll)(params, features, action, reward)
         assert nothing is None
         np.testing.assert_allclose(again, h, rtol=1e-5, atol=1e-6)
+
+
+def test_previous_inputs_are_read_unless_left_out():
+    """Without them, episodes of equal observations have equal outputs, whatever was done."""
+    features = jax.random.normal(jax.random.key(1), (1, STEPS + 1, 2), jnp.float32)
+    features = jnp.concatenate([features, features])
+    action = jnp.stack([jnp.zeros((STEPS, 2), jnp.int32), jnp.ones((STEPS, 2), jnp.int32)])
+    reward = jnp.zeros((2, STEPS), jnp.float32)
+    for previous_inputs in (True, False):
+        config = Config(filters=(2, 2), hidden=4, embedding=2, previous_inputs=previous_inputs)
+        agent = Agent(config)
+        params = jax.jit(agent.init)(jax.random.key(0))
+        h, _ = jax.jit(agent.unroll)(params, features, action, reward)
+        np.testing.assert_array_equal(h[0, 0], h[1, 0])
+        assert np.array_equal(h[0], h[1]) == (not previous_inputs)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from flax import nnx
 
 import trap_tube_jax as tt
 from agents import Config, make_learner
@@ -20,12 +21,14 @@ from agents.acting.rollout import Trajectory
 from agents.acting.symmetry import Symmetry
 from agents.arrays import to_arrays
 from agents.curiosity import Curiosity, Experience
+from agents.networks.encoder import Encoder
 from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
 from agents.registry import curiosities, encoders
 from easy import rows
 from small_runs import SETTINGS
+from trap_tube_jax.objects import AGENT
 
 BEST = Config.preset(
     "best",
@@ -39,6 +42,15 @@ BEST = Config.preset(
 PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
 STEPS, EPISODES = 6, 8
 OWN_COLORS = tt.Environment(base=tt.base_state().replace(palette=255 - tt.base_state().palette))
+
+
+def recolour(key: jax.Array, state: tt.State) -> tt.State:
+    """Draws a colour for the agent."""
+    color = jax.random.randint(key, (3,), 0, 256).astype(jnp.uint8)
+    return state.replace(palette=state.palette.at[AGENT].set(color))
+
+
+RECOLOURED = tt.Environment((tt.perceptual, recolour))
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
 
@@ -292,14 +304,78 @@ def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returne
         jax.eval_shape(own.iterate, own.init(jax.random.key(0)))
 
 
-def test_an_encoder_of_maps_is_refused(monkeypatch):
-    class Maps(nn.Module):
-        def __call__(self, observation):
-            return observation.astype(jnp.float32)
+class Maps(nn.Module):
+    """Returns maps instead of vectors."""
 
-    monkeypatch.setitem(encoders, "maps", lambda config: Maps())
-    with pytest.raises(ValueError, match=r"encoder 'maps' .*\(1, 12, 12, 3\)"):
-        make_learner(Config(encoder="maps")).init(jax.random.key(0))
+    def __call__(self, observation):
+        return observation.astype(jnp.float32)
+
+
+class Whole(nn.Module):
+    """Returns integers."""
+
+    def __call__(self, observation):
+        return observation.reshape(len(observation), -1)
+
+
+class Normalised(nn.Module):
+    """Has statistics besides parameters."""
+
+    @nn.compact
+    def __call__(self, observation):
+        flat = observation.reshape(len(observation), -1) / jnp.float32(255)
+        return nn.BatchNorm(use_running_average=False)(flat)
+
+
+class Noisy(nn.Module):
+    """Draws at random."""
+
+    @nn.compact
+    def __call__(self, observation):
+        flat = observation.reshape(len(observation), -1) / jnp.float32(255)
+        return nn.Dropout(0.5, deterministic=False)(flat)
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (Maps(), r"encoder 'mine' .*\(1, 12, 12, 3\)"),
+        (Whole(), "encoder 'mine' .*uint8"),
+        (Normalised(), "encoder 'mine' .*batch_stats"),
+        (Noisy(), "encoder 'mine' .*dropout"),
+        (nnx.Linear(3, 4, rngs=nnx.Rngs(0)), "must be a flax.linen.Module, got Linear"),
+        (None, "must be a flax.linen.Module, got NoneType"),
+    ],
+)
+def test_an_encoder_that_breaks_its_contract_is_refused_in_one_line(module, message, monkeypatch):
+    monkeypatch.setitem(encoders, "mine", lambda config: module)
+
+    def train() -> None:
+        made = make_learner(Config(encoder="mine"))
+        jax.eval_shape(made.iterate, made.init(jax.random.key(0)))
+
+    with pytest.raises(ValueError, match=message) as error:
+        train()
+    assert "\n" not in str(error.value)
+
+
+def test_two_encoders_of_one_module_share_no_parameters(monkeypatch):
+    """The predictor of `rnd` must not be its target."""
+    shared = Encoder((2, 2))
+    monkeypatch.setitem(encoders, "mine", lambda config: shared)
+    config = Config(**{**SETTINGS, "encoder": "mine", "curiosity": "rnd"})
+    params = make_learner(config).init(jax.random.key(0)).params["curiosity"]["params"]
+    assert set(params) == {"target", "predictor", "hidden", "output"}
+    target, predictor = (params[name]["conv1"]["kernel"] for name in ("target", "predictor"))
+    assert not np.any(np.isclose(target, predictor))
+
+
+@pytest.mark.parametrize(("backend", "path"), [("cpu", "fast"), ("gpu", "plain"), ("tpu", "plain")])
+def test_the_backend_decides_the_path(backend, path, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    made = make_learner(PLAIN)
+    assert made.path == path
+    assert (made.agent.core.scan_unroll > 1) == (backend != "cpu")
 
 
 def test_devices_average_floats_only(with_curiosity):
@@ -315,6 +391,8 @@ def test_devices_average_floats_only(with_curiosity):
         ({}, tt.make("base", num_features=4), "num_features is 4, the config's 3"),
         ({"encoder": "objects"}, OWN_COLORS, "know agent and food by the colours"),
         ({"align_to_food": True}, OWN_COLORS, "know agent and food by the colours"),
+        ({"align_to_food": True}, RECOLOURED, "know agent and food by the colours"),
+        ({"iterations": 2**20, "epochs": 10_000, "max_steps": 1}, None, "gradient steps"),
     ],
 )
 def test_settings_that_cannot_be_trained_with_are_refused(settings, env, message):
