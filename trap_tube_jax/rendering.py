@@ -47,7 +47,8 @@ TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
 TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
 FPS_RANGE = (1, 50)  # browsers slow down GIFs with shorter frames
-LONGEST_HOLD = 100  # seconds; a GIF shows no picture longer than 655
+LONGEST_HOLD = 100  # seconds
+MAX_DURATION = 2**16 - 1  # hundredths of a second for which a GIF can show a picture
 
 
 def render(
@@ -125,8 +126,10 @@ def save_gif(
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1. Pictures of at most
         256 colours are stored exactly.
       path: the file to write.
-      fps: frames per second, 1 to 50; a frame lasts whole hundredths of a second.
-      hold: seconds by which the last frame stays longer, 0 to 100.
+      fps: frames per second, 1 to 50. GIF counts hundredths of a second; durations alternate where
+        a frame takes a fraction, so that an episode keeps its length.
+      hold: seconds by which the last frame stays longer, 0 to 100. A picture that does not change
+        for 655 seconds or more stays that long.
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
@@ -145,11 +148,26 @@ def save_gif(
     with needs_extra("pictures"):
         from PIL import Image  # noqa: PLC0415  importing the environment must stay light
 
-    durations = [round(1000 / fps)] * len(pictures)
-    durations[-1] += round(1000 * hold)
+    pictures, durations = _distinct_pictures(pictures, _durations(len(pictures), fps, hold))
     first, *rest = map(Image.fromarray, pictures)
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
-    first.save(path, format="GIF", duration=durations, loop=0, **options)
+    first.save(path, format="GIF", duration=(10 * durations).tolist(), loop=0, **options)
+
+
+def _durations(num_frames: int, fps: float, hold: float) -> np.ndarray:
+    """Returns i64[T] in hundredths of a second; the sums up to every frame are rounded."""
+    ends = np.arange(1, num_frames + 1) * 100 / fps
+    ends[-1] += 100 * hold
+    return np.diff(np.rint(ends).astype(int), prepend=0)
+
+
+def _distinct_pictures(
+    pictures: np.ndarray, durations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joins equal pictures that follow one another, up to the longest duration of a GIF."""
+    is_new = np.append(True, np.any(pictures[1:] != pictures[:-1], axis=(1, 2, 3)))
+    durations = np.add.reduceat(durations, np.flatnonzero(is_new))
+    return pictures[is_new], durations.clip(max=MAX_DURATION)
 
 
 @functools.partial(jax.jit, static_argnames="cell_size")
