@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, described, integer_array
+from trap_tube_jax.checks import check_integer, described, integer_array, names_adapters
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     DIRECTION_NAMES,
@@ -106,6 +106,7 @@ class Environment(ByValue):
             for transfer in self.transfers[: own[-1] + 1 if own else 0]:
                 state = _try_transfer(transfer, jax.random.clone(key), state)
 
+    @names_adapters
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """Draws a task.
 
@@ -123,6 +124,7 @@ class Environment(ByValue):
         state = compose(*self.transfers)(key, jax.tree.map(jnp.copy, self.base))
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
+    @names_adapters
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:
         """Takes one action, deterministically. A finished state does not change and pays 0.
 
@@ -181,11 +183,16 @@ def action_from_index(index: jax.typing.ArrayLike) -> jax.Array:
     Raises:
       ValueError: `index` does not hold integers.
     """
-    index = integer_array("index", index)
+    return jnp.asarray(pairs_of(integer_array("index", index)))
+
+
+def pairs_of(index: Any) -> Any:
+    """Converts action indices integer[...] as `action_from_index` does; NumPy stays NumPy."""
+    xp = np if isinstance(index, np.ndarray) else jnp
     is_known = (index >= 0) & (index < NUM_ACTIONS)
-    index = jnp.asarray(index.astype(np.int32))
-    action = jnp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1)
-    return jnp.where(is_known[..., None], action, NO_DIRECTION)
+    index = index.astype(np.int32)
+    action = xp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1)
+    return xp.where(is_known[..., None], action, NO_DIRECTION)
 
 
 def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.layouts import (
-    NUM_FRAMES,
+    NUM_OUTLINES,
     LayoutTables,
     layout_tables,
     padded,
-    padded_by_frame,
+    padded_by_outline,
 )
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import State, base_state, check_state
@@ -140,11 +140,11 @@ def near_layouts(strength: float) -> LayoutTables:
     """Builds the tables of a strength; keeps those of the last 64."""
     full, base = layout_tables(), base_state()
     foods, tools, agents = [], [], []
-    for frame in range(NUM_FRAMES):
-        inside = full.food[frame, : full.num_food[frame]]
-        corners = full.tool[frame, : full.num_tools[frame]]
+    for outline in range(NUM_OUTLINES):
+        inside = full.food[outline, : full.num_food[outline]]
+        corners = full.tool[outline, : full.num_tools[outline]]
         near_corners = _nearest_cells(corners, base.tool, strength)
-        rows = zip(corners, full.agent[frame], full.num_agents[frame], strict=False)
+        rows = zip(corners, full.agent[outline], full.num_agents[outline], strict=False)
         foods.append(_nearest_cells(inside, base.food, strength))
         tools.append(near_corners)
         agents.append(
@@ -156,7 +156,7 @@ def near_layouts(strength: float) -> LayoutTables:
         )
     food, num_food = padded(foods)
     tool, num_tools = padded(tools)
-    agent, num_agents = padded_by_frame(agents, len(tool[0]))
+    agent, num_agents = padded_by_outline(agents, len(tool[0]))
     near = _is_near(_layout_distances(), strength)
     return full._replace(
         layout=np.argwhere(near).astype(np.int32),

@@ -30,7 +30,7 @@ from trap_tube_jax.objects import (
     TUBE1,
     TUBE2,
 )
-from trap_tube_jax.prng import threefry_key, typed_key
+from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import State, check_state, with_narrow_integers
 
 Transfer = Callable[[jax.Array, State], State]
@@ -43,7 +43,8 @@ POINT_OF_OBJECT = np.array([4, 2, 3, 1, 1, 0, 0, 0], np.int32)
 def compose(*transfers: Transfer) -> Transfer:
     """Returns the transfer that applies `transfers` from left to right, each with its own key.
 
-    Transfer i gets the typed key `jax.random.fold_in(key, i)`.
+    Transfer i gets the typed key `jax.random.fold_in(key, i)`: a Threefry key even if `key` is one
+    of `rbg`, whose draws would depend on the batch (`threefry_key`).
 
     Raises:
       ValueError: a transfer is not callable, or not hashable.
@@ -73,7 +74,7 @@ class Composition:
 
     def __call__(self, key: jax.Array, state: State) -> State:
         """Applies the transfers to `state`."""
-        key = typed_key(key)
+        key = threefry_key(key)
         for index, transfer in enumerate(self.transfers):
             state = with_narrow_integers(transfer(jax.random.fold_in(key, index), state))
             # Without the barrier XLA fuses a draw into each of its uses and repeats it there.
@@ -115,16 +116,16 @@ def draw_layout(key: jax.Array, state: State, layouts: LayoutTables) -> State:
     check_state(state)
     tables = jax.tree.map(jnp.asarray, layouts)
     layout, food, tool, agent = jax.random.bits(threefry_key(key), (4,), jnp.uint32)
-    frame, assignment = tables.layout[layout % len(tables.layout)]
-    food %= tables.num_food[frame]
-    tool %= tables.num_tools[frame]
-    agent %= tables.num_agents[frame, tool]
+    outline, assignment = tables.layout[layout % len(tables.layout)]
+    food %= tables.num_food[outline]
+    tool %= tables.num_tools[outline]
+    agent %= tables.num_agents[outline, tool]
     return state.replace(
-        board=tables.board[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
-        food=cell_of(tables.food[frame, food]),
-        tool=cell_of(tables.tool[frame, tool]),
-        tool_extent=tables.extent[frame],
-        agent=cell_of(tables.agent[frame, tool, agent]),
+        board=tables.board[outline, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
+        food=cell_of(tables.food[outline, food]),
+        tool=cell_of(tables.tool[outline, tool]),
+        tool_extent=tables.extent[outline],
+        agent=cell_of(tables.agent[outline, tool, agent]),
     )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, check_own_state, described
+from trap_tube_jax.checks import check_integer, check_own_state, described, names_adapters
 from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.state import State, TimeStep
@@ -71,7 +71,7 @@ class VectorEnvironment:
 
     env: Environment
     chunk_size: int | None = dataclasses.field(default=None, kw_only=True)
-    auto_resets: ClassVar = True
+    auto_resets: ClassVar = "SameStep"
 
     def __post_init__(self):
         if type(self.env) is not Environment:
@@ -83,6 +83,7 @@ class VectorEnvironment:
         if self.chunk_size is not None:
             object.__setattr__(self, "chunk_size", check_integer("chunk_size", self.chunk_size))
 
+    @names_adapters
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Starts the first episodes, one for each of the keys [B], B >= 1.
 
@@ -93,6 +94,7 @@ class VectorEnvironment:
         episodes, timestep = jax.vmap(AutoReset(self.env).reset)(keys)
         return VectorState(episodes, jax.vmap(draw_static)(episodes.inner)), timestep
 
+    @names_adapters
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes one action in every environment and starts the next episode where one ended.
 

@@ -8,6 +8,7 @@ Importing `trap_tube_jax` registers them where Gymnasium >= 1.1 is installed:
 Both take the keyword arguments of the classes below. The step limit is `max_steps`.
 """
 
+import copy
 import functools
 import reprlib
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import numpy as np
 
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.checks import check_integer, integer_array
-from trap_tube_jax.environment import Environment
+from trap_tube_jax.environment import Environment, pairs_of
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe, render_ascii
@@ -190,6 +191,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         num_envs: int = 1,
         *,
         autoreset_mode: Any = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
         **options: Any,
     ):
         """Checks the arguments; the first reset and step compile.
@@ -200,6 +202,8 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
           autoreset_mode: `AutoresetMode.NEXT_STEP` spends the step after the last on the
             reset; `SAME_STEP` resets within the last step and returns the last observation
             as `infos["final_obs"]`. Their names "NextStep" and "SameStep" work too.
+          max_episode_steps: further step limit, as `gymnasium.make` takes it: the smaller one of
+            it and the set's holds.
           **options: keyword arguments of `TrapTubeEnv`.
 
         Raises:
@@ -213,7 +217,13 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
         self.num_envs = check_integer("num_envs", num_envs)
         one = TrapTubeEnv(task_set, **options)
-        self.env, self.render_mode, self.cell_size = one.env, one.render_mode, one.cell_size
+        self.env = one.env
+        if max_episode_steps is not None:
+            limit = check_integer("max_episode_steps", max_episode_steps)
+            self.env = copy.copy(one.env)
+            self.env.max_steps = min(limit, one.env.max_steps)
+        self.render_mode = one.render_mode
+        self.cell_size = one.cell_size
         self.single_observation_space = one.observation_space
         self.single_action_space = one.action_space
         self.observation_space = batch_space(one.observation_space, num_envs)
@@ -359,8 +369,7 @@ def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:
         )
     if array.min() < 0 or array.max() >= count:
         raise ValueError(f"actions must be from 0 to {count - 1}, got {reprlib.repr(actions)}")
-    pairs = np.stack(np.divmod(array, NUM_DIRECTIONS), axis=-1) if is_flat else array
-    return pairs.astype(np.int32)
+    return pairs_of(array) if is_flat else array.astype(np.int32)
 
 
 def _final_infos(observations: np.ndarray, ended: np.ndarray) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from trap_tube_jax import dynamics
 from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.environment import action_from_index
 from trap_tube_jax.geometry import cell_of
-from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
-from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, position_id
+from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS
+from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, colorless_rows, position_id
 from trap_tube_jax.state import State, take, validate
 
 # Frontiers are padded to one of few sizes, because each size compiles once.
@@ -92,11 +92,12 @@ def solve_batch(states: State) -> Plan:
       ValueError: `states` is not a batch, or `solve` refuses a state, whose index the message
         names.
     """
+    tasks = list(_unbatched(states))
     # Tasks of a set may recur; each is solved once.
     found: dict[bytes, np.ndarray | None] = {}
     plans = []
-    for state in _unbatched(states):
-        task = _fingerprint(state)
+    for state, row in zip(tasks, np.asarray(colorless_rows(states)), strict=True):
+        task = row.tobytes()
         if task not in found:
             found[task] = _shortest_actions(state)
         plans.append(_to_plan(found[task]))
@@ -202,10 +203,10 @@ def _state_at(layout: State, node: jax.Array) -> State:
 
 def _to_plan(indices: np.ndarray | None) -> Plan:
     is_solvable = indices is not None
-    grasp, move = divmod(indices if is_solvable else np.empty(0, np.int32), NUM_DIRECTIONS)
+    actions = action_from_index(indices if is_solvable else np.empty(0, np.int32))
     return Plan(
-        actions=np.stack([grasp, move], axis=-1),
-        length=np.array(len(grasp) if is_solvable else -1, np.int32),
+        actions=np.asarray(actions),
+        length=np.array(len(actions) if is_solvable else -1, np.int32),
         solvable=np.array(is_solvable),
     )
 
@@ -222,12 +223,6 @@ def _unbatched(states: State) -> Iterator[State]:
             yield checked(take(states, index))
         except (ValueError, IndexError) as error:
             raise ValueError(f"state {index} of the batch: {error}") from error
-
-
-def _fingerprint(state: State) -> bytes:
-    """Returns bytes that are equal exactly for states of the same task, colours aside."""
-    fields = (state.board, state.tool_extent, state.food, state.tool, state.agent)
-    return b"".join(np.asarray(field).tobytes() for field in fields)
 
 
 def _to_host(state: State) -> State:
