@@ -33,7 +33,7 @@ def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None =
 
 
 def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:
-    """Returns `value` as an array of integers of its own width; JAX would cut 64 bits to 32.
+    """Returns `value` as an array of integers of any width; JAX would cut 64 bits to 32.
 
     Raises:
       ValueError: `value` is ragged or holds something else.

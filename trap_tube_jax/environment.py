@@ -51,7 +51,7 @@ class ArraySpec:
     """Shape, dtype and inclusive bounds of an array.
 
     Attributes:
-      shape: length of each dimension.
+      shape: lengths of the dimensions.
       dtype: NumPy dtype of the elements.
       minimum: smallest allowed element.
       maximum: largest allowed element.
@@ -79,13 +79,13 @@ class Environment(ByValue):
         base: State | None = None,
         max_steps: int = MAX_STEPS,
     ):
-        """Checks the arguments, and tries every transfer of your own once.
+        """Checks the arguments, and tries every custom transfer once.
 
-        Each trial runs the transfer under jit, on the output of those before it.
+        A trial runs the transfer under jit, on the output of the transfers before it.
 
         Args:
-          transfers: functions (key, state) -> state, applied in order at every reset, each
-            with a typed key of its own (`compose`).
+          transfers: functions (key, state) -> state, applied in order at every reset,
+            with different typed keys (`compose`).
           base: the state that the transfers start from, at time 0; the base task if absent.
           max_steps: steps after which an unsolved episode is truncated, 1 to 2**31 - 1.
 
@@ -99,11 +99,12 @@ class Environment(ByValue):
             )
         self.max_steps = check_integer("max_steps", max_steps, maximum=MAX_TIME)
         self.transfers = tuple(transfers)
-        own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
+        custom = [x not in _PAPER_TRANSFERS for x in self.transfers]
+        num_tried = len(custom) - custom[::-1].index(True) if any(custom) else 0
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             self.base = base_state() if base is None else _check_base(base)
             state, key = self.base, jax.random.key(0)
-            for transfer in self.transfers[: own[-1] + 1 if own else 0]:
+            for transfer in self.transfers[:num_tried]:
                 state = _try_transfer(transfer, jax.random.clone(key), state)
 
     @names_adapters

@@ -15,7 +15,7 @@ def unit_vector(direction: jax.Array | int) -> jax.Array:
     """Returns the displacement i32[2] = (row, column) of a direction, zero for other numbers."""
     direction = jnp.asarray(direction)
     up, down, left, right = (
-        (direction == each).astype(jnp.int32) for each in (UP, DOWN, LEFT, RIGHT)
+        (direction == code).astype(jnp.int32) for code in (UP, DOWN, LEFT, RIGHT)
     )
     return jnp.stack([down - up, right - left])
 
@@ -31,18 +31,18 @@ def is_on_board(cell: jax.Array) -> jax.Array:
 
 
 def same_cell(cell: jax.Array, other: jax.Array) -> jax.Array:
-    """Tests whether two cells, each i32[2], are equal."""
+    """Tests whether two cells i32[2] are equal."""
     return (cell[0] == other[0]) & (cell[1] == other[1])
 
 
 def bar_covers(corner: jax.Array, extent: jax.Array, cell: jax.Array) -> jax.Array:
-    """Tests whether a cell is in the bar at `corner` of size `extent`, each i32[2]."""
+    """Tests whether a cell i32[2] is in the bar at `corner` i32[2] of size `extent` i32[2]."""
     inside = (cell >= corner) & (cell < corner + extent)
     return inside[0] & inside[1]
 
 
 def bar_cells(corner: jax.Array, extent: jax.Array) -> jax.Array:
-    """Returns the mask bool[12, 12] of the bar at `corner` of size `extent`, each i32[2]."""
+    """Returns the mask bool[12, 12] of the bar at `corner` i32[2] of size `extent` i32[2]."""
     end = corner + extent
     in_rows = (corner[0] <= ROWS) & (end[0] > ROWS)
     in_columns = (corner[1] <= COLUMNS) & (end[1] > COLUMNS)

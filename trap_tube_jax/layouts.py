@@ -1,7 +1,7 @@
 """Every layout of the perceptual transfer, enumerated once as tables.
 
 The layouts are few, so NumPy enumerates them cell by cell. A draw is then a few integers and as
-many look-ups. Counting cells within each draw is an order of magnitude slower under vmap on a CPU.
+many look-ups. Counting cells within a draw is an order of magnitude slower under vmap on a CPU.
 
 Source: environment.md, "Perceptual".
 """
@@ -20,7 +20,7 @@ NUM_OUTLINES = 32
 NUM_ASSIGNMENTS = 8
 
 # (length of a side of the tube, its first row or column), equally likely: the length is
-# uniform over 3 and 4 first, then the place over those that fit into 4 to 8.
+# uniform over 3 and 4, then the first row is uniform over the rows that keep the side in 4 to 8.
 _SIDES = ((3, 4), (3, 5), (4, 4), (4, 4))
 
 
@@ -39,7 +39,7 @@ class LayoutTables(NamedTuple):
       extent: i32[32, 2], the tool's (rows, columns).
       tool: u8[32, T], the candidates of the tool's top-left cell, then padding.
       num_tools: u32[32], how many candidates there are.
-      agent: u8[32, T, A], the agent's cells for each candidate, then padding.
+      agent: u8[32, T, A], the agent's cells by candidate of the tool, then padding.
       num_agents: u32[32, T], how many cells there are; 1 in the padding.
     """
 
@@ -73,12 +73,10 @@ def layout_tables() -> LayoutTables:
     tool, num_tools = padded([np.flatnonzero(corners) for corners in tools])
     agent, num_agents = padded_by_outline(agents, len(tool[0]))
     food, num_food = padded([_food_cells(*outline[:4]) for outline in outlines])
-    assignment, outline = np.divmod(
-        np.arange(NUM_OUTLINES * NUM_ASSIGNMENTS, dtype=np.int32), NUM_OUTLINES
-    )
+    index = np.arange(NUM_OUTLINES * NUM_ASSIGNMENTS, dtype=np.int32)
     return LayoutTables(
-        layout=np.stack([outline, assignment], axis=1),
-        board=np.stack([_boards(*each[:4]) for each in outlines]),
+        layout=np.stack([index % NUM_OUTLINES, index // NUM_OUTLINES], axis=1),
+        board=np.stack([_boards(*outline[:4]) for outline in outlines]),
         food=food,
         num_food=num_food,
         extent=np.array([_extent(*outline) for outline in outlines], np.int32),

@@ -220,7 +220,7 @@ def _single_keys(terminal: int) -> Iterator[int]:
         import termios  # noqa: PLC0415
         import tty  # noqa: PLC0415
     except ImportError:  # Windows
-        raise ValueError("play needs a Unix terminal, such as that of WSL") from None
+        raise ValueError("play needs a Unix terminal, for example of WSL") from None
 
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal)

@@ -37,8 +37,8 @@ def _rows(*fields: jax.Array) -> jax.Array:
 def position_id(state: State) -> jax.Array:
     """Returns the number i32[], 0 to 144^3 - 1, of a state's position.
 
-    (agent * 144 + tool) * 144 + food, each a cell in reading order; the tool's is its top-left
-    one. A state of NumPy arrays gives a NumPy number.
+    (agent * 144 + tool) * 144 + food, cells in reading order; the tool's cell is its top-left one.
+    A state of NumPy arrays gives a NumPy number.
     """
     cells = (state.agent, state.tool, state.food)
     agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)

@@ -1,4 +1,4 @@
-"""Task sets by name: the paper's eight, the controls, and your own.
+"""Task sets by name: the paper's eight, the controls, and others that users register.
 
 Source: paper, section "Experimental Setup"; environment.md, "Task sets"; controls.md.
 """
@@ -73,7 +73,7 @@ _task_sets = dict(_BUILT_IN)
 
 
 def registered_ids() -> tuple[str, ...]:
-    """Returns the ids that `make` takes: the paper's eight, the controls, your own."""
+    """Returns the ids that `make` takes: the paper's eight, the controls, registered ones."""
     return tuple(_task_sets)
 
 
@@ -108,8 +108,8 @@ def make(
         "{P, St}".
       num_features: N, number of feature channels of the base task, 1 to 1024; 3 (RGB) if absent.
         With `base`, the palette of `base` has N channels.
-      base: a base state in place of the set's.
-      max_steps: a step limit in place of the set's.
+      base: a base state instead of the set's.
+      max_steps: a step limit instead of the set's.
 
     Raises:
       ValueError: naming the value and what is allowed.

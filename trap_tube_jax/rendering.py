@@ -204,7 +204,7 @@ def _enlarge(cells: jax.Array, cell_size: int) -> jax.Array:
 
 
 def _arrange(tiles: np.ndarray, objects: jax.Array) -> jax.Array:
-    """Returns [12 s, 12 s]: for each cell's object u8[12, 12] its tile of [8, s, s]."""
+    """Lays out tiles [8, s, s] by the objects u8[12, 12] of the cells, as [12 s, 12 s]."""
     size = BOARD_SIZE * tiles.shape[-1]
     return jnp.asarray(tiles)[objects].transpose(0, 2, 1, 3).reshape(size, size)
 
@@ -226,7 +226,7 @@ def _blend(image: Any, ink: Any, opacity: Any) -> Any:
 
 @functools.cache
 def _signs(cell_size: int) -> np.ndarray:
-    """Returns f32[8, s, s]: each object's sign as the covered part of each pixel, but no tool."""
+    """Returns the part of every pixel that a sign covers, f32[8, s, s]. The tool has none."""
     y, x = _offsets((0.5, 0.5), 1, cell_size)
     distance = np.full((NUM_OBJECTS, cell_size, cell_size), np.inf, np.float32)
     distance[TRAP] = _cross(y, x)
@@ -283,7 +283,7 @@ def _draw_hand(image: jax.Array, state: State, grasp: jax.Array, cell_size: int)
 
 
 def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:
-    """Returns each pixel's offset below and right of `center`, as f32[n s, 1] and f32[1, n s].
+    """Returns the offsets of pixels below and right of `center`, as f32[n s, 1] and f32[1, n s].
 
     `center`, (y, x), and the offsets are in units of a cell.
     """
@@ -292,7 +292,7 @@ def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:
 
 
 def _coverage(distance: Any, cell_size: int) -> Any:
-    """Returns the part of each pixel inside the shape, 0 to 1, as f32."""
+    """Returns the part of a pixel that is inside the shape, 0 to 1, as f32."""
     return (0.5 - distance * cell_size).clip(0, 1)
 
 

@@ -7,7 +7,7 @@ fast:
    finished environments start over, in as many chunks of fixed size as needed.
 2. Board and palette are fixed within an episode, so their picture is drawn once, at the
    reset. A step draws food, tool and agent over it.
-3. A picture is a flat vector of bytes, each compared with its own row and column. A loop over
+3. A picture is a flat vector of bytes, compared with vectors of their rows and columns. A loop over
    12 * 12 * N neighbouring bytes vectorises; a loop whose innermost axis has three channels
    does not. The pictures pass through the loop of the resets, which keeps XLA from fusing the
    later reshape to [12, 12, N] into the loop over bytes.
@@ -41,7 +41,7 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
 
     Attributes:
       episodes: states and keys, as `jax.vmap` of an `AutoReset` keeps them.
-      background: u8[B, 12 * 12 * N], each board without food, tool and agent.
+      background: u8[B, 12 * 12 * N], the boards without food, tool and agent.
     """
 
     episodes: AutoResetState
@@ -50,14 +50,14 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
 
 @dataclasses.dataclass(frozen=True)
 class VectorEnvironment:
-    """B environments in lockstep, each starting its next episode when one ends.
+    """B environments in lockstep, which start the next episode where one ends.
 
     States, observations and everything else equal `jax.vmap` of `AutoReset(env)` for the same
     keys and actions, up to the rounding of colours between programs (`Environment.reset`).
 
     The environment is batched: jit and scan it, and do not vmap it over environments. A vmap over
-    seeds works; each step then runs as many chunks as the seed with the most finished
-    environments needs.
+    seeds works; a step then runs as many chunks as the seed with the most finished environments
+    needs.
 
     Attributes:
       env: an environment without auto-reset, not a subclass: the batch would bypass its methods.
@@ -123,7 +123,7 @@ class VectorEnvironment:
     def _reset_done(
         self, done: jax.Array, state: VectorState, picture: jax.Array
     ) -> tuple[VectorState, jax.Array]:
-        """Replaces state and picture by those of a next episode where `done` bool[B]."""
+        """Starts the next episode where `done` bool[B], in the state and in the picture."""
         num_envs, size = len(done), self._chunk_size(len(done))
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
@@ -137,7 +137,7 @@ class VectorEnvironment:
             write = lambda into, rows: into.at[index].set(  # noqa: E731
                 rows, mode="drop", indices_are_sorted=True
             )
-            # Reading back what was just written keeps XLA from computing it again in each use.
+            # Reading back what was just written keeps XLA from computing it again at every use.
             keys = jax.random.clone(read(state.episodes.key))  # overwritten by the next ones
             new, _ = jax.vmap(AutoReset(self.env).reset)(keys)
             episodes = jax.tree.map(write, state.episodes, new)

@@ -93,7 +93,7 @@ class AutoReset:
         """Starts the first episode. See `Environment.reset`."""
         reset_key, next_key = jax.random.split(threefry_key(key))
         inner, timestep = self.env.reset(reset_key)
-        final = jnp.copy(timestep.observation)  # of its own memory, so both may be donated
+        final = jnp.copy(timestep.observation)  # in other memory, so both may be donated
         first = auto_reset_timestep(timestep, timestep.observation, final)
         return AutoResetState(inner, next_key), first
 
@@ -224,7 +224,7 @@ def _auto_resets(env: Any) -> str | None:
 def auto_reset_timestep(
     timestep: TimeStep, observation: jax.Array, final_observation: jax.Array
 ) -> AutoResetTimeStep:
-    """Returns `timestep` with other observations, reshaped to its own."""
+    """Returns `timestep` with other observations, which may be flat."""
     shape = timestep.observation.shape
     return AutoResetTimeStep(
         observation=observation.reshape(shape),

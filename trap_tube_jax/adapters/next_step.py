@@ -20,7 +20,7 @@ class NextStepVectorEnvironment(VectorEnvironment):
 
     @names_adapters
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
-        """Takes one action i32[B, 2] in each, or starts it over if its episode has ended."""
+        """Takes actions i32[B, 2], or starts the next episode where one has ended."""
         was_done = state.episodes.inner.done
         stepped, timestep, final_picture = self._advance(state, actions)
         state, picture = self._reset_done(was_done, stepped, final_picture)

@@ -92,12 +92,12 @@ class TrapTubeEnv(_Compiled, gymnasium.Env):
         """Checks the arguments; the first reset and step compile.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own, to which
+          task_set: registered id, short name or label, or an `Environment`, to which
             `num_features` and `max_steps` do not apply.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `MultiDiscrete([4, 4])`.
           num_features: N, the feature channels of the observation; see `make`.
-          max_steps: step limit in place of the set's.
+          max_steps: step limit instead of the set's.
           render_mode: "rgb_array", "ansi" or None.
           cell_size: pixels per cell and side of a picture.
 
@@ -109,7 +109,7 @@ class TrapTubeEnv(_Compiled, gymnasium.Env):
         elif (num_features, max_steps) != (None, None):
             raise ValueError(
                 f"num_features={num_features} and max_steps={max_steps} do not apply to an "
-                "Environment of your own; give them to it"
+                "Environment; give them to it"
             )
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(
@@ -197,7 +197,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         """Checks the arguments; the first reset and step compile.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own, not a subclass.
+          task_set: registered id, short name or label, or an `Environment`, not a subclass.
           num_envs: number of environments, at least 1.
           autoreset_mode: `AutoresetMode.NEXT_STEP` spends the step after the last on the
             reset; `SAME_STEP` resets within the last step and returns the last observation
@@ -307,17 +307,17 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
             first = check_integer("seed", seed, minimum=0)
             seeds = [first + index for index in range(self.num_envs)]
         else:
-            seeds = [each if each is None else check_integer("seed", each, 0) for each in seed]
+            seeds = [x if x is None else check_integer("seed", x, 0) for x in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must be one or {self.num_envs} integers, got {len(seeds)}")
-        super().reset(seed=next((each for each in seeds if each is not None), None))
+        super().reset(seed=next((x for x in seeds if x is not None), None))
         if self._state is None:
             drawn = self.np_random.integers(2**32, size=self.num_envs).tolist()
-            seeds = [new if each is None else each for each, new in zip(seeds, drawn, strict=True)]
-        keys = _keys([each or 0 for each in seeds])
+            seeds = [new if x is None else x for x, new in zip(seeds, drawn, strict=True)]
+        keys = _keys([x or 0 for x in seeds])
         if self._state is None:
             return keys
-        is_seeded = np.array([each is not None for each in seeds])
+        is_seeded = np.array([x is not None for x in seeds])
         return _select(is_seeded, keys, self._state.episodes.key)
 
 
@@ -373,7 +373,7 @@ def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:
 
 
 def _final_infos(observations: np.ndarray, ended: np.ndarray) -> dict[str, Any]:
-    """Returns the infos of Gymnasium's own vector environments for episodes that ended."""
+    """Returns the infos of Gymnasium's vector environments for episodes that ended."""
     if not ended.any():
         return {}
     final = np.full(len(ended), None, object)

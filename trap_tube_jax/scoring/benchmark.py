@@ -204,7 +204,7 @@ def _play(
     def step(now: _Episodes) -> _Episodes:
         step_key = jax.random.fold_in(key, now.time)
         action, carry = _pair(policy.act(now.observation, now.carry, step_key), batch)
-        expected, got = (jax.tree.structure(each) for each in (now.carry, carry))
+        expected, got = (jax.tree.structure(tree) for tree in (now.carry, carry))
         if got != expected:
             raise ValueError(
                 f"the policy's act must return a carry like that of initial, {expected}, got {got}"

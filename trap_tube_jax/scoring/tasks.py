@@ -69,7 +69,7 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     check_integer("the number of evaluation tasks", num_tasks, maximum=MAX_TASKS)
     count = num_tasks if env.transfers else 1
     # Transfers are compiled one by one: the sets share them, so eight sets take three
-    # compilations, and a transfer has the same bits in each.
+    # compilations, and a transfer has the same bits in all of them.
     draw = compose(*map(_compiled, env.transfers))
     base = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), env.base)
     keys = evaluation_keys(name, count, purpose)

@@ -26,9 +26,9 @@ def save_distances(
 ) -> None:
     """Writes a PNG of the distance to the goal over the board, at moments of a plan.
 
-    Tool and food stay in place within a picture. Each number is the distance to the goal with the
-    agent in that cell. The agent's own cell has none, nor have cells that are unreachable or have
-    no way to the goal.
+    Tool and food do not move within a picture. A number is the distance to the goal with the agent
+    in that cell. The agent's present cell has no number, nor have cells that are unreachable or
+    have no way to the goal.
 
     Args:
       state: the task's first state.

@@ -22,7 +22,7 @@ from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS
 from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, colorless_rows, position_id
 from trap_tube_jax.state import State, take, validate
 
-# Frontiers are padded to one of few sizes, because each size compiles once.
+# Frontiers are padded to one of few sizes, because every size compiles.
 CHUNK_SIZES = (256, 1024, 4096)
 
 
@@ -49,10 +49,10 @@ class Level(NamedTuple):
     """All nodes at one distance from the start, and their successors.
 
     Attributes:
-      nodes: i32[n], in the order of the first shortest plan that leads to each.
-      successors: i32[n, 16], the node after each action.
+      nodes: i32[n], in the order of the first shortest plans that lead to them.
+      successors: i32[n, 16], the nodes after the 16 actions.
       solved: bool[n, 16], the action solves the task.
-      origin: i64[n], flat index of each node's first occurrence in the previous level's
+      origin: i64[n], flat indices of the nodes' first occurrences in the previous level's
         `successors`; empty at the start.
     """
 
@@ -80,7 +80,7 @@ def solve(state: State) -> Plan:
 
 
 def solve_batch(states: State) -> Plan:
-    """Finds the shortest plans of many tasks, as `solve` does for each.
+    """Finds the shortest plans of many tasks, as `solve` does for one.
 
     Args:
       states: states with one leading axis B, as from `jax.vmap(env.reset)`.
@@ -93,7 +93,7 @@ def solve_batch(states: State) -> Plan:
         names.
     """
     tasks = list(_unbatched(states))
-    # Tasks of a set may recur; each is solved once.
+    # Tasks of a set may recur, and are solved once.
     found: dict[bytes, np.ndarray | None] = {}
     plans = []
     for state, row in zip(tasks, np.asarray(colorless_rows(states)), strict=True):
@@ -125,7 +125,7 @@ def checked(state: State) -> State:
 
 
 def levels(state: State) -> Iterator[Level]:
-    """Yields the task's nodes by distance from the start, each node once.
+    """Yields the task's nodes by distance from the start, every node once.
 
     Solved nodes end an episode, so they appear as successors alone. The search ends where no
     node is new; stop iterating to end it earlier.
