@@ -103,7 +103,8 @@ class Environment(ByValue):
         num_tried = len(custom) - custom[::-1].index(True) if any(custom) else 0
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             self.base = base_state() if base is None else _check_base(base)
-            state, key = self.base, jax.random.key(0)
+            state = self.base
+            key = jax.random.key(0)
             for transfer in self.transfers[:num_tried]:
                 state = _try_transfer(transfer, jax.random.clone(key), state)
 
@@ -208,7 +209,8 @@ def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
     if action.ndim == 0 or action.shape[-1] != 2:
         raise ValueError(f"action must be integer[..., 2] = (grasp, move), got {described(action)}")
     is_known = ((action >= 0) & (action < NUM_DIRECTIONS)).all(-1)
-    grasp, move = action[..., 0].astype(np.int32), action[..., 1].astype(np.int32)
+    grasp = action[..., 0].astype(np.int32)
+    move = action[..., 1].astype(np.int32)
     return jnp.where(is_known, grasp * NUM_DIRECTIONS + move, NO_DIRECTION)
 
 

@@ -54,7 +54,8 @@ def save_gallery(
       ValueError: an argument is invalid; the message says what is allowed.
       ImportError: matplotlib is not installed.
     """
-    tasks, seed = check_integer("tasks", tasks, 2, DRAWS), check_seed(seed)
+    tasks = check_integer("tasks", tasks, 2, DRAWS)
+    seed = check_seed(seed)
     if isinstance(ids, str) or not ids:
         raise ValueError(f"ids must name at least one task set, as in ('base', 'p'), got {ids!r}")
     entries = [task_set(name) for name in ids]

@@ -8,7 +8,8 @@ from trap_tube_jax.objects import BOARD_SIZE, DOWN, LEFT, RIGHT, UP
 
 # Row i32[12, 1] and column i32[1, 12] of every cell; they broadcast to the board.
 ROWS, COLUMNS = np.ogrid[0:BOARD_SIZE, 0:BOARD_SIZE]
-ROWS, COLUMNS = ROWS.astype(np.int32), COLUMNS.astype(np.int32)
+ROWS = ROWS.astype(np.int32)
+COLUMNS = COLUMNS.astype(np.int32)
 
 
 def unit_vector(direction: jax.Array | int) -> jax.Array:

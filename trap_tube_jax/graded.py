@@ -138,8 +138,11 @@ def points_between(present: jax.Array, drawn: jax.Array, strength: float) -> jax
 @functools.lru_cache(maxsize=64)
 def near_layouts(strength: float) -> LayoutTables:
     """Builds the tables of a strength; keeps the last 64."""
-    full, base = layout_tables(), base_state()
-    foods, tools, agents = [], [], []
+    full = layout_tables()
+    base = base_state()
+    foods = []
+    tools = []
+    agents = []
     for outline in range(NUM_OUTLINES):
         inside = full.food[outline, : full.num_food[outline]]
         corners = full.tool[outline, : full.num_tools[outline]]
@@ -174,7 +177,8 @@ def _layout_distances() -> np.ndarray:
 
     Tools are compared with their top-left cells aligned.
     """
-    full, base = layout_tables(), base_state()
+    full = layout_tables()
+    base = base_state()
     board = np.asarray(base.board).reshape(-1)
     board_cells = np.sum(full.board != board, axis=-1)
     extent = np.asarray(base.tool_extent)
@@ -192,7 +196,8 @@ def _nearest_cells(cells: np.ndarray, target: Any, strength: float) -> np.ndarra
 
 def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
     """Tests distances <= d_min + strength * (d_max - d_min), elementwise."""
-    nearest, farthest = distance.min(), distance.max()
+    nearest = distance.min()
+    farthest = distance.max()
     return distance <= nearest + strength * (farthest - nearest) + TOLERANCE
 
 

@@ -94,7 +94,8 @@ def _box(top: int, left: int, bottom: int, right: int) -> np.ndarray:
 
 def _boards(height: int, width: int, top: int, left: int) -> np.ndarray:
     """Draws u8[8, 144]: tubes on two opposite sides, the openings within the other two."""
-    bottom, right = top + height - 1, left + width - 1
+    bottom = top + height - 1
+    right = left + width - 1
     rows = _box(top, left, top, right), _box(bottom, left, bottom, right)
     columns = _box(top, left, bottom, left), _box(top, right, bottom, right)
     boards = []

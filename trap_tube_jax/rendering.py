@@ -262,7 +262,8 @@ def _face(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _tool_bar(state: State, cell_size: int) -> jax.Array:
     """Draws a bar f32[12 s, 12 s] with round ends along the tool; a single cell is vertical."""
-    corner, extent = state.tool.astype(np.float32), state.tool_extent.astype(np.float32)
+    corner = state.tool.astype(np.float32)
+    extent = state.tool_extent.astype(np.float32)
     along = jnp.where(extent[1] > 1, np.array([0, 1], np.float32), np.array([1, 0], np.float32))
     half = (extent - 1) / 2 + TOOL_BAR_OVERHANG * along
     y, x = _offsets(corner + extent / 2, BOARD_SIZE, cell_size)

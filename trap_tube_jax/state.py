@@ -338,7 +338,8 @@ def _parse_picture(rows: str | Sequence[str]) -> np.ndarray:
 
 def _place(codes: np.ndarray, code: int, given: Any, longest: int = 1) -> tuple[Any, Any]:
     """Returns top-left cell and extent of the bar drawn as `code`, or the cell `given`."""
-    cells, name = np.argwhere(codes == code), OBJECT_NAMES[code]
+    cells = np.argwhere(codes == code)
+    name = OBJECT_NAMES[code]
     drawn = [tuple(cell) for cell in cells.tolist()]
     if given is not None:
         if drawn:

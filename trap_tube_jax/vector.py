@@ -124,7 +124,8 @@ class VectorEnvironment:
         self, done: jax.Array, state: VectorState, picture: jax.Array
     ) -> tuple[VectorState, jax.Array]:
         """Starts the next episode where `done` bool[B], in the state and in the picture."""
-        num_envs, size = len(done), self._chunk_size(len(done))
+        num_envs = len(done)
+        size = self._chunk_size(len(done))
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
         def start_chunk(carry):
@@ -187,7 +188,8 @@ def draw_movable(state: State, background: jax.Array) -> jax.Array:
     """Draws food, tool and agent over a `draw_static` picture: a flat `observe`."""
     num_features = state.palette.shape[-1]
     cell = np.arange(background.size) // num_features
-    row, column = (cell // BOARD_SIZE).astype(np.uint8), (cell % BOARD_SIZE).astype(np.uint8)
+    row = (cell // BOARD_SIZE).astype(np.uint8)
+    column = (cell % BOARD_SIZE).astype(np.uint8)
     top, left = state.tool.astype(jnp.uint8)
     height, width = state.tool_extent.astype(jnp.uint8)
     # Above or left of the tool the unsigned difference wraps around to a large number.

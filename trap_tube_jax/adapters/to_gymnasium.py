@@ -278,7 +278,8 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         state = _started(self._state)
         actions = _grasp_and_move(actions, self.single_action_space, self.num_envs)
         self._state, timestep = self._programs.step(state, actions)
-        terminations, truncations = np.array(timestep.terminated), np.array(timestep.truncated)
+        terminations = np.array(timestep.terminated)
+        truncations = np.array(timestep.truncated)
         infos: dict[str, Any] = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             infos = _final_infos(np.asarray(timestep.final_observation), terminations | truncations)
@@ -362,7 +363,8 @@ def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:
     """Returns i32[..., 2] of actions in the action space; raises ValueError for others."""
     array = np.asarray(integer_array("actions", actions))
     is_flat = isinstance(space, spaces.Discrete)
-    shape, count = (*batch, *space.shape), NUM_ACTIONS if is_flat else NUM_DIRECTIONS
+    shape = (*batch, *space.shape)
+    count = NUM_ACTIONS if is_flat else NUM_DIRECTIONS
     if array.shape != shape:
         raise ValueError(
             f"actions must be integers of shape {shape}, got {array.dtype} of shape {array.shape}"

@@ -179,7 +179,8 @@ def _scores(
     if isinstance(sets, str) or not sets:
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
     check_integer("optimality", optimality, minimum=0)
-    made, entries = [], [task_set(name) for name in sets]
+    made = []
+    entries = [task_set(name) for name in sets]
     # All before the first is played, so that a wrong one costs nothing.
     envs = [make(entry.short, num_features=num_features) for entry in entries]
     for entry, env in zip(entries, envs, strict=True):

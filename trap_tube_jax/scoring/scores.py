@@ -107,7 +107,8 @@ class Score:
 
         `layout` i32[B] numbers the layouts of the tasks; it is None unless the set has few.
         """
-        count, tasks = int(np.sum(solved)), len(solved)
+        count = int(np.sum(solved))
+        tasks = len(solved)
         low, high = wilson_interval(count, tasks)
         return cls(
             set=name,
@@ -163,7 +164,8 @@ class Scores:
 
 
 def _cells(score: Score) -> list[str]:
-    interval, found = score.interval, score.optimality
+    interval = score.interval
+    found = score.optimality
     return [
         score.label,
         str(score.tasks),

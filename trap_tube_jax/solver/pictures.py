@@ -41,7 +41,8 @@ def save_distances(
     times = np.unique(np.linspace(0, last, MOMENTS).round().astype(int))
     boards = [distances.to_goal[(*states[time].food, *states[time].tool)] for time in times]
     scale = Normalize(0, max(np.max(boards), 1))
-    rows, columns = -(-len(times) // 2), min(len(times), 2)
+    rows = -(-len(times) // 2)
+    columns = min(len(times), 2)
     figure = Figure(figsize=(3.8 * columns + 0.7, 4 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).flatten()
     for axis in axes:
