@@ -1,13 +1,11 @@
-"""Uses the installed wheel outside the checkout, `alone` or with `extras`."""
+"""Uses the installed wheel without extras, outside the checkout."""
 
 import importlib.util
-import pathlib
 import subprocess
 import sys
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import trap_tube_jax as tt
 
@@ -36,32 +34,18 @@ def play():
 
 
 def run_alone():
-    """Finds nothing that the wheel does not need, and refuses pictures in a line."""
+    """Finds nothing that the wheel does not need, and says in a line what pictures need."""
     for module in ("agents", "benchmarks", "pandas", "PIL", "matplotlib"):
         assert importlib.util.find_spec(module) is None, module
     play()
-    for command in (["gallery"], ["solver", "--show", "base"], ["solver", "--tasks", "1"]):
-        result = run(*command)
-        assert result.returncode == 2, result
-        assert result.stderr.count("\n") == 1, result.stderr
-        assert "pip install 'trap-tube-jax[pictures]'" in result.stderr
-
-
-def run_with_extras():
-    """Writes pictures, and steps Gymnasium's environments."""
-    for command, file in (
-        (["gallery"], "gallery.png"),
-        (["solver", "--show", "base"], "plan.gif"),
-        (["solver", "--sets", "base", "--tasks", "1"], "shortest_plans.png"),
+    for command, code in (
+        (["gallery"], 2),
+        (["solver", "--show", "base"], 0),
+        (["solver", "--sets", "base", "--tasks", "1"], 0),
     ):
-        run(*command).check_returncode()
-        assert pathlib.Path(file).stat().st_size > 1000
-    import gymnasium  # noqa: PLC0415
-
-    batch = gymnasium.make_vec("trap_tube_jax/PerceptualTrapTube-v0", num_envs=2)
-    batch.reset(seed=0)
-    observation, *_ = batch.step(np.array([[0, 3], [1, 2]]))
-    assert observation.shape == (2, 12, 12, 3)
+        result = run(*command)
+        assert result.returncode == code, result
+        assert "pip install 'trap-tube-jax[pictures]'" in result.stderr.splitlines()[-1]
 
 
 def run(*arguments):
@@ -72,4 +56,4 @@ def run(*arguments):
 
 
 if __name__ == "__main__":
-    {"alone": run_alone, "extras": run_with_extras}[sys.argv[1]]()
+    run_alone()

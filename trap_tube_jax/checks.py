@@ -1,12 +1,19 @@
 """Shared checks of arguments."""
 
+import difflib
+import functools
+import inspect
 import re
 import reprlib
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 MAX_SEED = 2**32 - 1  # `jax.random.key` keeps the low 32 bits only
 MAX_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
@@ -26,7 +33,7 @@ def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None =
 
 
 def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:
-    """Returns `value` as an array of integers of its own width; JAX would cut 64 bits to 32.
+    """Returns `value` as an array of integers of any width; JAX would cut 64 bits to 32.
 
     Raises:
       ValueError: `value` is ragged or holds something else.
@@ -58,6 +65,23 @@ def check_registered_name(kind: str, name: Any) -> None:
         raise ValueError(f"{kind} names consist of letters, digits, '_', '.' and '-', got {name!r}")
 
 
+def did_you_mean(name: Any, known: Iterable[str]) -> str:
+    """Returns " (did you mean ...?)" with at most three known names near `name`, or "".
+
+    Ignores case and blanks.
+    """
+    by_plain: dict[str, str] = {}
+    for candidate in known:
+        by_plain.setdefault(_plain(candidate), candidate)
+    near = difflib.get_close_matches(_plain(name), by_plain) if isinstance(name, str) else []
+    names = " or ".join(repr(by_plain[plain]) for plain in near)
+    return f" (did you mean {names}?)" if near else ""
+
+
+def _plain(name: str) -> str:
+    return "".join(name.lower().split())
+
+
 def check_seed(seed: Any) -> int:
     """Returns `seed` as an int if it is an integer from 0 to 2**32 - 1.
 
@@ -65,6 +89,30 @@ def check_seed(seed: Any) -> int:
       ValueError: naming the seed and the bounds.
     """
     return check_integer("seed", seed, 0, MAX_SEED)
+
+
+def names_adapters(
+    method: Callable[Arguments, Result],
+) -> Callable[Arguments, Result]:
+    """Decorates `reset` or `step`: a call in Gymnasium's or gymnax's style names their adapters.
+
+    Raises:
+      TypeError: the number or names of the arguments are wrong.
+    """
+    signature = inspect.signature(method)
+
+    @functools.wraps(method)
+    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        try:
+            signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise TypeError(
+                f"{method.__name__}: {error}; call reset(key) and step(state, action), or use "
+                "trap_tube_jax.adapters.to_gymnasium or to_gymnax for their interfaces"
+            ) from None
+        return method(*args, **kwargs)
+
+    return checked
 
 
 def check_own_state(state: Any, kind: type) -> None:

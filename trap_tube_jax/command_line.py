@@ -25,7 +25,7 @@ def plain_errors() -> Iterator[None]:
     prepare_terminal()
     try:
         yield
-        print(end="", flush=True)  # does nothing where stdout is closed, unlike its own flush
+        print(end="", flush=True)  # does nothing where stdout is closed, unlike sys.stdout.flush
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python warns at exit
         raise SystemExit(1) from None
@@ -42,5 +42,5 @@ def add_import_option(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="MODULE",
-        help="import a module of your own first, for the task sets that it registers; repeatable",
+        help="import a module first, for the task sets that it registers; repeatable",
     )

@@ -27,7 +27,10 @@ def step(state: State, action: jax.Array) -> State:
     Returns:
       The state after the step; `terminated` is set when agent and food share a cell.
     """
-    board, agent, food, tool = state.board, state.agent, state.food, state.tool
+    board = state.board
+    agent = state.agent
+    food = state.food
+    tool = state.tool
     extent = state.tool_extent
     on_tool = functools.partial(bar_covers, tool, extent)
     move = jnp.where(state.done, 0, unit_vector(action[1]))

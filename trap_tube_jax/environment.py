@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, described, integer_array
+from trap_tube_jax.checks import check_integer, described, integer_array, names_adapters
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     DIRECTION_NAMES,
@@ -51,7 +51,7 @@ class ArraySpec:
     """Shape, dtype and inclusive bounds of an array.
 
     Attributes:
-      shape: length of each dimension.
+      shape: lengths of the dimensions.
       dtype: NumPy dtype of the elements.
       minimum: smallest allowed element.
       maximum: largest allowed element.
@@ -79,13 +79,13 @@ class Environment(ByValue):
         base: State | None = None,
         max_steps: int = MAX_STEPS,
     ):
-        """Checks the arguments, and tries every transfer of your own once.
+        """Checks the arguments, and tries every custom transfer once.
 
-        Each trial runs the transfer under jit, on the output of those before it.
+        A trial runs the transfer under jit, on the output of the transfers before it.
 
         Args:
-          transfers: functions (key, state) -> state, applied in order at every reset, each
-            with a typed key of its own (`compose`).
+          transfers: functions (key, state) -> state, applied in order at every reset,
+            with different typed keys (`compose`).
           base: the state that the transfers start from, at time 0; the base task if absent.
           max_steps: steps after which an unsolved episode is truncated, 1 to 2**31 - 1.
 
@@ -99,13 +99,16 @@ class Environment(ByValue):
             )
         self.max_steps = check_integer("max_steps", max_steps, maximum=MAX_TIME)
         self.transfers = tuple(transfers)
-        own = [i for i, each in enumerate(self.transfers) if each not in _PAPER_TRANSFERS]
+        custom = [x not in _PAPER_TRANSFERS for x in self.transfers]
+        num_tried = len(custom) - custom[::-1].index(True) if any(custom) else 0
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             self.base = base_state() if base is None else _check_base(base)
-            state, key = self.base, jax.random.key(0)
-            for transfer in self.transfers[: own[-1] + 1 if own else 0]:
+            state = self.base
+            key = jax.random.key(0)
+            for transfer in self.transfers[:num_tried]:
                 state = _try_transfer(transfer, jax.random.clone(key), state)
 
+    @names_adapters
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """Draws a task.
 
@@ -123,6 +126,7 @@ class Environment(ByValue):
         state = compose(*self.transfers)(key, jax.tree.map(jnp.copy, self.base))
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
+    @names_adapters
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:
         """Takes one action, deterministically. A finished state does not change and pays 0.
 
@@ -181,11 +185,16 @@ def action_from_index(index: jax.typing.ArrayLike) -> jax.Array:
     Raises:
       ValueError: `index` does not hold integers.
     """
-    index = integer_array("index", index)
+    return jnp.asarray(pairs_of(integer_array("index", index)))
+
+
+def pairs_of(index: Any) -> Any:
+    """Converts action indices integer[...] as `action_from_index` does; NumPy stays NumPy."""
+    xp = np if isinstance(index, np.ndarray) else jnp
     is_known = (index >= 0) & (index < NUM_ACTIONS)
-    index = jnp.asarray(index.astype(np.int32))
-    action = jnp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1)
-    return jnp.where(is_known[..., None], action, NO_DIRECTION)
+    index = index.astype(np.int32)
+    action = xp.stack([index // NUM_DIRECTIONS, index % NUM_DIRECTIONS], -1)
+    return xp.where(is_known[..., None], action, NO_DIRECTION)
 
 
 def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
@@ -200,7 +209,8 @@ def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
     if action.ndim == 0 or action.shape[-1] != 2:
         raise ValueError(f"action must be integer[..., 2] = (grasp, move), got {described(action)}")
     is_known = ((action >= 0) & (action < NUM_DIRECTIONS)).all(-1)
-    grasp, move = action[..., 0].astype(np.int32), action[..., 1].astype(np.int32)
+    grasp = action[..., 0].astype(np.int32)
+    move = action[..., 1].astype(np.int32)
     return jnp.where(is_known, grasp * NUM_DIRECTIONS + move, NO_DIRECTION)
 
 

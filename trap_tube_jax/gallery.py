@@ -17,7 +17,13 @@ from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
 from trap_tube_jax.rendering import render
 from trap_tube_jax.state import base_state
-from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
+from trap_tube_jax.transfers import (
+    Transfer,
+    perceptual,
+    structural,
+    symbolic,
+    transfer_name,
+)
 
 CHANGES: dict[Transfer, str] = {
     perceptual: "layout",
@@ -36,7 +42,7 @@ def save_gallery(
     tasks: int = 4,
     seed: int = 0,
 ) -> None:
-    """Writes a PNG of task sets with some of their tasks each, and a legend of the objects.
+    """Writes a PNG with some tasks of every set, and a legend of the objects.
 
     Args:
       path: the file to write.
@@ -48,7 +54,8 @@ def save_gallery(
       ValueError: an argument is invalid; the message says what is allowed.
       ImportError: matplotlib is not installed.
     """
-    tasks, seed = check_integer("tasks", tasks, 2, DRAWS), check_seed(seed)
+    tasks = check_integer("tasks", tasks, 2, DRAWS)
+    seed = check_seed(seed)
     if isinstance(ids, str) or not ids:
         raise ValueError(f"ids must name at least one task set, as in ('base', 'p'), got {ids!r}")
     entries = [task_set(name) for name in ids]
@@ -88,7 +95,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _title(entry: TaskSet) -> str:
-    changes = ", ".join(CHANGES.get(transfer, "own") for transfer in entry.transfers)
+    changes = ", ".join(
+        CHANGES.get(transfer, transfer_name(transfer)) for transfer in entry.transfers
+    )
     return f"{entry.id}\n{entry.label}: {f'changes {changes}' if changes else 'the base task'}"
 
 
@@ -109,12 +118,12 @@ def _distinct_tasks(entry: TaskSet, tasks: int, seed: int) -> np.ndarray:
 
 
 def _signs() -> np.ndarray:
-    """Cuts each object out of the base task, u8[8, s, s, 3]."""
+    """Cuts the objects out of the base task, u8[8, s, s, 3]."""
     state = base_state()
     cells = np.asarray(render(state, SIGN_SIZE)).reshape(12, SIGN_SIZE, 12, SIGN_SIZE, 3)
     objects = np.asarray(visible_objects(state))
-    places = [np.argwhere(objects == code)[0] for code in range(NUM_OBJECTS)]
-    return np.stack([cells[row, :, column] for row, column in places])
+    shown = [np.argwhere(objects == code)[0] for code in range(NUM_OBJECTS)]
+    return np.stack([cells[row, :, column] for row, column in shown])
 
 
 if __name__ == "__main__":

@@ -8,14 +8,15 @@ from trap_tube_jax.objects import BOARD_SIZE, DOWN, LEFT, RIGHT, UP
 
 # Row i32[12, 1] and column i32[1, 12] of every cell; they broadcast to the board.
 ROWS, COLUMNS = np.ogrid[0:BOARD_SIZE, 0:BOARD_SIZE]
-ROWS, COLUMNS = ROWS.astype(np.int32), COLUMNS.astype(np.int32)
+ROWS = ROWS.astype(np.int32)
+COLUMNS = COLUMNS.astype(np.int32)
 
 
 def unit_vector(direction: jax.Array | int) -> jax.Array:
     """Returns the displacement i32[2] = (row, column) of a direction, zero for other numbers."""
     direction = jnp.asarray(direction)
     up, down, left, right = (
-        (direction == each).astype(jnp.int32) for each in (UP, DOWN, LEFT, RIGHT)
+        (direction == code).astype(jnp.int32) for code in (UP, DOWN, LEFT, RIGHT)
     )
     return jnp.stack([down - up, right - left])
 
@@ -31,18 +32,18 @@ def is_on_board(cell: jax.Array) -> jax.Array:
 
 
 def same_cell(cell: jax.Array, other: jax.Array) -> jax.Array:
-    """Tests whether two cells, each i32[2], are equal."""
+    """Tests whether two cells i32[2] are equal."""
     return (cell[0] == other[0]) & (cell[1] == other[1])
 
 
 def bar_covers(corner: jax.Array, extent: jax.Array, cell: jax.Array) -> jax.Array:
-    """Tests whether a cell is in the bar at `corner` of size `extent`, each i32[2]."""
+    """Tests whether a cell i32[2] is in the bar at `corner` i32[2] of size `extent` i32[2]."""
     inside = (cell >= corner) & (cell < corner + extent)
     return inside[0] & inside[1]
 
 
 def bar_cells(corner: jax.Array, extent: jax.Array) -> jax.Array:
-    """Returns the mask bool[12, 12] of the bar at `corner` of size `extent`, each i32[2]."""
+    """Returns the mask bool[12, 12] of the bar at `corner` i32[2] of size `extent` i32[2]."""
     end = corner + extent
     in_rows = (corner[0] <= ROWS) & (end[0] > ROWS)
     in_columns = (corner[1] <= COLUMNS) & (end[1] > COLUMNS)

@@ -1,7 +1,7 @@
 """The perceptual and the structural transfer at strengths from 0 to 1.
 
 A strength bounds the distance of the draws: of layouts from the base task's, of features from the
-state's own. Strength 0 draws exactly these; strength 1 is the paper's transfer. Draws are nested: a
+state's. Strength 0 draws exactly these; strength 1 is the paper's transfer. Draws are nested: a
 layout, or a direction of a feature point, that is possible at one strength is possible at every
 higher one.
 
@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.layouts import (
-    NUM_FRAMES,
+    NUM_OUTLINES,
     LayoutTables,
     layout_tables,
     padded,
-    padded_by_frame,
+    padded_by_outline,
 )
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import State, base_state, check_state
@@ -34,7 +34,7 @@ from trap_tube_jax.transfers import (
     structural,
 )
 
-CENTER = 1e-4  # a radius below is 0 up to rounding; that of other features is 1 / 255 or more
+CENTER = 1e-4  # a radius below is 0 up to rounding; other features have a radius of 1 / 255 or more
 TOLERANCE = 1e-9  # of a distance, against the rounding of strength * distance
 
 
@@ -62,9 +62,9 @@ def graded_perceptual(strength: float) -> Transfer:
 def graded_structural(strength: float) -> Transfer:
     """Returns a structural transfer that takes features part of the way to the drawn ones.
 
-    `structural` draws a point u on the unit sphere for each kind of object. With r b the
-    state's own features as a point, |b| = 1, and theta the angle between b and u, the new
-    features are those of the point
+    `structural` draws a point u on the unit sphere for every kind of object. With r b the
+    state's features as a point, |b| = 1, and theta the angle between b and u, the new features
+    belong to the point
 
         ((1 - s) r + s) (cos(s theta) b + sin(s theta) t)
 
@@ -110,22 +110,22 @@ class GradedStructural:
         """Draws a palette."""
         check_state(state)
         # The middle of the interval that floor maps to the feature, so that 0 changes nothing.
-        own = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
+        present = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
         drawn = sphere_points(key, state.palette.shape[-1])
-        return recolor(state, points_between(own, drawn, self.strength))
+        return recolor(state, points_between(present, drawn, self.strength))
 
     @property
     def __name__(self) -> str:
         return f"structural {self.strength:g}"
 
 
-def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Array:
-    """Returns the points f32[K, N] of `graded_structural` between `own`, r b, and `drawn`, u."""
-    if own.shape[-1] == 1:
-        return (1 - strength) * own + strength * drawn
-    radius = jnp.linalg.norm(own, axis=-1, keepdims=True)
+def points_between(present: jax.Array, drawn: jax.Array, strength: float) -> jax.Array:
+    """Returns the points f32[K, N] of `graded_structural` from `present`, r b, to `drawn`, u."""
+    if present.shape[-1] == 1:
+        return (1 - strength) * present + strength * drawn
+    radius = jnp.linalg.norm(present, axis=-1, keepdims=True)
     is_center = radius < CENTER
-    start = jnp.where(is_center, drawn, own / jnp.where(is_center, 1, radius))
+    start = jnp.where(is_center, drawn, present / jnp.where(is_center, 1, radius))
     cosine = jnp.sum(start * drawn, axis=-1, keepdims=True)
     across = drawn - cosine * start
     sine = jnp.linalg.norm(across, axis=-1, keepdims=True)
@@ -137,14 +137,17 @@ def points_between(own: jax.Array, drawn: jax.Array, strength: float) -> jax.Arr
 
 @functools.lru_cache(maxsize=64)
 def near_layouts(strength: float) -> LayoutTables:
-    """Builds the tables of a strength; keeps those of the last 64."""
-    full, base = layout_tables(), base_state()
-    foods, tools, agents = [], [], []
-    for frame in range(NUM_FRAMES):
-        inside = full.food[frame, : full.num_food[frame]]
-        corners = full.tool[frame, : full.num_tools[frame]]
+    """Builds the tables of a strength; keeps the last 64."""
+    full = layout_tables()
+    base = base_state()
+    foods = []
+    tools = []
+    agents = []
+    for outline in range(NUM_OUTLINES):
+        inside = full.food[outline, : full.num_food[outline]]
+        corners = full.tool[outline, : full.num_tools[outline]]
         near_corners = _nearest_cells(corners, base.tool, strength)
-        rows = zip(corners, full.agent[frame], full.num_agents[frame], strict=False)
+        rows = zip(corners, full.agent[outline], full.num_agents[outline], strict=False)
         foods.append(_nearest_cells(inside, base.food, strength))
         tools.append(near_corners)
         agents.append(
@@ -156,7 +159,7 @@ def near_layouts(strength: float) -> LayoutTables:
         )
     food, num_food = padded(foods)
     tool, num_tools = padded(tools)
-    agent, num_agents = padded_by_frame(agents, len(tool[0]))
+    agent, num_agents = padded_by_outline(agents, len(tool[0]))
     near = _is_near(_layout_distances(), strength)
     return full._replace(
         layout=np.argwhere(near).astype(np.int32),
@@ -174,25 +177,27 @@ def _layout_distances() -> np.ndarray:
 
     Tools are compared with their top-left cells aligned.
     """
-    full, base = layout_tables(), base_state()
+    full = layout_tables()
+    base = base_state()
     board = np.asarray(base.board).reshape(-1)
     board_cells = np.sum(full.board != board, axis=-1)
-    own = np.asarray(base.tool_extent)
-    shared = np.minimum(full.extent, own).prod(axis=1)
-    tool_cells = full.extent.prod(axis=1) + own.prod() - 2 * shared
+    extent = np.asarray(base.tool_extent)
+    shared = np.minimum(full.extent, extent).prod(axis=1)
+    tool_cells = full.extent.prod(axis=1) + extent.prod() - 2 * shared
     return board_cells + tool_cells[:, None]
 
 
 def _nearest_cells(cells: np.ndarray, target: Any, strength: float) -> np.ndarray:
     """Returns the flat indices near the cell `target`, by steps up, down and across."""
-    place = np.stack(np.divmod(cells.astype(np.int32), BOARD_SIZE), axis=-1)
-    distance = abs(place - np.asarray(target)).sum(axis=-1)
+    position = np.stack(np.divmod(cells.astype(np.int32), BOARD_SIZE), axis=-1)
+    distance = abs(position - np.asarray(target)).sum(axis=-1)
     return cells[_is_near(distance, strength)]
 
 
 def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
     """Tests distances <= d_min + strength * (d_max - d_min), elementwise."""
-    nearest, farthest = distance.min(), distance.max()
+    nearest = distance.min()
+    farthest = distance.max()
     return distance <= nearest + strength * (farthest - nearest) + TOLERANCE
 
 

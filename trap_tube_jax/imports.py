@@ -33,7 +33,9 @@ def import_modules(names: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def needs_extra(extra: str) -> Iterator[None]:
-    """Turns a failed import inside the `with` block into one that names the extra to install.
+    """Turns a failed import inside the `with` block into one that says what to install.
+
+    The message names the module that is missing, which may be one that the extra's library needs.
 
     Raises:
       ImportError: an import failed.
@@ -41,6 +43,7 @@ def needs_extra(extra: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
+        missing = f"the module {error.name!r}" if error.name else "an optional library"
         raise ImportError(
-            f"this needs an optional library: pip install 'trap-tube-jax[{extra}]' ({error})"
+            f"this needs {missing}: pip install 'trap-tube-jax[{extra}]' ({error})"
         ) from error

@@ -1,7 +1,7 @@
 """Every layout of the perceptual transfer, enumerated once as tables.
 
 The layouts are few, so NumPy enumerates them cell by cell. A draw is then a few integers and as
-many look-ups. Counting cells within each draw is an order of magnitude slower under vmap on a CPU.
+many look-ups. Counting cells within a draw is an order of magnitude slower under vmap on a CPU.
 
 Source: environment.md, "Perceptual".
 """
@@ -16,30 +16,30 @@ from trap_tube_jax.geometry import COLUMNS, ROWS
 from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND, TRAP, TUBE1, TUBE2
 
 CENTER_FIRST, CENTER_LAST = 4, 8  # rows and columns of the central block, both included
-NUM_FRAMES = 32
+NUM_OUTLINES = 32
 NUM_ASSIGNMENTS = 8
 
 # (length of a side of the tube, its first row or column), equally likely: the length is
-# uniform over 3 and 4 first, then the place over those that fit into 4 to 8.
+# uniform over 3 and 4, then the first row is uniform over the rows that keep the side in 4 to 8.
 _SIDES = ((3, 4), (3, 5), (4, 4), (4, 4))
 
 
 class LayoutTables(NamedTuple):
     """The outcomes of every choice, equally likely within a choice.
 
-    A frame is a tube's outline with a direction of the tool; an assignment says which of
-    the outline's sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143. Rows of
-    cells end in padding; the counts exclude it.
+    An outline is the rectangle of a tube with a direction of the tool; an assignment says which
+    sides are tube1, tube2, trap and exit. Cells are flat indices 0 to 143. Rows of cells end in
+    padding; the counts exclude it.
 
     Attributes:
-      layout: i32[L, 2], the pairs (frame, assignment) to draw from.
-      board: u8[32, 8, 144], the static objects per frame and assignment.
+      layout: i32[L, 2], the pairs (outline, assignment) to draw from.
+      board: u8[32, 8, 144], the static objects per outline and assignment.
       food: u8[32, F], the cells inside the tube, then padding.
       num_food: u32[32], how many cells there are.
       extent: i32[32, 2], the tool's (rows, columns).
       tool: u8[32, T], the candidates of the tool's top-left cell, then padding.
       num_tools: u32[32], how many candidates there are.
-      agent: u8[32, T, A], the agent's cells for each candidate, then padding.
+      agent: u8[32, T, A], the agent's cells by candidate of the tool, then padding.
       num_agents: u32[32, T], how many cells there are; 1 in the padding.
     """
 
@@ -57,28 +57,29 @@ class LayoutTables(NamedTuple):
 @functools.cache
 def layout_tables() -> LayoutTables:
     """Builds the tables of all layouts, once per process."""
-    frames = [
+    outlines = [
         (height, width, top, left, vertical)
         for (height, top), (width, left) in itertools.product(_SIDES, _SIDES)
         for vertical in (True, False)
     ]
-    tools = [_tool_corners(*frame) for frame in frames]
+    tools = [_tool_corners(*outline) for outline in outlines]
     agents = [
-        [_agent_cells(corners, _extent(*frame), int(corner)) for corner in np.flatnonzero(corners)]
-        for frame, corners in zip(frames, tools, strict=True)
+        [
+            _agent_cells(corners, _extent(*outline), int(corner))
+            for corner in np.flatnonzero(corners)
+        ]
+        for outline, corners in zip(outlines, tools, strict=True)
     ]
     tool, num_tools = padded([np.flatnonzero(corners) for corners in tools])
-    agent, num_agents = padded_by_frame(agents, len(tool[0]))
-    food, num_food = padded([_food_cells(*frame[:4]) for frame in frames])
-    assignment, frame = np.divmod(
-        np.arange(NUM_FRAMES * NUM_ASSIGNMENTS, dtype=np.int32), NUM_FRAMES
-    )
+    agent, num_agents = padded_by_outline(agents, len(tool[0]))
+    food, num_food = padded([_food_cells(*outline[:4]) for outline in outlines])
+    index = np.arange(NUM_OUTLINES * NUM_ASSIGNMENTS, dtype=np.int32)
     return LayoutTables(
-        layout=np.stack([frame, assignment], axis=1),
-        board=np.stack([_boards(*each[:4]) for each in frames]),
+        layout=np.stack([index % NUM_OUTLINES, index // NUM_OUTLINES], axis=1),
+        board=np.stack([_boards(*outline[:4]) for outline in outlines]),
         food=food,
         num_food=num_food,
-        extent=np.array([_extent(*frame) for frame in frames], np.int32),
+        extent=np.array([_extent(*outline) for outline in outlines], np.int32),
         tool=tool,
         num_tools=num_tools,
         agent=agent,
@@ -93,7 +94,8 @@ def _box(top: int, left: int, bottom: int, right: int) -> np.ndarray:
 
 def _boards(height: int, width: int, top: int, left: int) -> np.ndarray:
     """Draws u8[8, 144]: tubes on two opposite sides, the openings within the other two."""
-    bottom, right = top + height - 1, left + width - 1
+    bottom = top + height - 1
+    right = left + width - 1
     rows = _box(top, left, top, right), _box(bottom, left, bottom, right)
     columns = _box(top, left, bottom, left), _box(top, right, bottom, right)
     boards = []
@@ -145,9 +147,11 @@ def padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndar
     return table, lengths
 
 
-def padded_by_frame(frames: list[list[np.ndarray]], num_rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pads the rows of every frame to u8[F, num_rows, A], with lengths u32[F, num_rows]."""
-    tables, lengths = zip(*(padded(rows, num_rows) for rows in frames), strict=True)
+def padded_by_outline(
+    outlines: list[list[np.ndarray]], num_rows: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pads the rows of every outline to u8[F, num_rows, A], with lengths u32[F, num_rows]."""
+    tables, lengths = zip(*(padded(rows, num_rows) for rows in outlines), strict=True)
     longest = max(table.shape[1] for table in tables)
     wide = [np.pad(table, ((0, 0), (0, longest - table.shape[1]))) for table in tables]
     return np.stack(wide), np.stack(lengths)

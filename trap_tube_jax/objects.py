@@ -19,6 +19,7 @@ from trap_tube_jax.checks import check_integer
 BOARD_SIZE: Final = 12
 MAX_TOOL_LENGTH: Final = 4
 MAX_STEPS: Final = 50
+MAX_FEATURES: Final = 1024
 
 # Codes are in drawing order: a later object hides an earlier one.
 GROUND, TRAP, EXIT, TUBE1, TUBE2, FOOD, TOOL, AGENT = range(8)
@@ -55,19 +56,19 @@ def base_palette(num_features: int = 3) -> np.ndarray:
 
     Three features are the RGB colours of environment.md, "Board and objects". Two are the
     red and green channels. More than three repeat red, green and blue. One feature is the
-    colour's luma (ITU-R BT.601), rounded. For every N all objects differ from each other,
+    colour's luma (ITU-R BT.601), rounded. For every N all objects differ in pairs,
     except the two tubes, which always look alike.
 
     Args:
-      num_features: N >= 1, the number of feature channels.
+      num_features: N, the number of feature channels, 1 to 1024.
 
     Returns:
       u8[8, N], one row per object code.
 
     Raises:
-      ValueError: `num_features` is not an integer >= 1.
+      ValueError: `num_features` is not an integer from 1 to 1024.
     """
-    check_integer("num_features", num_features)
+    check_integer("num_features", num_features, maximum=MAX_FEATURES)
     if num_features == 1:
         return np.rint(BASE_COLORS @ LUMA).astype(np.uint8)[:, None]
     return BASE_COLORS[:, np.arange(num_features) % 3]

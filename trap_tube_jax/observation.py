@@ -36,7 +36,7 @@ def observe(state: State) -> jax.Array:
 
 
 def render_ascii(state: State) -> str:
-    """Draws the board as 12 lines of 12 characters, those of `State.from_ascii`. Host side.
+    """Draws the board as 12 lines of 12 characters, as `State.from_ascii` reads. Host side.
 
     A character shows the topmost object of its cell alone, so not every state can be read back.
     """

@@ -23,8 +23,8 @@ from trap_tube_jax.objects import (
     AGENT,
     BOARD_SIZE,
     DIRECTION_NAMES,
+    FOOD,
     LUMA,
-    NUM_OBJECTS,
     OBJECT_NAMES,
     TOOL,
 )
@@ -34,7 +34,7 @@ from trap_tube_jax.rendering import rgb
 from trap_tube_jax.solver import solve
 from trap_tube_jax.state import State
 
-SIGNS = ["  ", "><", "()", "//", "\\\\", "@@", "||", "/\\"]  # by object code
+SIGNS: tuple[str, ...] = ("  ", "><", "()", "//", "\\\\", "@@", "||", "/\\")  # by object code
 HORIZONTAL_TOOL = "=="
 AGENT_SIGNS = ("/\\", "\\/", "<-", "->")  # by grasp direction
 
@@ -106,7 +106,7 @@ def press(game: Game, key: str) -> Game:
         return game
     state = game.state
     if state.done:
-        message = "the episode is over: r restart, n next task"
+        message = _outcome(state)
     elif key == HINT_KEY:
         message = _hint(state)
     else:
@@ -118,11 +118,11 @@ def press(game: Game, key: str) -> Game:
 def screen(game: Game) -> str:
     """Returns the board next to the keys and signs, and the message, as coloured text."""
     holds = "holds the tool" if holds_tool(game.state, game.grasp) else "empty"
-    signs = [f"{SIGNS[code]} {OBJECT_NAMES[code]:<9}" for code in range(NUM_OBJECTS)]
+    signs = [f"{sign} {name:<9}" for sign, name in zip(_signs(game), OBJECT_NAMES, strict=True)]
     panel = (
-        f"step {game.state.time}",
+        f"step {game.state.time} of {game.env.max_steps}",
         f"hand {DIRECTION_NAMES[game.grasp]}: {holds}",
-        "",
+        f"goal: move onto the food {SIGNS[FOOD]}",
         *(f"{keys:<14}{meaning}" for keys, meaning in HELP),
         "",
         *map("".join, zip(signs[:4], signs[4:], strict=True)),
@@ -160,25 +160,30 @@ def _deal(env: Environment, name: str, seed: int) -> Game:
 def _hint(state: State) -> str:
     plan = solve(state)
     if not plan.solvable:
-        return "the food is out of reach for good: r restart, n next task"
+        return "the food is out of reach for good  r: restart, n: next task"
     grasp, move = (DIRECTION_NAMES[direction] for direction in plan.actions[0])
     return f"hint: hand {grasp}, move {move}, and {plan.length - 1} more"
 
 
 def _outcome(state: State) -> str:
     if state.terminated:
-        return f"solved in {state.time} steps!  n: next task"
-    return f"not solved in {state.time} steps.  r: restart" if state.truncated else ""
+        return f"solved in {state.time} steps!  r: restart, n: next task"
+    return "out of steps  r: restart, n: next task" if state.truncated else ""
 
 
-def _board(game: Game) -> list[str]:
-    """Draws the board, two characters a cell, inside a frame."""
-    signs = SIGNS.copy()
+def _signs(game: Game) -> list[str]:
+    """Returns two characters per object: the agent's show its hand, the tool's its direction."""
+    signs = list(SIGNS)
     signs[AGENT] = AGENT_SIGNS[game.grasp]
     if game.state.tool_extent[1] > 1:
         signs[TOOL] = HORIZONTAL_TOOL
+    return signs
+
+
+def _board(game: Game) -> list[str]:
+    """Draws the board, two characters a cell, inside a border."""
     colors = np.asarray(rgb(game.state.palette)).tolist()
-    cells = [_colored(sign, color) for sign, color in zip(signs, colors, strict=True)]
+    cells = [_colored(sign, color) for sign, color in zip(_signs(game), colors, strict=True)]
     edge = "+" + "--" * BOARD_SIZE + "+"
     rows = np.asarray(visible_objects(game.state)).tolist()
     return [edge, *(f"|{''.join(cells[code] for code in row)}|" for row in rows), edge]
@@ -215,7 +220,7 @@ def _single_keys(terminal: int) -> Iterator[int]:
         import termios  # noqa: PLC0415
         import tty  # noqa: PLC0415
     except ImportError:  # Windows
-        raise ValueError("play needs a Unix terminal, such as that of WSL") from None
+        raise ValueError("play needs a Unix terminal, for example of WSL") from None
 
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal)

@@ -36,7 +36,7 @@ def threefry_key(key: Any) -> jax.Array:
     """Returns one PRNG key, typed or raw, as a typed key whose draws do not depend on the batch.
 
     A key of `rbg` or `unsafe_rbg` becomes the Threefry key in its first two words: under
-    `jax.vmap`, its own draws depend on the batch and would repeat tasks. Returns other keys
+    `jax.vmap`, draws of `rbg` depend on the batch and would repeat tasks. Returns other keys
     unchanged.
 
     Raises:

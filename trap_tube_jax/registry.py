@@ -1,12 +1,12 @@
-"""Task sets by name: the paper's eight, the controls, and your own.
+"""Task sets by name: the paper's eight, the controls, and others that users register.
 
 Source: paper, section "Experimental Setup"; environment.md, "Task sets"; controls.md.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
-from trap_tube_jax.checks import check_registered_name
+from trap_tube_jax.checks import check_registered_name, did_you_mean
 from trap_tube_jax.controls import CONTROLS, LayoutDraw
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
@@ -21,6 +21,8 @@ class TaskSet:
     Attributes:
       id: name that `make` takes.
       short: name in tables and file names.
+      label: name in text: the paper's notation, such as "{P, St}", for the paper's sets, and the
+        short name for others.
       transfers: the transfers, in the order in which they apply.
       base: the state that the transfers start from; None is the base task.
       max_steps: steps after which an unsolved episode is truncated.
@@ -28,67 +30,67 @@ class TaskSet:
 
     id: str
     short: str
+    label: str
     transfers: tuple[Transfer, ...]
     base: State | None = dataclasses.field(default=None, repr=False)
     max_steps: int = MAX_STEPS
 
     @property
-    def label(self) -> str:
-        """Returns the paper's notation, such as "{P, St}" or, without transfers, "base".
-
-        A set with transfers, a base state or a step limit of its own is labelled by its short name.
-        """
-        symbols: dict[Transfer, str] = {perceptual: "P", structural: "St", symbolic: "Sy"}
-        is_own = any(each not in symbols for each in self.transfers)
-        if is_own or self.base is not None or self.max_steps != MAX_STEPS:
-            return self.short
-        names = [symbols[each] for each in self.transfers]
-        return "{" + ", ".join(names) + "}" if names else "base"
+    def names(self) -> tuple[str, str, str]:
+        """The names that `make` takes; two registered sets share none."""
+        return self.id, self.short, self.label
 
 
 PAPER_TASK_SETS = (
-    TaskSet("TrapTube-v0", "base", ()),
-    TaskSet("PerceptualTrapTube-v0", "p", (perceptual,)),
-    TaskSet("StructuralTrapTube-v0", "st", (structural,)),
-    TaskSet("SymbolicTrapTube-v0", "sy", (symbolic,)),
-    TaskSet("PerceptualStructuralTrapTube-v0", "pst", (perceptual, structural)),
-    TaskSet("PerceptualSymbolicTrapTube-v0", "psy", (perceptual, symbolic)),
-    TaskSet("StructuralSymbolicTrapTube-v0", "stsy", (structural, symbolic)),
-    TaskSet("PerceptualStructuralSymbolicTrapTube-v0", "pstsy", (perceptual, structural, symbolic)),
+    TaskSet("TrapTube-v0", "base", "base", ()),
+    TaskSet("PerceptualTrapTube-v0", "p", "{P}", (perceptual,)),
+    TaskSet("StructuralTrapTube-v0", "st", "{St}", (structural,)),
+    TaskSet("SymbolicTrapTube-v0", "sy", "{Sy}", (symbolic,)),
+    TaskSet("PerceptualStructuralTrapTube-v0", "pst", "{P, St}", (perceptual, structural)),
+    TaskSet("PerceptualSymbolicTrapTube-v0", "psy", "{P, Sy}", (perceptual, symbolic)),
+    TaskSet("StructuralSymbolicTrapTube-v0", "stsy", "{St, Sy}", (structural, symbolic)),
+    TaskSet(
+        "PerceptualStructuralSymbolicTrapTube-v0",
+        "pstsy",
+        "{P, St, Sy}",
+        (perceptual, structural, symbolic),
+    ),
 )
 
-# `trap_turned` becomes TrapTurnedControl-v0, in short trap-turned.
-CONTROL_TASK_SETS = tuple(
-    TaskSet(
-        id="".join(word.capitalize() for word in layouts.__name__.split("_")) + "Control-v0",
-        short=layouts.__name__.replace("_", "-"),
-        transfers=(LayoutDraw(layouts),),
-    )
-    for layouts in CONTROLS
-)
+
+def _control(layouts: Callable[[], tuple[State, ...]]) -> TaskSet:
+    """Names the set of a control: `trap_turned` is TrapTurnedControl-v0, in short trap-turned."""
+    words = layouts.__name__.split("_")
+    id = "".join(map(str.capitalize, words)) + "Control-v0"
+    short = "-".join(words)
+    return TaskSet(id, short, short, (LayoutDraw(layouts),))
+
+
+CONTROL_TASK_SETS = tuple(map(_control, CONTROLS))
 
 _BUILT_IN = {entry.id: entry for entry in (*PAPER_TASK_SETS, *CONTROL_TASK_SETS)}
 _task_sets = dict(_BUILT_IN)
 
 
 def registered_ids() -> tuple[str, ...]:
-    """Returns the ids that `make` takes: the paper's eight, the controls, your own."""
+    """Returns the ids that `make` takes: the paper's eight, the controls, registered ones."""
     return tuple(_task_sets)
 
 
 def task_set(name: str) -> TaskSet:
-    """Returns the task set with this id or short name.
+    """Returns the task set with this id, short name or label.
 
     Raises:
-      ValueError: no set has the name; the message lists all.
+      ValueError: no set has the name; the message lists the short names and the nearest names.
     """
-    for candidate in _task_sets.values():
-        if name in (candidate.id, candidate.short):
-            return candidate
-    allowed = ", ".join(f"{entry.id} ({entry.short})" for entry in _task_sets.values())
+    by_name = {known: entry for entry in _task_sets.values() for known in entry.names}
+    if isinstance(name, str) and name in by_name:
+        return by_name[name]
+    allowed = ", ".join(entry.short for entry in _task_sets.values())
     raise ValueError(
-        f"unknown task set {name!r}; allowed: {allowed}; a set of yours is known once its module "
-        "is imported, as by --import MODULE"
+        f"unknown task set {name!r}{did_you_mean(name, by_name)}; allowed: {allowed}, or their ids "
+        "(trap_tube_jax.registered_ids()); a set of yours is known once its module is imported, as "
+        "by --import MODULE"
     )
 
 
@@ -102,11 +104,12 @@ def make(
     """Makes the environment of a registered task set.
 
     Args:
-      name: an id such as "PerceptualTrapTube-v0", or its short name such as "p".
-      num_features: N >= 1, number of feature channels of the base task; 3 (RGB) if absent. With
-        `base`, N is that of its palette.
-      base: a base state in place of the set's.
-      max_steps: a step limit in place of the set's.
+      name: an id such as "PerceptualStructuralTrapTube-v0", its short name "pst", or its label
+        "{P, St}".
+      num_features: N, number of feature channels of the base task, 1 to 1024; 3 (RGB) if absent.
+        With `base`, the palette of `base` has N channels.
+      base: a base state instead of the set's.
+      max_steps: a step limit instead of the set's.
 
     Raises:
       ValueError: naming the value and what is allowed.
@@ -151,12 +154,12 @@ def register(
     """
     short = id if short is None else short
     others = [entry for entry in _task_sets.values() if entry.id != id or id in _BUILT_IN]
-    taken = {name for entry in others for name in (entry.id, entry.short)}
+    taken = {name for entry in others for name in entry.names}
     for name in (id, short):
         check_registered_name("task set", name)
         if name in taken:
             raise ValueError(f"the name {name!r} is taken; taken are: {', '.join(sorted(taken))}")
     env = Environment(transfers, base=base, max_steps=max_steps)
     base = None if base is None else env.base
-    _task_sets[id] = TaskSet(id, short, env.transfers, base, env.max_steps)
+    _task_sets[id] = TaskSet(id, short, short, env.transfers, base, env.max_steps)
     return _task_sets[id]

@@ -47,7 +47,8 @@ TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
 TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
 FPS_RANGE = (1, 50)  # browsers slow down GIFs with shorter frames
-LONGEST_HOLD = 100  # seconds; a GIF shows no picture longer than 655
+LONGEST_HOLD = 100  # seconds
+MAX_DURATION = 2**16 - 1  # hundredths of a second for which a GIF can show a picture
 
 
 def render(
@@ -125,8 +126,10 @@ def save_gif(
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1. Pictures of at most
         256 colours are stored exactly.
       path: the file to write.
-      fps: frames per second, 1 to 50; a frame lasts whole hundredths of a second.
-      hold: seconds by which the last frame stays longer, 0 to 100.
+      fps: frames per second, 1 to 50. GIF counts hundredths of a second; durations alternate where
+        a frame takes a fraction, so that an episode keeps its length.
+      hold: seconds by which the last frame stays longer, 0 to 100. A picture that does not change
+        for 655 seconds or more stays that long.
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
@@ -145,11 +148,26 @@ def save_gif(
     with needs_extra("pictures"):
         from PIL import Image  # noqa: PLC0415  importing the environment must stay light
 
-    durations = [round(1000 / fps)] * len(pictures)
-    durations[-1] += round(1000 * hold)
+    pictures, durations = _distinct_pictures(pictures, _durations(len(pictures), fps, hold))
     first, *rest = map(Image.fromarray, pictures)
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
-    first.save(path, format="GIF", duration=durations, loop=0, **options)
+    first.save(path, format="GIF", duration=(10 * durations).tolist(), loop=0, **options)
+
+
+def _durations(num_frames: int, fps: float, hold: float) -> np.ndarray:
+    """Returns i64[T] in hundredths of a second; the sums up to every frame are rounded."""
+    ends = np.arange(1, num_frames + 1) * 100 / fps
+    ends[-1] += 100 * hold
+    return np.diff(np.rint(ends).astype(int), prepend=0)
+
+
+def _distinct_pictures(
+    pictures: np.ndarray, durations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joins equal pictures that follow one another, up to the longest duration of a GIF."""
+    is_new = np.append(True, np.any(pictures[1:] != pictures[:-1], axis=(1, 2, 3)))
+    durations = np.add.reduceat(durations, np.flatnonzero(is_new))
+    return pictures[is_new], durations.clip(max=MAX_DURATION)
 
 
 @functools.partial(jax.jit, static_argnames="cell_size")
@@ -186,7 +204,7 @@ def _enlarge(cells: jax.Array, cell_size: int) -> jax.Array:
 
 
 def _arrange(tiles: np.ndarray, objects: jax.Array) -> jax.Array:
-    """Returns [12 s, 12 s]: for each cell's object u8[12, 12] its tile of [8, s, s]."""
+    """Lays out tiles [8, s, s] by the objects u8[12, 12] of the cells, as [12 s, 12 s]."""
     size = BOARD_SIZE * tiles.shape[-1]
     return jnp.asarray(tiles)[objects].transpose(0, 2, 1, 3).reshape(size, size)
 
@@ -208,7 +226,7 @@ def _blend(image: Any, ink: Any, opacity: Any) -> Any:
 
 @functools.cache
 def _signs(cell_size: int) -> np.ndarray:
-    """Returns f32[8, s, s]: each object's sign as the covered part of each pixel, but no tool."""
+    """Returns the part of every pixel that a sign covers, f32[8, s, s]. The tool has none."""
     y, x = _offsets((0.5, 0.5), 1, cell_size)
     distance = np.full((NUM_OBJECTS, cell_size, cell_size), np.inf, np.float32)
     distance[TRAP] = _cross(y, x)
@@ -244,7 +262,8 @@ def _face(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _tool_bar(state: State, cell_size: int) -> jax.Array:
     """Draws a bar f32[12 s, 12 s] with round ends along the tool; a single cell is vertical."""
-    corner, extent = state.tool.astype(np.float32), state.tool_extent.astype(np.float32)
+    corner = state.tool.astype(np.float32)
+    extent = state.tool_extent.astype(np.float32)
     along = jnp.where(extent[1] > 1, np.array([0, 1], np.float32), np.array([1, 0], np.float32))
     half = (extent - 1) / 2 + TOOL_BAR_OVERHANG * along
     y, x = _offsets(corner + extent / 2, BOARD_SIZE, cell_size)
@@ -265,7 +284,7 @@ def _draw_hand(image: jax.Array, state: State, grasp: jax.Array, cell_size: int)
 
 
 def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:
-    """Returns each pixel's offset below and right of `center`, as f32[n s, 1] and f32[1, n s].
+    """Returns the offsets of pixels below and right of `center`, as f32[n s, 1] and f32[1, n s].
 
     `center`, (y, x), and the offsets are in units of a cell.
     """
@@ -274,7 +293,7 @@ def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:
 
 
 def _coverage(distance: Any, cell_size: int) -> Any:
-    """Returns the part of each pixel inside the shape, 0 to 1, as f32."""
+    """Returns the part of a pixel that is inside the shape, 0 to 1, as f32."""
     return (0.5 - distance * cell_size).clip(0, 1)
 
 

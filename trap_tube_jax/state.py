@@ -124,7 +124,7 @@ class State(ByValue, struct.PyTreeNode, eq=False):
         """Builds a state at time 0 from a picture of 12 rows of 12 characters.
 
         `.` ground, `x` trap, `e` exit, `1` and `2` the tubes, `F` food, `T` tool, `A` agent. Cells
-        drawn as `F`, `T` or `A` have ground below. To place one on another object, leave it out of
+        drawn as `F`, `T` or `A` have ground below. To put one on another object, leave it out of
         the picture and pass its position by keyword.
 
         Args:
@@ -239,7 +239,7 @@ def validate(state: State) -> State:
     if np.array_equal(state.agent, state.food):
         raise ValueError(
             f"agent and food share cell {tuple(np.asarray(state.food).tolist())}: "
-            "the task would be solved before it starts; place them apart"
+            "the task would be solved before it starts; move them apart"
         )
     return state
 
@@ -338,7 +338,8 @@ def _parse_picture(rows: str | Sequence[str]) -> np.ndarray:
 
 def _place(codes: np.ndarray, code: int, given: Any, longest: int = 1) -> tuple[Any, Any]:
     """Returns top-left cell and extent of the bar drawn as `code`, or the cell `given`."""
-    cells, name = np.argwhere(codes == code), OBJECT_NAMES[code]
+    cells = np.argwhere(codes == code)
+    name = OBJECT_NAMES[code]
     drawn = [tuple(cell) for cell in cells.tolist()]
     if given is not None:
         if drawn:

@@ -30,7 +30,7 @@ from trap_tube_jax.objects import (
     TUBE1,
     TUBE2,
 )
-from trap_tube_jax.prng import threefry_key, typed_key
+from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import State, check_state, with_narrow_integers
 
 Transfer = Callable[[jax.Array, State], State]
@@ -41,9 +41,10 @@ POINT_OF_OBJECT = np.array([4, 2, 3, 1, 1, 0, 0, 0], np.int32)
 
 
 def compose(*transfers: Transfer) -> Transfer:
-    """Returns the transfer that applies `transfers` from left to right, each with its own key.
+    """Returns the transfer that applies `transfers` from left to right, with different keys.
 
-    Transfer i gets the typed key `jax.random.fold_in(key, i)`.
+    Transfer i gets the typed key `jax.random.fold_in(key, i)`: a Threefry key even if `key` is one
+    of `rbg`, whose draws would depend on the batch (`threefry_key`).
 
     Raises:
       ValueError: a transfer is not callable, or not hashable.
@@ -62,7 +63,7 @@ class Composition:
             if not callable(transfer):
                 raise ValueError(
                     f"a transfer is a function (key, state) -> state, got {transfer!r}; "
-                    "allowed: trap_tube_jax.perceptual, structural, symbolic or your own"
+                    "allowed: trap_tube_jax.perceptual, structural, symbolic or a function of yours"
                 )
             try:
                 hash(transfer)
@@ -73,10 +74,10 @@ class Composition:
 
     def __call__(self, key: jax.Array, state: State) -> State:
         """Applies the transfers to `state`."""
-        key = typed_key(key)
+        key = threefry_key(key)
         for index, transfer in enumerate(self.transfers):
             state = with_narrow_integers(transfer(jax.random.fold_in(key, index), state))
-            # Without the barrier XLA fuses a draw into each of its uses and repeats it there.
+            # Without the barrier XLA fuses a draw into all of its uses and repeats it there.
             state = jax.lax.optimization_barrier(state)
         return state
 
@@ -115,16 +116,16 @@ def draw_layout(key: jax.Array, state: State, layouts: LayoutTables) -> State:
     check_state(state)
     tables = jax.tree.map(jnp.asarray, layouts)
     layout, food, tool, agent = jax.random.bits(threefry_key(key), (4,), jnp.uint32)
-    frame, assignment = tables.layout[layout % len(tables.layout)]
-    food %= tables.num_food[frame]
-    tool %= tables.num_tools[frame]
-    agent %= tables.num_agents[frame, tool]
+    outline, assignment = tables.layout[layout % len(tables.layout)]
+    food %= tables.num_food[outline]
+    tool %= tables.num_tools[outline]
+    agent %= tables.num_agents[outline, tool]
     return state.replace(
-        board=tables.board[frame, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
-        food=cell_of(tables.food[frame, food]),
-        tool=cell_of(tables.tool[frame, tool]),
-        tool_extent=tables.extent[frame],
-        agent=cell_of(tables.agent[frame, tool, agent]),
+        board=tables.board[outline, assignment].reshape(BOARD_SIZE, BOARD_SIZE),
+        food=cell_of(tables.food[outline, food]),
+        tool=cell_of(tables.tool[outline, tool]),
+        tool_extent=tables.extent[outline],
+        agent=cell_of(tables.agent[outline, tool, agent]),
     )
 
 
@@ -162,7 +163,7 @@ def sphere_points(key: jax.Array, num_features: int) -> jax.Array:
 
 
 def recolor(state: State, points: jax.Array) -> State:
-    """Sets the features of all objects except agent and food to those of points f32[8, N].
+    """Sets the features of all objects except agent and food by points f32[8, N].
 
     Coordinates are clipped to -1 to 1.
     """
@@ -172,13 +173,13 @@ def recolor(state: State, points: jax.Array) -> State:
 
 
 def symbolic(key: jax.Array, state: State) -> State:
-    """Swaps shape, place and colour of the tool with those of a random object (F_Sy).
+    """Swaps the roles and the colours of the tool and a random object (F_Sy).
 
     The object is uniform over tool, tube1, tube2, trap and exit; "tool" changes nothing. The
     new tool starts at the object's top-left cell, has as many cells, and is horizontal if the
     first two in reading order share a row. The object takes the old tool's cells.
 
-    On boards of your own, the state stays as it is if the object cannot be a tool (it has no
+    On custom boards, the state stays as it is if the object cannot be a tool (it has no
     cells, more than four, or its bar would leave the board), or if the tool covers agent or
     food, which would then stand on the object.
     Source: environment.md, "Symbolic".
@@ -203,7 +204,7 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
 
     Args:
       state: one unbatched state.
-      code: integer[], one of `SYMBOLIC_OBJECTS`; the tool's own code changes nothing.
+      code: integer[], one of `SYMBOLIC_OBJECTS`; the tool's code changes nothing.
 
     Returns:
       The state after the swap, or as it was; see `symbolic`.

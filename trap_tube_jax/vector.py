@@ -7,7 +7,7 @@ fast:
    finished environments start over, in as many chunks of fixed size as needed.
 2. Board and palette are fixed within an episode, so their picture is drawn once, at the
    reset. A step draws food, tool and agent over it.
-3. A picture is a flat vector of bytes, each compared with its own row and column. A loop over
+3. A picture is a flat vector of bytes, compared with vectors of their rows and columns. A loop over
    12 * 12 * N neighbouring bytes vectorises; a loop whose innermost axis has three channels
    does not. The pictures pass through the loop of the resets, which keeps XLA from fusing the
    later reshape to [12, 12, N] into the loop over bytes.
@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, check_own_state, described
+from trap_tube_jax.checks import check_integer, check_own_state, described, names_adapters
 from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.state import State, TimeStep
@@ -41,7 +41,7 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
 
     Attributes:
       episodes: states and keys, as `jax.vmap` of an `AutoReset` keeps them.
-      background: u8[B, 12 * 12 * N], each board without food, tool and agent.
+      background: u8[B, 12 * 12 * N], the boards without food, tool and agent.
     """
 
     episodes: AutoResetState
@@ -50,14 +50,14 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
 
 @dataclasses.dataclass(frozen=True)
 class VectorEnvironment:
-    """B environments in lockstep, each starting its next episode when one ends.
+    """B environments in lockstep, which start the next episode where one ends.
 
     States, observations and everything else equal `jax.vmap` of `AutoReset(env)` for the same
     keys and actions, up to the rounding of colours between programs (`Environment.reset`).
 
     The environment is batched: jit and scan it, and do not vmap it over environments. A vmap over
-    seeds works; each step then runs as many chunks as the seed with the most finished
-    environments needs.
+    seeds works; a step then runs as many chunks as the seed with the most finished environments
+    needs.
 
     Attributes:
       env: an environment without auto-reset, not a subclass: the batch would bypass its methods.
@@ -71,7 +71,7 @@ class VectorEnvironment:
 
     env: Environment
     chunk_size: int | None = dataclasses.field(default=None, kw_only=True)
-    auto_resets: ClassVar = True
+    auto_resets: ClassVar = "SameStep"
 
     def __post_init__(self):
         if type(self.env) is not Environment:
@@ -83,6 +83,7 @@ class VectorEnvironment:
         if self.chunk_size is not None:
             object.__setattr__(self, "chunk_size", check_integer("chunk_size", self.chunk_size))
 
+    @names_adapters
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Starts the first episodes, one for each of the keys [B], B >= 1.
 
@@ -93,6 +94,7 @@ class VectorEnvironment:
         episodes, timestep = jax.vmap(AutoReset(self.env).reset)(keys)
         return VectorState(episodes, jax.vmap(draw_static)(episodes.inner)), timestep
 
+    @names_adapters
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes one action in every environment and starts the next episode where one ended.
 
@@ -121,8 +123,9 @@ class VectorEnvironment:
     def _reset_done(
         self, done: jax.Array, state: VectorState, picture: jax.Array
     ) -> tuple[VectorState, jax.Array]:
-        """Replaces state and picture by those of a next episode where `done` bool[B]."""
-        num_envs, size = len(done), self._chunk_size(len(done))
+        """Starts the next episode where `done` bool[B], in the state and in the picture."""
+        num_envs = len(done)
+        size = self._chunk_size(len(done))
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
         def start_chunk(carry):
@@ -135,7 +138,7 @@ class VectorEnvironment:
             write = lambda into, rows: into.at[index].set(  # noqa: E731
                 rows, mode="drop", indices_are_sorted=True
             )
-            # Reading back what was just written keeps XLA from computing it again in each use.
+            # Reading back what was just written keeps XLA from computing it again at every use.
             keys = jax.random.clone(read(state.episodes.key))  # overwritten by the next ones
             new, _ = jax.vmap(AutoReset(self.env).reset)(keys)
             episodes = jax.tree.map(write, state.episodes, new)
@@ -185,7 +188,8 @@ def draw_movable(state: State, background: jax.Array) -> jax.Array:
     """Draws food, tool and agent over a `draw_static` picture: a flat `observe`."""
     num_features = state.palette.shape[-1]
     cell = np.arange(background.size) // num_features
-    row, column = (cell // BOARD_SIZE).astype(np.uint8), (cell % BOARD_SIZE).astype(np.uint8)
+    row = (cell // BOARD_SIZE).astype(np.uint8)
+    column = (cell % BOARD_SIZE).astype(np.uint8)
     top, left = state.tool.astype(jnp.uint8)
     height, width = state.tool_extent.astype(jnp.uint8)
     # Above or left of the tool the unsigned difference wraps around to a large number.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_own_state
+from trap_tube_jax.checks import check_own_state, names_adapters
 from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import TimeStep
 
@@ -20,7 +20,8 @@ from trap_tube_jax.state import TimeStep
 class EnvironmentLike(Protocol):
     """An environment with a state of any type: wrapped by wrappers, and implemented by them.
 
-    An environment that resets itself has a true attribute `auto_resets`.
+    An environment that resets itself has an attribute `auto_resets`: "SameStep" if it does so in
+    the step that ends an episode, "NextStep" if in the next step, which ignores its action.
     """
 
     def reset(self, key: jax.Array, /) -> tuple[Any, TimeStep]:
@@ -72,7 +73,7 @@ class AutoReset:
     """
 
     env: EnvironmentLike
-    auto_resets: ClassVar = True
+    auto_resets: ClassVar = "SameStep"
 
     def __post_init__(self):
         _check_environment(self.env)
@@ -87,14 +88,16 @@ class AutoReset:
                 "episode; allowed: EpisodeStatistics(AutoReset(env))"
             )
 
+    @names_adapters
     def reset(self, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
         """Starts the first episode. See `Environment.reset`."""
         reset_key, next_key = jax.random.split(threefry_key(key))
         inner, timestep = self.env.reset(reset_key)
-        final = jnp.copy(timestep.observation)  # of its own memory, so both may be donated
+        final = jnp.copy(timestep.observation)  # in other memory, so both may be donated
         first = auto_reset_timestep(timestep, timestep.observation, final)
         return AutoResetState(inner, next_key), first
 
+    @names_adapters
     def step(
         self, state: AutoResetState, action: jax.Array
     ) -> tuple[AutoResetState, AutoResetTimeStep]:
@@ -129,7 +132,7 @@ class EpisodeStatisticsState(ByValue, struct.PyTreeNode, eq=False):
       last_return: f32[], the undiscounted return of the last finished episode.
       last_length: i32[], the number of steps of the last finished episode.
       episodes: i32[], finished episodes since the reset.
-      over: bool[], the wrapped environment has ended and does not reset itself.
+      over: bool[], the last step ended an episode and started no other, so the next is not counted.
     """
 
     inner: Any
@@ -145,8 +148,8 @@ class EpisodeStatisticsState(ByValue, struct.PyTreeNode, eq=False):
 class EpisodeStatistics:
     """Records the return and length of every episode. Also wraps a `VectorEnvironment`.
 
-    Around a bare environment, steps after the end of the episode are not counted. For several
-    episodes use `EpisodeStatistics(AutoReset(env))`, not the reverse.
+    Steps after the end of a bare environment's episode do not count, nor do steps that only reset.
+    For several episodes use `EpisodeStatistics(AutoReset(env))`, not the reverse.
 
     Attributes:
       env: an environment, wrapped or not.
@@ -161,10 +164,11 @@ class EpisodeStatistics:
         _check_environment(self.env)
 
     @property
-    def auto_resets(self) -> bool:
-        """True if the wrapped environment resets itself."""
+    def auto_resets(self) -> str | None:
+        """When the wrapped environment resets itself, or None."""
         return _auto_resets(self.env)
 
+    @names_adapters
     def reset(self, key: jax.Array) -> tuple[EpisodeStatisticsState, TimeStep]:
         """Starts the first episode with all counts at zero."""
         inner, timestep = self.env.reset(key)
@@ -179,6 +183,7 @@ class EpisodeStatistics:
             over=jnp.zeros(shape, bool),
         ), timestep
 
+    @names_adapters
     def step(
         self, state: EpisodeStatisticsState, action: jax.Array
     ) -> tuple[EpisodeStatisticsState, TimeStep]:
@@ -189,10 +194,10 @@ class EpisodeStatistics:
         """
         check_own_state(state, EpisodeStatisticsState)
         inner, timestep = self.env.step(state.inner, action)
-        running_return = state.running_return + timestep.reward
-        running_length = state.running_length + 1
-        # A bare environment stays done; its only episode must not finish at every step.
-        finished = timestep.done & ~state.over
+        is_counted = ~state.over
+        running_return = state.running_return + jnp.where(is_counted, timestep.reward, 0.0)
+        running_length = state.running_length + is_counted.astype(jnp.int32)
+        finished = timestep.done & is_counted
         return EpisodeStatisticsState(
             inner=inner,
             running_return=jnp.where(timestep.done, 0.0, running_return),
@@ -200,7 +205,7 @@ class EpisodeStatistics:
             last_return=jnp.where(finished, running_return, state.last_return),
             last_length=jnp.where(finished, running_length, state.last_length),
             episodes=state.episodes + finished.astype(jnp.int32),
-            over=timestep.done & (not self.auto_resets),
+            over=timestep.done & (self.auto_resets != "SameStep"),
         ), timestep
 
 
@@ -212,14 +217,14 @@ def _check_environment(env: Any) -> None:
         )
 
 
-def _auto_resets(env: Any) -> bool:
-    return bool(getattr(env, "auto_resets", False))
+def _auto_resets(env: Any) -> str | None:
+    return getattr(env, "auto_resets", None)
 
 
 def auto_reset_timestep(
     timestep: TimeStep, observation: jax.Array, final_observation: jax.Array
 ) -> AutoResetTimeStep:
-    """Returns `timestep` with other observations, reshaped to its own."""
+    """Returns `timestep` with other observations, which may be flat."""
     shape = timestep.observation.shape
     return AutoResetTimeStep(
         observation=observation.reshape(shape),

@@ -116,6 +116,18 @@ def test_make_vec_makes_the_compiled_batch():
     assert TrapTubeVectorEnv.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
 
 
+@pytest.mark.parametrize(("limit", "length"), [(3, 3), (9, 5)])
+def test_the_smaller_of_two_step_limits_holds_for_one_and_many(limit, length):
+    options = {"max_steps": 5, "max_episode_steps": limit}
+    one = gymnasium.make("trap_tube_jax/TrapTube-v0", **options)
+    many = gymnasium.make_vec("trap_tube_jax/TrapTube-v0", num_envs=2, **options)
+    one.reset(seed=0)
+    many.reset(seed=0)
+    for time in range(1, length + 1):
+        assert one.step([0, 0])[3] == (time == length)
+        assert many.step([[0, 0]] * 2)[3].tolist() == [time == length] * 2
+
+
 def test_steps_do_not_loop_over_environments():
     calls = []
 
@@ -273,6 +285,7 @@ def test_processes_of_their_own_change_nothing(context):
         ({"render_mode": "human"}, "one of rgb_array, ansi, got 'human'"),
         ({"num_envs": 0}, "num_envs must be an integer >= 1, got 0"),
         ({"cell_size": 0}, "cell_size must be an integer >= 1, got 0"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be an integer >= 1, got 0"),
         ({"autoreset_mode": "Disabled"}, "one of NextStep, SameStep, got 'Disabled'"),
         ({"task_set": tt.Environment(), "max_steps": 9}, "do not apply"),
     ],

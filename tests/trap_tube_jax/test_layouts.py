@@ -5,7 +5,7 @@ import pytest
 
 from agents import Config
 from paths import ROOT
-from trap_tube_jax.layouts import NUM_ASSIGNMENTS, NUM_FRAMES, layout_tables
+from trap_tube_jax.layouts import NUM_ASSIGNMENTS, NUM_OUTLINES, layout_tables
 from trap_tube_jax.objects import TUBE1, TUBE2
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS
 
@@ -18,14 +18,14 @@ def layouts() -> tuple[np.ndarray, np.ndarray]:
     """
     tables = layout_tables()
     looks = np.where(tables.board == TUBE2, TUBE1, tables.board)
-    frames = np.concatenate([looks.reshape(NUM_FRAMES, -1), tables.extent], axis=1)
-    _, first, times = np.unique(frames, axis=0, return_index=True, return_counts=True)
+    outlines = np.concatenate([looks.reshape(NUM_OUTLINES, -1), tables.extent], axis=1)
+    _, first, times = np.unique(outlines, axis=0, return_index=True, return_counts=True)
     chances, counts = [], []
-    for frame, share in zip(first, times / NUM_FRAMES, strict=True):
-        _, boards = np.unique(looks[frame], axis=0, return_counts=True)
-        foods = np.full(tables.num_food[frame], 1 / tables.num_food[frame])
-        num_tools = tables.num_tools[frame]
-        agents = tables.num_agents[frame, :num_tools]
+    for outline, share in zip(first, times / NUM_OUTLINES, strict=True):
+        _, boards = np.unique(looks[outline], axis=0, return_counts=True)
+        foods = np.full(tables.num_food[outline], 1 / tables.num_food[outline])
+        num_tools = tables.num_tools[outline]
+        agents = tables.num_agents[outline, :num_tools]
         inside = np.multiply.outer(boards / NUM_ASSIGNMENTS, foods)
         chance = share * np.multiply.outer(inside, 1 / (num_tools * agents))
         chances.append(chance.ravel())

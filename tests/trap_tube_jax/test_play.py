@@ -73,13 +73,15 @@ def test_hints_lead_to_the_food(game):
         game = press_all(game, ["wsad"[grasp], "kjhl"[move]])
     assert game.message.startswith("solved in 11 steps!")
     for key in (UP, "?"):
-        assert play.press(game, key).message.startswith("the episode is over")
+        assert play.press(game, key) == game
 
 
 def test_the_limit_ends_the_episode(game):
     game = press_all(game, [LEFT] * 50)
-    assert game.message.startswith("not solved in 50 steps")
-    assert int(press_all(game, [LEFT]).state.time) == 50
+    assert "step 50 of 50" in drawn(game)[1]
+    assert game.message.startswith("out of steps")
+    for key in (LEFT, "?"):
+        assert play.press(game, key) == game
 
 
 def test_a_hint_where_nothing_helps(game):
@@ -101,7 +103,9 @@ def test_the_screen_shows_the_board_and_fits(game):
     assert lines[6][:26] == "|  ||    ////////        |"
     assert lines[7][:26] == "|  ||    ><@@  ()        |"
     assert lines[11][:26] == "|  /\\                    |"
+    assert "step 0 of 50" in lines[1]
     assert "hand up: empty" in lines[2]
+    assert "goal: move onto the food @@" in lines[3]
     assert sum("@@ food" in line for line in lines) == 1
 
 
@@ -111,8 +115,11 @@ def test_the_screen_shows_the_hand_and_a_horizontal_tool(game):
     turned = play.press(holding, "d")
     assert "hand right: empty" in drawn(turned)[2]
     assert drawn(turned)[10][:26] == "|  ->                    |"
+    assert sum("-> agent" in line for line in drawn(turned)) == 1
     tool, extent = jnp.array([0, 0], jnp.int32), game.state.tool_extent[::-1]
-    assert drawn(having(game, tool=tool, tool_extent=extent))[2][:11] == "|========  "
+    lying = drawn(having(game, tool=tool, tool_extent=extent))
+    assert lying[2][:11] == "|========  "
+    assert sum("== tool" in line for line in lying) == 1
 
 
 @pytest.mark.parametrize(

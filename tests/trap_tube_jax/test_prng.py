@@ -20,10 +20,16 @@ def test_keys_of_either_kind_draw_the_same_tasks(impl):
     assert_same(reset(key), reset(jax.random.key(5, impl="threefry2x32")))
 
 
+def own_transfer(key, state):
+    """Draws with the key as it is."""
+    return state.replace(agent=state.agent.at[1].set(jax.random.randint(key, (), 0, 12)))
+
+
 @pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
 def test_tasks_of_rbg_keys_do_not_depend_on_the_batch(impl):
     keys = jax.random.split(jax.random.key(5, impl=impl), 4)
-    for env in (tt.make("pstsy"), tt.AutoReset(tt.make("pstsy"))):
+    own = tt.Environment((own_transfer, tt.compose(tt.structural, own_transfer)))
+    for env in (tt.make("pstsy"), tt.AutoReset(tt.make("pstsy")), own):
         batch, reset = jax.jit(jax.vmap(env.reset))(keys), jax.jit(env.reset)
         for index, key in enumerate(keys):
             assert_same(rows(batch, index), reset(key))

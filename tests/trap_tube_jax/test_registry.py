@@ -27,13 +27,13 @@ SPECIFIED = [
 ]
 
 
-def test_the_papers_sets_are_those_of_the_page_by_id_and_short_name():
+def test_the_papers_sets_are_those_of_the_page_by_id_short_name_and_label():
     sets = [(entry.id, entry.short, entry.label, entry.transfers) for entry in tt.PAPER_TASK_SETS]
     assert sets == SPECIFIED
     assert tt.registered_ids()[:8] == tuple(entry[0] for entry in SPECIFIED)
 
-    for name, short, _, transfers in SPECIFIED:
-        for env in (tt.make(name), tt.make(short)):
+    for name, short, label, transfers in SPECIFIED:
+        for env in map(tt.make, (name, short, label)):
             assert (env.transfers, env.max_steps, env.num_features) == (transfers, 50, 3)
 
 
@@ -67,9 +67,26 @@ def test_base_state_and_step_limit_are_those_of_the_set_or_given(own_task_sets):
     assert len({entry, *tt.PAPER_TASK_SETS}) == 9
 
 
-@pytest.mark.parametrize("options", [{"base": tt.base_state()}, {"max_steps": 20}])
-def test_other_tasks_than_the_papers_have_no_label_of_the_papers(own_task_sets, options):
-    assert tt.register("Own-v0", (tt.structural,), short="own", **options).label == "own"
+@pytest.mark.parametrize("options", [{}, {"base": tt.base_state()}, {"max_steps": 20}])
+def test_no_two_sets_have_one_label(own_task_sets, options):
+    tt.register("Own-v0", (tt.structural,), short="own", **options)
+    labels = [tt.task_set(name).label for name in tt.registered_ids()]
+    assert len(set(labels)) == len(labels)
+    assert labels[-1] == "own"
+
+
+@pytest.mark.parametrize("name", ["NA", "null", "nan", "None"])
+def test_a_name_that_reads_as_missing_is_a_name(own_task_sets, name):
+    tt.register(name, (tt.structural,))
+    assert tt.make(name).transfers == (tt.structural,)
+    scores = tt.score_gymnasium(Upward(), [name, "base"], 2)
+    assert list(scores) == [name, "base"]
+    assert scores[name].tasks == 2
+
+
+class Upward:
+    def act(self, observation):
+        return 0, 0
 
 
 def test_an_own_set_may_be_registered_again(own_task_sets):
@@ -84,19 +101,36 @@ def test_an_own_set_may_be_registered_again(own_task_sets):
     assert tt.make("own").max_steps == 30
 
 
-UNKNOWN = ["TrapTube-v1", "traptube-v0", "", "P", 3, None]
-
-
-@pytest.mark.parametrize("name", UNKNOWN)
-def test_make_refuses_an_unknown_id(name):
-    every_id = [entry[0] for entry in SPECIFIED]
-    assert_refused([f"unknown task set {name!r}", *every_id, "(pstsy)"], tt.make, name)
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("TrapTube-v1", "TrapTube-v0"),
+        ("traptube-v0", "TrapTube-v0"),
+        ("P", "p"),
+        ("psty", "pstsy"),
+        ("{P,St}", "{P, St}"),
+        ("two_traps", "two-traps"),
+        ("mine", None),
+        ("", None),
+        (3, None),
+        (None, None),
+        (["p"], None),
+    ],
+)
+def test_make_refuses_an_unknown_name_and_offers_the_nearest(name, meant):
+    shorts = ", ".join(entry[1] for entry in SPECIFIED)
+    assert_refused([f"unknown task set {name!r}", f"allowed: {shorts}, "], tt.make, name)
+    with pytest.raises(ValueError, match="unknown") as error:
+        tt.make(name)
+    assert (f"did you mean {meant!r}" in str(error.value)) == (meant is not None)
+    assert ("did you mean" in str(error.value)) == (meant is not None)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"num_features": 2.5}, ["num_features", ">= 1", "2.5"]),
+        ({"num_features": 10**9}, ["num_features", "<= 1024", "1000000000"]),
         ({"num_features": 4, "base": tt.base_state(5)}, ["num_features=4", "5 features"]),
         ({"max_steps": 0}, ["max_steps", ">= 1", "0"]),  # as `Environment` does
     ],

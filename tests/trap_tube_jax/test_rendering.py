@@ -165,6 +165,35 @@ def test_gif_holds_the_frames(tmp_path):
     assert durations == [100, 100, 600]
 
 
+def durations_of(path):
+    """Milliseconds of the pictures of a GIF."""
+    with Image.open(path) as gif:
+        found = []
+        for index in range(getattr(gif, "n_frames", 1)):
+            gif.seek(index)
+            found.append(gif.info["duration"])
+    return found
+
+
+@pytest.mark.parametrize("fps", [1, 7, 12, 15, 24, 29.97, 30, 40, 45, 50])
+def test_a_gif_plays_at_its_rate(fps, tmp_path):
+    flicker = np.zeros((61, 4, 4, 3), np.uint8)
+    flicker[1::2] = 255
+    tt.save_gif(flicker, tmp_path / "flicker.gif", fps, hold=0)
+    durations = durations_of(tmp_path / "flicker.gif")
+    np.testing.assert_allclose(np.cumsum(durations), np.arange(1, 62) * 1000 / fps, atol=5.001)
+    assert np.ptp(durations) <= 10
+
+
+def test_a_still_picture_lasts_as_long_as_a_gif_can_show_it(tmp_path):
+    still = np.zeros((700, 4, 4, 3), np.uint8)
+    tt.save_gif(still, tmp_path / "still.gif", 1)
+    assert durations_of(tmp_path / "still.gif") == [655_350]
+    still[600:] = 255
+    tt.save_gif(still, tmp_path / "two.gif", 1)
+    assert durations_of(tmp_path / "two.gif") == [600_000, 101_000]
+
+
 def test_gif_of_more_colors_than_it_can_hold(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3)).astype(np.uint8)
     tt.save_gif(noise, tmp_path / "noise.gif")

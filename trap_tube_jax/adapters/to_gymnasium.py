@@ -8,6 +8,7 @@ Importing `trap_tube_jax` registers them where Gymnasium >= 1.1 is installed:
 Both take the keyword arguments of the classes below. The step limit is `max_steps`.
 """
 
+import copy
 import functools
 import reprlib
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import numpy as np
 
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.checks import check_integer, integer_array
-from trap_tube_jax.environment import Environment
+from trap_tube_jax.environment import Environment, pairs_of
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe, render_ascii
@@ -91,12 +92,12 @@ class TrapTubeEnv(_Compiled, gymnasium.Env):
         """Checks the arguments; the first reset and step compile.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own, to which
+          task_set: registered id, short name or label, or an `Environment`, to which
             `num_features` and `max_steps` do not apply.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `MultiDiscrete([4, 4])`.
           num_features: N, the feature channels of the observation; see `make`.
-          max_steps: step limit in place of the set's.
+          max_steps: step limit instead of the set's.
           render_mode: "rgb_array", "ansi" or None.
           cell_size: pixels per cell and side of a picture.
 
@@ -108,7 +109,7 @@ class TrapTubeEnv(_Compiled, gymnasium.Env):
         elif (num_features, max_steps) != (None, None):
             raise ValueError(
                 f"num_features={num_features} and max_steps={max_steps} do not apply to an "
-                "Environment of your own; give them to it"
+                "Environment; give them to it"
             )
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(
@@ -190,16 +191,19 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         num_envs: int = 1,
         *,
         autoreset_mode: Any = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
         **options: Any,
     ):
         """Checks the arguments; the first reset and step compile.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own, not a subclass.
+          task_set: registered id, short name or label, or an `Environment`, not a subclass.
           num_envs: number of environments, at least 1.
           autoreset_mode: `AutoresetMode.NEXT_STEP` spends the step after the last on the
             reset; `SAME_STEP` resets within the last step and returns the last observation
             as `infos["final_obs"]`. Their names "NextStep" and "SameStep" work too.
+          max_episode_steps: further step limit, as `gymnasium.make` takes it: the smaller one of
+            it and the set's holds.
           **options: keyword arguments of `TrapTubeEnv`.
 
         Raises:
@@ -213,7 +217,13 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
         self.num_envs = check_integer("num_envs", num_envs)
         one = TrapTubeEnv(task_set, **options)
-        self.env, self.render_mode, self.cell_size = one.env, one.render_mode, one.cell_size
+        self.env = one.env
+        if max_episode_steps is not None:
+            limit = check_integer("max_episode_steps", max_episode_steps)
+            self.env = copy.copy(one.env)
+            self.env.max_steps = min(limit, one.env.max_steps)
+        self.render_mode = one.render_mode
+        self.cell_size = one.cell_size
         self.single_observation_space = one.observation_space
         self.single_action_space = one.action_space
         self.observation_space = batch_space(one.observation_space, num_envs)
@@ -268,7 +278,8 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         state = _started(self._state)
         actions = _grasp_and_move(actions, self.single_action_space, self.num_envs)
         self._state, timestep = self._programs.step(state, actions)
-        terminations, truncations = np.array(timestep.terminated), np.array(timestep.truncated)
+        terminations = np.array(timestep.terminated)
+        truncations = np.array(timestep.truncated)
         infos: dict[str, Any] = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             infos = _final_infos(np.asarray(timestep.final_observation), terminations | truncations)
@@ -297,17 +308,17 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
             first = check_integer("seed", seed, minimum=0)
             seeds = [first + index for index in range(self.num_envs)]
         else:
-            seeds = [each if each is None else check_integer("seed", each, 0) for each in seed]
+            seeds = [x if x is None else check_integer("seed", x, 0) for x in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must be one or {self.num_envs} integers, got {len(seeds)}")
-        super().reset(seed=next((each for each in seeds if each is not None), None))
+        super().reset(seed=next((x for x in seeds if x is not None), None))
         if self._state is None:
             drawn = self.np_random.integers(2**32, size=self.num_envs).tolist()
-            seeds = [new if each is None else each for each, new in zip(seeds, drawn, strict=True)]
-        keys = _keys([each or 0 for each in seeds])
+            seeds = [new if x is None else x for x, new in zip(seeds, drawn, strict=True)]
+        keys = _keys([x or 0 for x in seeds])
         if self._state is None:
             return keys
-        is_seeded = np.array([each is not None for each in seeds])
+        is_seeded = np.array([x is not None for x in seeds])
         return _select(is_seeded, keys, self._state.episodes.key)
 
 
@@ -352,19 +363,19 @@ def _grasp_and_move(actions: Any, space: Any, *batch: int) -> np.ndarray:
     """Returns i32[..., 2] of actions in the action space; raises ValueError for others."""
     array = np.asarray(integer_array("actions", actions))
     is_flat = isinstance(space, spaces.Discrete)
-    shape, count = (*batch, *space.shape), NUM_ACTIONS if is_flat else NUM_DIRECTIONS
+    shape = (*batch, *space.shape)
+    count = NUM_ACTIONS if is_flat else NUM_DIRECTIONS
     if array.shape != shape:
         raise ValueError(
             f"actions must be integers of shape {shape}, got {array.dtype} of shape {array.shape}"
         )
     if array.min() < 0 or array.max() >= count:
         raise ValueError(f"actions must be from 0 to {count - 1}, got {reprlib.repr(actions)}")
-    pairs = np.stack(np.divmod(array, NUM_DIRECTIONS), axis=-1) if is_flat else array
-    return pairs.astype(np.int32)
+    return pairs_of(array) if is_flat else array.astype(np.int32)
 
 
 def _final_infos(observations: np.ndarray, ended: np.ndarray) -> dict[str, Any]:
-    """Returns the infos of Gymnasium's own vector environments for episodes that ended."""
+    """Returns the infos of Gymnasium's vector environments for episodes that ended."""
     if not ended.any():
         return {}
     final = np.full(len(ended), None, object)

@@ -60,8 +60,8 @@ class _TrapTube(environment.Environment):
         """Checks the arguments.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own, which has its own
-            number of features and, as the default parameter, step limit.
+          task_set: registered id, short name or label, or an `Environment`, whose number of
+            features and, as the default parameter, step limit hold.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
             `Tuple((Discrete(4), Discrete(4)))` or i32[2].
           num_features: N, the feature channels of the observation; see `trap_tube_jax.make`.
@@ -75,8 +75,8 @@ class _TrapTube(environment.Environment):
             task_set = make_environment(task_set, num_features=num_features)
         elif num_features is not None:
             raise ValueError(
-                f"num_features={num_features} does not apply to an Environment of your own; "
-                "give it the base state you mean"
+                f"num_features={num_features} does not apply to an Environment; give it the base "
+                "state you mean"
             )
         else:
             self._name = repr(task_set)
@@ -166,7 +166,7 @@ class FiveValueTrapTube(_TrapTube):
         """Checks the arguments.
 
         Args:
-          task_set: registered id or short name, or an `Environment` of your own.
+          task_set: registered id, short name or label, or an `Environment`.
           final_observation: adds the observation before any reset to `info`.
           **options: flat_actions and num_features, see `SixValueTrapTube`.
 

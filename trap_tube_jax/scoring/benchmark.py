@@ -4,7 +4,6 @@ Source: protocol.md.
 """
 
 import functools
-import inspect
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -16,21 +15,19 @@ import numpy as np
 from trap_tube_jax._version import __version__
 from trap_tube_jax.checks import check_integer, check_seed, described, integer_array
 from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
+from trap_tube_jax.objects import NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
 from trap_tube_jax.registry import TaskSet, make, task_set
-from trap_tube_jax.scoring.scores import Optimality, Score, Scores
-from trap_tube_jax.scoring.tasks import (
-    ALL_SETS,
-    PROTOCOL,
-    fixed_tasks,
-    label,
-    layout_numbers,
+from trap_tube_jax.scoring.python_agent import PythonAgent
+from trap_tube_jax.scoring.scores import Scores
+from trap_tube_jax.scoring.suite import (
+    blocks,  # noqa: F401  `agents` imports it from here
+    play_blocks,
+    score_of,
 )
+from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, fixed_tasks
 from trap_tube_jax.solver.search import solve_batch
 from trap_tube_jax.state import State, take
-
-BLOCK = 1024  # tasks played at once, which bounds the memory
 
 # Maps a set and B of its tasks to solved bool[B] and the steps taken i32[B].
 Play = Callable[[TaskSet, State], tuple[np.ndarray, np.ndarray]]
@@ -58,7 +55,16 @@ class Policy(Protocol):
 
 
 class _Episodes(NamedTuple):
-    """B episodes in play. The flags say whether all actions and memory so far were valid."""
+    """B episodes in play.
+
+    Attributes:
+      time: i32[], steps taken.
+      states: B states.
+      observation: u8[B, 12, 12, N].
+      carry: the policy's memory.
+      in_range: bool[B], all actions of the unfinished episode were in range.
+      is_number: bool[], the memory held no NaN.
+    """
 
     time: jax.Array
     states: State
@@ -103,12 +109,11 @@ def score(
     def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
         env = Environment(max_steps=entry.max_steps)  # states hold their tasks
         key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(entry.id.encode()))
-        total = len(states.time)
-        played = [
-            program(env, take(states, block), jax.random.fold_in(key, block[0]))
-            for block in blocks(total)
-        ]
-        solved, length, in_range, is_number = zip(*played, strict=True)
+
+        def play_block(block: State, start: int) -> tuple[jax.Array, ...]:
+            return program(env, block, jax.random.fold_in(key, start))
+
+        solved, length, in_range, is_number = play_blocks(play_block, states)
         if not np.all(in_range):
             raise ValueError(
                 f"the policy's act returned an invalid action on {entry.label}; allowed: "
@@ -119,7 +124,7 @@ def score(
                 f"the policy's act returned a carry with NaN on {entry.label}; check that its "
                 "parameters are finite"
             )
-        return np.concatenate(solved)[:total], np.concatenate(length)[:total]
+        return np.asarray(solved), np.asarray(length)
 
     return _scores(play, sets, tasks, seed, optimality, num_features)
 
@@ -139,26 +144,23 @@ def score_gymnasium(
         u8[12, 12, N] and returns (grasp, move) or 4 * grasp + move. A function that takes
         `state` besides the observation gets None at first and returns the action and the next
         state, as in Stable-Baselines3. A function that takes `deterministic` gets True. An agent's
-        `reset()`, if it has one, is called before every episode.
+        `reset()`, if it has one, is called before every episode. A model that Stable-Baselines3
+        trained behind `VecNormalize` gets observations that are normalised likewise.
       sets: as for `score`.
       tasks: as for `score`.
       optimality: as for `score`.
       num_features: as for `score`.
 
     Raises:
-      ValueError: an argument is invalid, or the agent returns an invalid action.
+      ValueError: an argument is invalid, the agent acts on observations of another dtype, or it
+        returns an invalid action.
     """
-    act = getattr(agent, "predict", None) or getattr(agent, "act", None)
-    if not callable(act):
-        raise ValueError(
-            f"an agent has predict(observation) or act(observation); {type(agent).__name__} has "
-            "neither"
-        )
+    caller = PythonAgent(agent)
 
     def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
         step = _compiled_step(Environment(max_steps=entry.max_steps))
         states = jax.device_get(states)
-        ends = [_play_one(agent, act, step, take(states, i)) for i in range(len(states.time))]
+        ends = [caller.play(step, take(states, index)) for index in range(len(states.time))]
         solved, length = zip(*ends, strict=True)
         return np.array(solved), np.array(length, np.int32)
 
@@ -177,7 +179,8 @@ def _scores(
     if isinstance(sets, str) or not sets:
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
     check_integer("optimality", optimality, minimum=0)
-    made, entries = [], [task_set(name) for name in sets]
+    made = []
+    entries = [task_set(name) for name in sets]
     # All before the first is played, so that a wrong one costs nothing.
     envs = [make(entry.short, num_features=num_features) for entry in entries]
     for entry, env in zip(entries, envs, strict=True):
@@ -188,51 +191,21 @@ def _scores(
     return Scores(PROTOCOL, __version__, seed, tuple(made))
 
 
-def score_of(
-    name: str,
-    states: State,
-    solved: np.ndarray,
-    length: np.ndarray,
-    max_steps: int,
-    shortest: np.ndarray | None = None,
-) -> Score:
-    """Computes the score of outcomes bool[B] and numbers of steps i32[B] on B tasks of a set.
-
-    `shortest` has the lengths of the first tasks' shortest plans, to compare with.
-    """
-    found = None
-    if shortest is not None:
-        part = slice(len(shortest))
-        found = Optimality.of(solved[part], length[part], shortest, max_steps)
-    layout = layout_numbers(name, states)
-    return Score.of(name, label(name), solved, length, layout=layout, optimality=found)
-
-
-def blocks(total: int) -> list[np.ndarray]:
-    """Returns the indices of `total` tasks in blocks i64[b] that are played at once.
-
-    All blocks have one size, the smaller of `BLOCK` and `total`, so that they share a compilation.
-    The last block is filled up with the first tasks.
-    """
-    size = min(BLOCK, total)
-    return [np.arange(start, start + size) % total for start in range(0, total, size)]
-
-
 def _play(
     policy: Policy, env: Environment, states: State, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Plays B tasks in lockstep until all are over.
 
     Returns:
-      Solved bool[B]; steps taken i32[B]; bool[], all actions of unfinished episodes were in
-      range; bool[], the policy's memory held no NaN.
+      Solved bool[B]; steps taken i32[B]; bool[B], all actions of the unfinished episode were in
+      range; bool[B], the same in every row: the policy's memory held no NaN.
     """
+    batch = len(states.time)
 
     def step(now: _Episodes) -> _Episodes:
         step_key = jax.random.fold_in(key, now.time)
-        batch = len(now.observation)
         action, carry = _pair(policy.act(now.observation, now.carry, step_key), batch)
-        expected, got = (jax.tree.structure(each) for each in (now.carry, carry))
+        expected, got = (jax.tree.structure(tree) for tree in (now.carry, carry))
         if got != expected:
             raise ValueError(
                 f"the policy's act must return a carry like that of initial, {expected}, got {got}"
@@ -244,7 +217,7 @@ def _play(
             states=states,
             observation=timestep.observation,
             carry=carry,
-            in_range=now.in_range & jnp.all(in_range | now.states.done),
+            in_range=now.in_range & (in_range | now.states.done),
             is_number=now.is_number & ~_has_nan(carry),
         )
 
@@ -252,12 +225,13 @@ def _play(
         time=jnp.int32(0),
         states=states,
         observation=jax.vmap(observe)(states),
-        carry=policy.initial(len(states.time)),
-        in_range=jnp.array(True),
+        carry=policy.initial(batch),
+        in_range=jnp.ones(batch, bool),
         is_number=jnp.array(True),
     )
     last = jax.lax.while_loop(lambda now: ~jnp.all(now.states.done), step, first)
-    return last.states.terminated, last.states.time, last.in_range, last.is_number
+    is_number = jnp.broadcast_to(last.is_number, (batch,))
+    return last.states.terminated, last.states.time, last.in_range, is_number
 
 
 def _has_nan(tree: Any) -> jax.Array:
@@ -280,41 +254,6 @@ def _pair(returned: Any, batch: int) -> tuple[jax.Array, Any]:
             f"{described(action)}; action_from_index converts 4 * grasp + move"
         )
     return jnp.asarray(action), carry
-
-
-def _play_one(
-    agent: Any, act: Callable[..., Any], step: Callable[..., Any], state: State
-) -> tuple[bool, int]:
-    """Plays one task; returns solved and the number of steps."""
-    known = list(inspect.signature(act).parameters)[1:]  # without the observation
-    options: dict[str, Any] = {"deterministic": True} if "deterministic" in known else {}
-    if callable(getattr(agent, "reset", None)):
-        agent.reset()
-    observation, memory = np.array(observe(state)), None
-    while not state.done:
-        if "state" in known:
-            action, memory = act(observation, state=memory, **options)
-        else:
-            action = act(observation, **options)
-        state, timestep = step(state, _grasp_and_move(action))
-        observation = np.array(timestep.observation)
-    return bool(state.terminated), int(state.time)
-
-
-def _grasp_and_move(action: Any) -> np.ndarray:
-    """Converts (grasp, move) or 4 * grasp + move to i32[2]; raises ValueError for the rest."""
-    try:
-        array = np.asarray(action)
-    except ValueError:  # ragged
-        array = np.zeros(0)
-    count = {1: NUM_ACTIONS, 2: NUM_DIRECTIONS}.get(array.size, 0)
-    if not count or array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count:
-        raise ValueError(
-            f"an action is (grasp, move), each in 0 to {NUM_DIRECTIONS - 1}, or 4 * grasp + move, "
-            f"in 0 to {NUM_ACTIONS - 1}; got {action!r}"
-        )
-    pair = array if array.size == 2 else np.stack(np.divmod(array, NUM_DIRECTIONS))
-    return pair.reshape(2).astype(np.int32)
 
 
 @functools.cache

@@ -58,7 +58,7 @@ class Layouts:
     @classmethod
     def of(cls, solved: np.ndarray, layout: np.ndarray) -> "Layouts":
         """Counts the layouts i32[B] of outcomes bool[B]."""
-        shares = [float(np.mean(solved[layout == each])) for each in np.unique(layout)]
+        shares = [float(np.mean(solved[layout == number])) for number in np.unique(layout)]
         return cls(sum(share > 0.5 for share in shares), len(shares))
 
     def __str__(self) -> str:
@@ -105,9 +105,10 @@ class Score:
     ) -> "Score":
         """Computes the score of outcomes bool[B] and numbers of steps i32[B].
 
-        `layout` i32[B] numbers the layout of each task; it is None unless the set has few.
+        `layout` i32[B] numbers the layouts of the tasks; it is None unless the set has few.
         """
-        count, tasks = int(np.sum(solved)), len(solved)
+        count = int(np.sum(solved))
+        tasks = len(solved)
         low, high = wilson_interval(count, tasks)
         return cls(
             set=name,
@@ -163,7 +164,8 @@ class Scores:
 
 
 def _cells(score: Score) -> list[str]:
-    interval, found = score.interval, score.optimality
+    interval = score.interval
+    found = score.optimality
     return [
         score.label,
         str(score.tasks),

@@ -16,6 +16,7 @@ import numpy as np
 
 from trap_tube_jax.checks import MAX_TASKS, check_integer
 from trap_tube_jax.environment import Environment
+from trap_tube_jax.positions import colorless_rows
 from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
 from trap_tube_jax.state import State
 from trap_tube_jax.transfers import Transfer, compose, perceptual
@@ -68,7 +69,7 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     check_integer("the number of evaluation tasks", num_tasks, maximum=MAX_TASKS)
     count = num_tasks if env.transfers else 1
     # Transfers are compiled one by one: the sets share them, so eight sets take three
-    # compilations, and a transfer has the same bits in each.
+    # compilations, and a transfer has the same bits in all of them.
     draw = compose(*map(_compiled, env.transfers))
     base = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), env.base)
     keys = evaluation_keys(name, count, purpose)
@@ -108,8 +109,7 @@ def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
     """
     if name in ALL_SETS and name not in SETS_OF_FEW:
         return None
-    parts = (tasks.board, tasks.agent, tasks.tool, tasks.tool_extent, tasks.food)
-    rows = np.concatenate([np.asarray(part).reshape(len(part), -1) for part in parts], axis=1)
+    rows = np.asarray(colorless_rows(tasks))
     found, layout = np.unique(rows, axis=0, return_inverse=True)
     few = len(found) <= FEW_LAYOUTS and len(found) < max(len(rows), 2)
     return layout.reshape(-1).astype(np.int32) if few or name in SETS_OF_FEW else None

@@ -1,8 +1,9 @@
 """The solver's command line: `python -m trap_tube_jax.solver --help`."""
 
 import argparse
+import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -22,7 +23,7 @@ from trap_tube_jax.tables import markdown_table
 
 DESCRIPTION = """Find exact shortest plans of the trap-tube tasks. Without --show and --distances,
 print statistics of whole task sets and draw a histogram. Sets that differ in colours alone have
-the same statistics."""
+the same statistics. Only the pictures need the extra [pictures]."""
 QUANTILES = (5, 25, 50, 75, 95)
 
 
@@ -66,22 +67,21 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _survey(options: argparse.Namespace) -> None:
-    from trap_tube_jax.solver.pictures import save_histogram  # noqa: PLC0415  matplotlib is slow
-
     tasks = check_integer("tasks", options.tasks, maximum=MAX_TASKS)
     keys = jax.random.split(jax.random.key(check_seed(options.seed)), tasks)
     lengths = {}
-    for entry in [task_set(name) for name in options.sets]:
+    for entry in dict.fromkeys(task_set(name) for name in options.sets):
         print(f"solving {tasks:,} tasks of {entry.label}", file=sys.stderr)
         states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
         lengths[entry.label] = solve_batch(states).length
-    path = options.output or Path("shortest_plans.png")
-    save_histogram(lengths, path)
     quantiles = (f"{quantile} %" for quantile in QUANTILES)
     head = ["set", "tasks", "solvable", "mean", *quantiles, "longest"]
     rows = [row_of_lengths(label, length) for label, length in lengths.items()]
     print(f"Steps of the shortest plans\n\n{markdown_table([head, *rows])}")
-    print(f"histogram: {path}", file=sys.stderr)
+    with _drawing(options, "shortest_plans.png") as path:
+        from trap_tube_jax.solver.pictures import save_histogram  # noqa: PLC0415
+
+        save_histogram(lengths, path)
 
 
 def row_of_lengths(label: str, length: np.ndarray) -> list[str]:
@@ -97,26 +97,39 @@ def row_of_lengths(label: str, length: np.ndarray) -> list[str]:
 def _show(options: argparse.Namespace) -> None:
     state = _task(options.show, options.seed)
     plan = solve(state)
-    path = options.output or Path("plan.gif")
-    save_gif(episode_frames(state, plan.actions, cell_size=32), path, fps=4)
     for time, at in enumerate(replay(state, plan)):
         print(f"{_caption(plan, time)}\n{render_ascii(at)}\n")
-    print(f"animation: {path}", file=sys.stderr)
+    with _drawing(options, "plan.gif") as path:
+        save_gif(episode_frames(state, plan.actions, cell_size=32), path, fps=4)
 
 
 def _distances(options: argparse.Namespace) -> None:
-    from trap_tube_jax.solver.pictures import save_distances  # noqa: PLC0415  matplotlib is slow
-
     state = _task(options.distances, options.seed)
-    plan, found = solve(state), distances(state)
-    path = options.output or Path("distances.png")
-    save_distances(state, plan, found, path)
+    plan = solve(state)
+    found = distances(state)
     print(f"length of the plan: {plan.length if plan.solvable else 'unsolvable'}")
     print(f"reachable states: {found.num_reachable}")
     print(f"with a way to the goal: {np.count_nonzero(found.to_goal >= 0)}")
     if plan.solvable:
         print(f"farthest from the goal: {found.to_goal.max()}")
-    print(f"picture: {path}", file=sys.stderr)
+    with _drawing(options, "distances.png") as path:
+        from trap_tube_jax.solver.pictures import save_distances  # noqa: PLC0415
+
+        save_distances(state, plan, found, path)
+
+
+@contextlib.contextmanager
+def _drawing(options: argparse.Namespace, default: str) -> Iterator[Path]:
+    """Yields the file to draw. A missing library is an error only if `--output` names the file."""
+    path = options.output or Path(default)
+    try:
+        yield path
+    except ImportError as error:
+        if options.output is not None:
+            raise
+        print(f"no picture: {error}", file=sys.stderr)
+    else:
+        print(f"picture: {path}", file=sys.stderr)
 
 
 def _task(name: str, seed: int) -> State:

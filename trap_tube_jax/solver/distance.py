@@ -70,7 +70,8 @@ def _by_cells(table: np.ndarray) -> np.ndarray:
 def _explore(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns `from_start` i16[144^3], the unsolved nodes i32[n], their successors i32[n, 16]."""
     from_start = np.full(NUM_POSITIONS, UNKNOWN, np.int16)
-    nodes, successors = [], []
+    nodes = []
+    successors = []
     for depth, level in enumerate(levels(state)):
         from_start[level.nodes] = depth
         solved = level.successors[level.solved]
@@ -91,5 +92,6 @@ def _distances_to_goal(
         if not is_next.any():
             break
         to_goal[nodes[is_next]] = distance
-        nodes, successors = nodes[~is_next], successors[~is_next]
+        nodes = nodes[~is_next]
+        successors = successors[~is_next]
     return to_goal

@@ -26,9 +26,9 @@ def save_distances(
 ) -> None:
     """Writes a PNG of the distance to the goal over the board, at moments of a plan.
 
-    Tool and food stay in place within a picture. Each number is the distance to the goal with the
-    agent in that cell. The agent's own cell has none, nor have cells that are unreachable or have
-    no way to the goal.
+    Tool and food do not move within a picture. A number is the distance to the goal with the agent
+    in that cell. The agent's present cell has no number, nor have cells that are unreachable or
+    have no way to the goal.
 
     Args:
       state: the task's first state.
@@ -41,7 +41,8 @@ def save_distances(
     times = np.unique(np.linspace(0, last, MOMENTS).round().astype(int))
     boards = [distances.to_goal[(*states[time].food, *states[time].tool)] for time in times]
     scale = Normalize(0, max(np.max(boards), 1))
-    rows, columns = -(-len(times) // 2), min(len(times), 2)
+    rows = -(-len(times) // 2)
+    columns = min(len(times), 2)
     figure = Figure(figsize=(3.8 * columns + 0.7, 4 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).flatten()
     for axis in axes:

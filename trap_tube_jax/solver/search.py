@@ -18,11 +18,11 @@ from trap_tube_jax import dynamics
 from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.environment import action_from_index
 from trap_tube_jax.geometry import cell_of
-from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
-from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, position_id
+from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS
+from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, colorless_rows, position_id
 from trap_tube_jax.state import State, take, validate
 
-# Frontiers are padded to one of few sizes, because each size compiles once.
+# Frontiers are padded to one of few sizes, because every size compiles.
 CHUNK_SIZES = (256, 1024, 4096)
 
 
@@ -49,10 +49,10 @@ class Level(NamedTuple):
     """All nodes at one distance from the start, and their successors.
 
     Attributes:
-      nodes: i32[n], in the order of the first shortest plan that leads to each.
-      successors: i32[n, 16], the node after each action.
+      nodes: i32[n], in the order of the first shortest plans that lead to them.
+      successors: i32[n, 16], the nodes after the 16 actions.
       solved: bool[n, 16], the action solves the task.
-      origin: i64[n], flat index of each node's first occurrence in the previous level's
+      origin: i64[n], flat indices of the nodes' first occurrences in the previous level's
         `successors`; empty at the start.
     """
 
@@ -80,7 +80,7 @@ def solve(state: State) -> Plan:
 
 
 def solve_batch(states: State) -> Plan:
-    """Finds the shortest plans of many tasks, as `solve` does for each.
+    """Finds the shortest plans of many tasks, as `solve` does for one.
 
     Args:
       states: states with one leading axis B, as from `jax.vmap(env.reset)`.
@@ -92,11 +92,12 @@ def solve_batch(states: State) -> Plan:
       ValueError: `states` is not a batch, or `solve` refuses a state, whose index the message
         names.
     """
-    # Tasks of a set may recur; each is solved once.
+    tasks = list(_unbatched(states))
+    # Tasks of a set may recur, and are solved once.
     found: dict[bytes, np.ndarray | None] = {}
     plans = []
-    for state in _unbatched(states):
-        task = _fingerprint(state)
+    for state, row in zip(tasks, np.asarray(colorless_rows(states)), strict=True):
+        task = row.tobytes()
         if task not in found:
             found[task] = _shortest_actions(state)
         plans.append(_to_plan(found[task]))
@@ -124,7 +125,7 @@ def checked(state: State) -> State:
 
 
 def levels(state: State) -> Iterator[Level]:
-    """Yields the task's nodes by distance from the start, each node once.
+    """Yields the task's nodes by distance from the start, every node once.
 
     Solved nodes end an episode, so they appear as successors alone. The search ends where no
     node is new; stop iterating to end it earlier.
@@ -202,10 +203,10 @@ def _state_at(layout: State, node: jax.Array) -> State:
 
 def _to_plan(indices: np.ndarray | None) -> Plan:
     is_solvable = indices is not None
-    grasp, move = divmod(indices if is_solvable else np.empty(0, np.int32), NUM_DIRECTIONS)
+    actions = action_from_index(indices if is_solvable else np.empty(0, np.int32))
     return Plan(
-        actions=np.stack([grasp, move], axis=-1),
-        length=np.array(len(grasp) if is_solvable else -1, np.int32),
+        actions=np.asarray(actions),
+        length=np.array(len(actions) if is_solvable else -1, np.int32),
         solvable=np.array(is_solvable),
     )
 
@@ -222,12 +223,6 @@ def _unbatched(states: State) -> Iterator[State]:
             yield checked(take(states, index))
         except (ValueError, IndexError) as error:
             raise ValueError(f"state {index} of the batch: {error}") from error
-
-
-def _fingerprint(state: State) -> bytes:
-    """Returns bytes that are equal exactly for states of the same task, colours aside."""
-    fields = (state.board, state.tool_extent, state.food, state.tool, state.agent)
-    return b"".join(np.asarray(field).tobytes() for field in fields)
 
 
 def _to_host(state: State) -> State:

@@ -3,7 +3,7 @@
 import json
 import re
 import zlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ import pytest
 import trap_tube_jax as tt
 from refusal import assert_refused
 from trap_tube_jax import registry
-from trap_tube_jax.scoring import benchmark
+from trap_tube_jax.positions import layout_rows
+from trap_tube_jax.scoring import Suite, suite
 from trap_tube_jax.scoring.scores import Optimality
 from trap_tube_jax.scoring.tasks import (
     ALL_SETS,
@@ -147,6 +148,7 @@ def test_few_layouts_are_those_that_return(name, rows, numbers):
 
 
 def test_layouts_differ_by_every_part_but_colours():
+    """And `layout_rows` by colours, but not by the position."""
     base = jax.tree.map(np.asarray, tt.base_state())
     parts = ("board", "agent", "tool", "tool_extent", "food")
     others = [base.replace(**{part: getattr(base, part) + 1}) for part in parts]
@@ -155,11 +157,15 @@ def test_layouts_differ_by_every_part_but_colours():
     first, second, *rest = np.asarray(layout_numbers("sy", tasks)).tolist()
     assert first == second
     assert sorted([first, *rest]) == list(range(6))
+    rows = np.asarray(jax.jit(layout_rows)(tasks))
+    same = (rows == rows[0]).all(axis=1)
+    alike = {"agent", "tool", "food"}
+    assert same.tolist() == [True, False, *(part in alike for part in parts)]
 
 
 def test_blocks_change_nothing_but_the_keys_of_draws(near, scores, monkeypatch):
     """Three blocks of five steps, of which none ends early."""
-    monkeypatch.setattr(benchmark, "BLOCK", 8)
+    monkeypatch.setattr(suite, "BLOCK", 8)
     assert tt.score(Rightward(), ["near"], tasks=20)["near"] == scores["near"]
     seen = []
 
@@ -182,6 +188,41 @@ def test_the_sets_own_limit_holds(near, max_steps, counts):
     name = f"Near{max_steps}"
     tt.register(name, near.transfers, base=near.base, max_steps=max_steps)
     assert (tt.score(Rightward(), [name], tasks=20)[name].solved > 0) == counts
+
+
+class Ends(NamedTuple):
+    """Outcomes as an agent of one's own may record them."""
+
+    solved: jax.Array
+    length: jax.Array
+    food: jax.Array
+
+
+def test_a_suite_plays_all_sets_in_equal_blocks_up_to_their_limits(near, monkeypatch):
+    """The program solves every task in four steps."""
+    monkeypatch.setattr(suite, "BLOCK", 8)
+    tt.register("Near3", near.transfers, base=near.base, max_steps=3)
+    tasks = Suite.of_sets(["near", "{P}", "Near3", "base"], 6)
+    assert tasks.longest == 50
+    blocks = []
+
+    def program(states):
+        blocks.append(len(states.time))
+        four = jnp.full(blocks[-1], 4)
+        return Ends(four > 0, four, states.food)
+
+    outcomes = tasks.play(program)
+    assert blocks == [8, 8, 8], "of 19 tasks"
+    for name, states in tasks.tasks.items():
+        np.testing.assert_array_equal(outcomes[name].food, states.food)
+    shortest = {name: np.array([2, 4, 1])[: len(x.time)] for name, x in tasks.tasks.items()}
+    scores = tasks.scores(outcomes, shortest=shortest, seed=7)
+    assert [(x.set, x.tasks, x.solved) for x in scores.sets] == [
+        *[("near", 6, 6), ("p", 6, 6), ("Near3", 6, 0), ("base", 1, 1)]
+    ]
+    assert (scores["p"].mean_steps, scores.seed, scores.protocol) == (4, 7, PROTOCOL)
+    assert scores["p"].optimality == Optimality(3, 100, 7 / 12, 1 / 4)
+    assert_refused(["name at least one"], Suite.of_sets, [], 6)
 
 
 def test_scores_are_records(scores):
@@ -250,12 +291,38 @@ def test_an_agent_may_keep_a_state(near):
     assert scores["Above-v0"].mean_steps == 4
 
 
+def test_a_model_trained_behind_vecnormalize_sees_what_it_was_trained_on(near, scores):
+    """The task looks the same to both agents; one reads scaled observations."""
+
+    class Normalizer:
+        def normalize_obs(self, observation):
+            return observation / np.float32(255)
+
+    class Trained(Single):
+        observation_space = np.zeros(3, np.float32)
+
+        def get_vec_normalize_env(self):
+            return Normalizer()
+
+    plain = Single((UP, RIGHT))
+    trained = Trained((UP, RIGHT))
+    for agent in (plain, trained):
+        assert tt.score_gymnasium(agent, ["near"], 3)["near"].tasks == 3
+    np.testing.assert_allclose(trained.seen, np.asarray(plain.seen) / 255, rtol=1e-6)
+
+
 def test_refusals(near):
     words = ["num_features=5", "has 3"]  # before base, which an agent without action cannot play
     assert_refused(words, tt.score, Rightward(), ["near"], num_features=5)
     assert_refused(words, tt.score_gymnasium, Single(None), ["base", "near"], num_features=5)
     assert_refused(["initial(batch)", "object has no initial"], tt.score, object())
     assert_refused(["predict(observation)", "neither"], tt.score_gymnasium, object())
+
+    class Floats(Single):
+        observation_space = np.zeros(3, np.float32)  # all that is looked at is the dtype
+
+    words = ["acts on float32", "uint8", "VecNormalize"]
+    assert_refused(words, tt.score_gymnasium, Floats(0), ["near"])
     for sets, options, words in (
         (["q"], {}, ["unknown task set 'q'", "pstsy"]),
         ("sy", {}, ["sets must name task sets", "base, p", "'sy'"]),
