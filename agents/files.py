@@ -55,11 +55,12 @@ def damage_named(path: Path) -> Iterator[None]:
     """Turns what a parser raises about a file's content into a ValueError with the file's path."""
     try:
         yield
-    except OSError:
+    except (OSError, MemoryError):
         raise
     except Exception as error:  # parsers raise many kinds, also RecursionError
         reason = " ".join(str(error).split())
-        raise ValueError(f"{path} cannot be read: {reason}") from error
+        shown = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in reason)
+        raise ValueError(f"{path} cannot be read: {shown}") from error
 
 
 def read_text(path: Path) -> str:

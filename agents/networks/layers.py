@@ -24,7 +24,7 @@ def variance_scaling(scale: float) -> Callable[..., np.ndarray]:
     """Returns an initialiser that fills kernels with sqrt(scale / fan-in), for `draw` to sample."""
 
     def init(key: jax.Array, shape: Sequence[int], dtype: Any = np.float32) -> np.ndarray:
-        return np.full(shape, np.sqrt(scale / np.prod(shape[:-1])), dtype)
+        return np.broadcast_to(np.sqrt(scale / np.prod(shape[:-1])).astype(dtype), shape)
 
     return init
 

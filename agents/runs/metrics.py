@@ -134,8 +134,8 @@ def _records(path: Path) -> list[list[str]]:
         header, *rows = filter(None, csv.reader(io.StringIO(text, newline=""), strict=True))
         if rows and not text.endswith("\n") and len(rows[-1]) < len(header):
             rows.pop()
-        if len(set(header)) < len(header):
-            raise ValueError("two columns have the same name")
+        if len(set(header)) < len(header) or "" in header:
+            raise ValueError("its columns need a name each")
         for number, row in enumerate(rows, 1):
             if len(row) != len(header):
                 raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
