@@ -58,9 +58,13 @@ def damage_named(path: Path) -> Iterator[None]:
     except (OSError, MemoryError):
         raise
     except Exception as error:  # parsers raise many kinds, also RecursionError
-        reason = " ".join(str(error).split())
-        shown = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in reason)
-        raise ValueError(f"{path} cannot be read: {shown}") from error
+        raise ValueError(f"{path} cannot be read: {one_line(error)}") from error
+
+
+def one_line(error: Exception) -> str:
+    """Returns the message of an error as one line that any terminal can show."""
+    text = " ".join(str(error).split())
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
 
 
 def read_text(path: Path) -> str:

@@ -49,6 +49,11 @@ class RunFolder:
         self.page = path / "report.html"
         self.animation = path / "solved.gif"
 
+    @property
+    def title(self) -> str:
+        """The folder's name, also if its path is "." or ends in ".."."""
+        return self.path.resolve().name
+
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
         """Makes this process the folder's only writer; makes the folder if missing.
