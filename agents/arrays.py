@@ -13,7 +13,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from agents.files import write_bytes
+from agents.files import check_file, damage_named, parse_json, write_bytes
 
 Tree = TypeVar("Tree")
 Arrays = dict[str, np.ndarray]
@@ -53,21 +53,26 @@ def write_arrays(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
     write_bytes(path, safetensors.numpy.save(arrays, {"json": json.dumps(about)}))
 
 
-def read_arrays(path: Path) -> tuple[Arrays, dict[str, Any]]:
+def read_arrays(path: Path, kind: Any = dict[str, Any]) -> tuple[Arrays, Any]:
     """Inverts `write_arrays`.
 
+    Args:
+      path: the file.
+      kind: type of the plain values, as in `agents.files.parse_json`.
+
     Raises:
-      ValueError: the file is damaged or of another kind.
-      OSError: the file cannot be opened.
+      ValueError: the file is not regular, damaged or of another kind.
+      OSError: the file is missing or cannot be opened.
     """
+    check_file(path)
     with path.open("rb"):  # safetensors calls an unreadable file missing
         pass
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return arrays, {**json.loads((file.metadata() or {})["json"])}
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not a file of arrays of this package: {error}") from error
+    with damage_named(path), safetensors.safe_open(path, framework="numpy") as file:
+        about = parse_json((file.metadata() or {}).get("json", "null"), kind)
+        for name in (names := list(file.keys())):
+            if not name.isprintable():
+                raise ValueError(f"names of arrays must be printable, got {name!r}")
+        return {name: file.get_tensor(name) for name in names}, about
 
 
 def key_data(x: jax.Array) -> jax.Array:

@@ -7,8 +7,10 @@ import inspect
 import re
 import types
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from agents.files import expand
 from trap_tube_jax.imports import import_modules
 
 Options = TypeVar("Options")
@@ -126,7 +128,9 @@ def _values(kind: Any) -> dict[str, Any]:
         return {**_values(inner), "nargs": "*" if rest == [...] else 1 + len(rest)}
     if kind is bool:
         return {"action": argparse.BooleanOptionalAction}
-    return {"type": kind, "metavar": {int: "N", float: "X", str: "NAME"}.get(kind, "PATH")}
+    if kind is Path:
+        return {"type": expand, "metavar": "PATH"}
+    return {"type": kind, "metavar": {int: "N", float: "X", str: "NAME"}[kind]}
 
 
 def _documents(cls: type) -> dict[str, str]:

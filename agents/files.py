@@ -1,19 +1,185 @@
-"""Files that are written whole or not at all."""
+"""Files of runs: read only where they are regular and as expected, written whole or not at all."""
 
+import contextlib
+import dataclasses
+import errno
 import json
 import os
+import reprlib
+import types
+import typing
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+Plain = bool | int | float | str | None
+
+LARGEST = 2**26  # bytes of a text file
+
+
+def expand(path: str | os.PathLike[str]) -> Path:
+    """Returns a path, in which a leading `~` stands for the home folder.
+
+    Shells expand `--out ~/x`, but not `--out=~/x`; Python expands neither.
+
+    Raises:
+      ValueError: there is no such home folder.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"{path} cannot be expanded: {error}") from error
+
+
+def is_file(path: Path) -> bool:
+    """Returns whether a path names a regular file; False if it names nothing.
+
+    Raises:
+      ValueError: it names something else, such as a folder, a FIFO or a dangling link.
+    """
+    if path.is_file():
+        return True
+    if os.path.lexists(path):
+        raise ValueError(f"{path} is not a regular file")
+    return False
+
+
+def check_file(path: Path) -> None:
+    """Raises FileNotFoundError or ValueError unless a path names a regular file."""
+    if not is_file(path):
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+
+
+@contextlib.contextmanager
+def damage_named(path: Path) -> Iterator[None]:
+    """Turns what a parser raises about a file's content into a ValueError with the file's path."""
+    try:
+        yield
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:  # parsers raise many kinds, also RecursionError
+        raise ValueError(f"{path} cannot be read: {one_line(error)}") from error
+
+
+def one_line(error: Exception) -> str:
+    """Returns the message of an error as one line that any terminal can show."""
+    text = " ".join(str(error).split())
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
+
+
+def read_text(path: Path) -> str:
+    """Reads a file of UTF-8.
+
+    Raises:
+      ValueError: the file is not regular, not UTF-8 or larger than `LARGEST`.
+      OSError: the file is missing or cannot be opened.
+    """
+    check_file(path)
+    with damage_named(path), path.open("rb") as file:
+        content = file.read(LARGEST + 1)
+        if len(content) > LARGEST:
+            raise ValueError(f"more than {LARGEST:,} bytes")
+        return content.decode()
+
+
+def read_json(path: Path, kind: Any = Any) -> Any:
+    """Reads a JSON file whose value is of an annotated type; see `parse_json`.
+
+    Raises:
+      ValueError: the file is damaged; the message names it.
+      OSError: the file is missing or cannot be opened.
+    """
+    text = read_text(path)
+    with damage_named(path):
+        return parse_json(text, kind)
+
+
+def parse_json(text: str, kind: Any) -> Any:
+    """Parses JSON, and checks that the value is of an annotated type.
+
+    Strings must be printable, because terminals show them. Keys of a TypedDict or a dataclass must
+    be known, and the required keys of a TypedDict present.
+
+    Args:
+      text: the JSON.
+      kind: a plain type, a union, `list[X]`, `tuple[X, ...]`, `dict[str, X]`, a TypedDict, or a
+        dataclass.
+
+    Raises:
+      ValueError: the text is not JSON, or its value is of another type.
+    """
+    value = json.loads(text)
+    _check_kind(value, kind, "it")
+    return value
+
+
+def _check_kind(value: Any, kind: Any, name: str) -> None:
+    """Raises ValueError, which names the part, unless a JSON value is of a type."""
+    form, arguments = get_origin(kind) or kind, get_args(kind)
+    if form is Any:
+        return
+    if form in (Union, types.UnionType):
+        _check_union(value, arguments, name)
+    elif form in (list, tuple):
+        _check_is(value, list, name)
+        for index, part in enumerate(value):
+            _check_kind(part, arguments[0], f"{name}[{index}]")
+    elif form is dict:
+        _check_is(value, dict, name)
+        for key, part in value.items():
+            _check_is(key, str, f"a key of {name}")
+            _check_kind(part, arguments[1], key)
+    elif typing.is_typeddict(form) or dataclasses.is_dataclass(form):
+        _check_is(value, dict, name)
+        _check_keys(value, form, name)
+        kinds = get_type_hints(form)
+        for key, part in value.items():
+            _check_kind(part, kinds[key], key)
+    else:
+        _check_is(value, form, name)
+
+
+def _check_union(value: Any, kinds: tuple[Any, ...], name: str) -> None:
+    for kind in kinds:
+        with contextlib.suppress(ValueError):
+            return _check_kind(value, kind, name)
+    wanted = " or ".join(getattr(kind, "__name__", str(kind)) for kind in kinds)
+    raise ValueError(f"{name} must be {wanted}, got {reprlib.repr(value)}")
+
+
+def _check_is(value: Any, kind: type, name: str) -> None:
+    if type(value) not in ((int, float) if kind is float else (kind,)):
+        raise ValueError(f"{name} must be {kind.__name__}, got {reprlib.repr(value)}")
+    if kind is str and not value.isprintable():
+        raise ValueError(f"{name} must be printable, got {reprlib.repr(value)}")
+
+
+def _check_keys(value: dict[str, Any], form: Any, name: str) -> None:
+    for key in sorted(getattr(form, "__required_keys__", set()) - value.keys()):
+        raise ValueError(f"{name} lacks {key!r}")
+    for key in sorted(value.keys() - get_type_hints(form).keys()):
+        raise ValueError(f"{name} has an unknown {reprlib.repr(key)}")
+
+
+@contextlib.contextmanager
+def draft_of(path: Path) -> Iterator[Path]:
+    """Yields a path to write to, whose file takes the place of `path` at the end of the block.
+
+    A link at `path` is replaced, and the file that it names stays as it is.
+    """
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.unlink(missing_ok=True)  # of a killed process of this number, or a link
+    try:
+        yield draft
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Writes a file atomically."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with draft_of(path) as draft:
         draft.write_bytes(content)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def write_json(path: Path, values: Any) -> None:
@@ -22,9 +188,17 @@ def write_json(path: Path, values: Any) -> None:
     write_bytes(path, (json.dumps(values, indent=2) + "\n").encode())
 
 
-def read_json(path: Path) -> Any:
-    """Reads a JSON file; raises ValueError, which names the file, if it is damaged."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
+def append_text(path: Path, text: str, head: str) -> None:
+    """Appends lines to a text file; begins a new file with the line `head`.
+
+    Raises:
+      ValueError: the file is not regular, or begins with another line.
+      OSError: the file cannot be written.
+    """
+    is_file(path)
+    with path.open("a+", encoding="utf-8", newline="") as file:
+        file.seek(0)
+        first = file.readline(LARGEST)
+        if first and first != head:
+            raise ValueError(f"{path} does not begin with {head.strip()!r}; move it away")
+        file.write(text if first else head + text)

@@ -7,11 +7,10 @@ best-pstsy  the preset `best` on {P, St, Sy}: the median of five seeds
 
 from pathlib import Path
 
-from agents.arrays import SUFFIX
-
 FOLDER = Path(__file__).parent
+FILES = {path.stem: path for path in sorted(FOLDER.glob("*.safetensors"))}
 
 
 def names() -> tuple[str, ...]:
     """Returns the names of the shipped agents."""
-    return tuple(sorted(path.name.removesuffix(SUFFIX) for path in FOLDER.glob(f"*{SUFFIX}")))
+    return tuple(FILES)

@@ -4,12 +4,15 @@ A file holds the state's arrays and a record of plain values. Each file is writt
 killed process leaves earlier checkpoints intact.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
 from agents.arrays import SUFFIX, Arrays, read_arrays, to_arrays, write_arrays
+from agents.files import Plain, damage_named
 
 KEPT = 3  # the newest checkpoints
+CANONICAL = re.compile("0|[1-9][0-9]*")  # names of files; others are somebody else's
 
 
 def save(folder: Path, iteration: int, state: Any, record: dict[str, Any]) -> None:
@@ -32,7 +35,7 @@ def save(folder: Path, iteration: int, state: Any, record: dict[str, Any]) -> No
 def iterations(folder: Path) -> list[int]:
     """Returns the iterations that have a checkpoint, in order; none if the folder is missing."""
     names = [path.name.removesuffix(SUFFIX) for path in folder.glob(f"*{SUFFIX}")]
-    return sorted(int(name) for name in names if name.isdigit())
+    return sorted(int(name) for name in names if CANONICAL.fullmatch(name))
 
 
 def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, Any]]:
@@ -44,21 +47,29 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
       ValueError: there is no such checkpoint, or it is damaged.
       OSError: the file cannot be read.
     """
-    known = iterations(folder)
-    if not known:
-        raise ValueError(f"{folder} holds no checkpoint")
-    chosen = known[-1] if iteration is None else iteration
-    if chosen not in known:
-        allowed = ", ".join(map(str, known))
-        raise ValueError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
+    while known := iterations(folder):
+        chosen = known[-1] if iteration is None else iteration
+        if chosen not in known:
+            allowed = ", ".join(map(str, known))
+            raise ValueError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
+        try:
+            return _read(folder, chosen)
+        except FileNotFoundError:
+            if iteration is not None:
+                raise
+    raise ValueError(f"{folder} holds no checkpoint")
+
+
+def _read(folder: Path, iteration: int) -> tuple[Arrays, dict[str, Any]]:
+    path = _file(folder, iteration)
     try:
-        return read_arrays(_file(folder, chosen))
-    except FileNotFoundError:
-        if iteration is None:
-            return load(folder)
-        raise
+        arrays, record = read_arrays(path, dict[str, Plain])
+        with damage_named(path):
+            if record.get("iteration") != iteration:
+                raise ValueError(f"its iteration is {record.get('iteration')!r}")
     except ValueError as error:
         raise ValueError(f"{error}; delete it to use the checkpoint before it") from error
+    return arrays, record
 
 
 def _file(folder: Path, iteration: int) -> Path:

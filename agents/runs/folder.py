@@ -2,41 +2,70 @@
 
 import contextlib
 import dataclasses
+import difflib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NotRequired, TypedDict
 
 import filelock
 
-from agents.files import read_json, write_json
-from agents.runs.run import Run, RunOptions
+from agents.files import Plain, damage_named, expand, is_file, read_json, write_json
+from agents.runs.run import DeviceOptions, Run, RunOptions, check_algorithm
 from trap_tube_jax._version import __version__
+from trap_tube_jax.checks import check_registered_name, check_seed
 from trap_tube_jax.imports import import_modules
 
 CONFIG_FILE = "config.json"
+RUNS = Path("runs")  # where agents.train puts them
+MOST_LISTED = 10
+
+Settings = dict[str, Plain | list[int | float]]
+
+
+class StoredRun(TypedDict):
+    """The content of config.json: a run, its options and the version that wrote it."""
+
+    version: NotRequired[str]
+    config: Settings
+    seed: int
+    algorithm: str
+    imports: list[str]
+    options: RunOptions
 
 
 class RunFolder:
-    """The files of a run."""
+    """The files of a run; `~` in the path is the home folder."""
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: str | Path):
+        self.path = path = expand(path)
         self.config = path / CONFIG_FILE  # settings and options
         self.provenance = path / "provenance.json"  # machines, versions and commits that trained it
         self.metrics = path / "metrics.csv"  # a row per iteration
         self.evaluations = path / "evaluations.csv"  # a row per evaluated iteration and task set
         self.best = path / "best.safetensors"  # the best evaluation's, with `evaluate_every`
         self.checkpoints = path / "checkpoints"  # a file each, named by its iteration
+        self.tensorboard = path / "tensorboard"
         self.curves = path / "curves.png"
         self.page = path / "report.html"
         self.animation = path / "solved.gif"
+
+    @property
+    def title(self) -> str:
+        """The folder's name, also if its path is "." or ends in ".."."""
+        return self.path.resolve().name
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
         """Makes this process the folder's only writer; makes the folder if missing.
 
-        Raises ValueError if another process writes to the folder, OSError if it cannot be created.
+        Raises:
+          ValueError: another process writes to the folder, or the folder holds a link.
+          OSError: the folder cannot be created or locked.
         """
         self.path.mkdir(parents=True, exist_ok=True)
+        for path in self.path.iterdir():
+            if path.is_symlink():  # writing would change a file elsewhere
+                raise ValueError(f"{path} is a link; replace it by a copy of what it names")
         try:
             with filelock.FileLock(self.path / ".lock", timeout=0):
                 yield
@@ -44,13 +73,15 @@ class RunFolder:
             raise ValueError(
                 f"{self.path} is being written by another process; wait for its end"
             ) from None
+        except NotImplementedError as error:
+            raise OSError(f"{self.path} cannot be locked: {error}") from error
 
     def check_free(self) -> None:
         """Raises ValueError unless a new run can be created here."""
         if self.config.is_file():
             again = f"continue it with --resume {self.path}, or give another --name"
             raise ValueError(f"{self.path} holds a run; {again}")
-        if self.path.exists() and any(each.name != ".lock" for each in self.path.iterdir()):
+        if self.path.exists() and any(path.name != ".lock" for path in self.path.iterdir()):
             raise ValueError(f"{self.path} exists, but holds no run; give another --name")
 
     def note(self, run: Run, options: RunOptions | None = None) -> None:
@@ -58,10 +89,27 @@ class RunFolder:
         values = {**run.to_dict(), "options": dataclasses.asdict(options or RunOptions())}
         write_json(self.config, {"version": __version__, **values})
 
+    def stored(self) -> dict[str, Any]:
+        """Reads config.json as a `StoredRun`, without looking up the names in its settings.
+
+        Raises:
+          ValueError: there is no run, or the file is damaged.
+        """
+        if not is_file(self.config):
+            raise ValueError(f"{self.path} holds no run; {runs_near(self.path)}")
+        values = read_json(self.config, StoredRun)
+        with damage_named(self.config):
+            check_seed(values["seed"])
+            check_algorithm(values["algorithm"])
+            DeviceOptions(values["options"].get("devices"))
+            for setting, value in values["config"].items():
+                if isinstance(value, str):
+                    check_registered_name(setting, value)
+        return values
+
     def devices(self) -> int | None:
-        """Returns the stored option; unlike `read`, needs no modules."""
-        values = read_json(self.config) if self.config.is_file() else {}
-        return values.get("options", {}).get("devices")
+        """Returns the stored option, None without a run; unlike `read`, needs no modules."""
+        return self.stored()["options"].get("devices") if is_file(self.config) else None
 
     def read(self, imports: tuple[str, ...] = ()) -> tuple[Run, RunOptions]:
         """Returns the stored run and its options.
@@ -70,30 +118,46 @@ class RunFolder:
         no run, or its settings or options cannot be read.
         """
         import_modules(imports)
-        if not self.config.is_file():
-            raise ValueError(f"{self.path} holds no run; {runs_next_to(self.path)}")
-        version, needs = "unknown", ()
+        values = self.stored()
+        options = values.pop("options")
+        version = values.pop("version", "unknown")
         try:
-            values = read_json(self.config)
-            version, needs = values.pop("version", version), values.get("imports", needs)
-            options = values.pop("options", {})
-            run, sets = Run.from_dict(values), options["sets"] and tuple(options["sets"])
-            return run, RunOptions(**{**options, "sets": sets})
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            missing = "".join(f" --import {name}" for name in needs if name not in imports)
-            hint = f"; it was trained with{missing}" if missing else ""
+            sets = options.get("sets")
+            options["sets"] = None if sets is None else tuple(sets)
+            return Run.from_dict(values), RunOptions(**options)
+        except ValueError as error:
+            missing = [f"--import {name}" for name in values["imports"] if name not in imports]
+            hint = f"; it was trained with {' '.join(missing)}" if missing else ""
             raise ValueError(
                 f"{self.config}, written by version {version}, cannot be read: {error}{hint}"
             ) from error
 
 
-def runs_next_to(path: Path) -> str:
-    """Lists the runs in the parent of a folder, for messages."""
-    known = sorted(entry.parent.name for entry in path.parent.glob(f"*/{CONFIG_FILE}"))
-    return f"runs in {path.parent}: {', '.join(known) or 'none'}"
+def runs_near(path: Path) -> str:
+    """Says which runs a path that is none may have meant, for messages."""
+    if inside := _runs_in(path):
+        return f"give one of its runs: {_listed(inside)}"
+    known = [*_runs_in(path.parent), *_runs_in(RUNS)]
+    names = [run.name for run in known]
+    for name in difflib.get_close_matches(path.name, names, n=1, cutoff=0.8):
+        return f"did you mean {known[names.index(name)]}?"
+    return f"runs in {path.parent}: {_listed(_runs_in(path.parent)) or 'none'}"
+
+
+def _runs_in(path: Path) -> list[Path]:
+    found = sorted(entry.parent for entry in path.glob(f"*/{CONFIG_FILE}"))
+    return [run for run in found if run.name.isprintable()]
+
+
+def _listed(runs: list[Path]) -> str:
+    more = ", ..." if len(runs) > MOST_LISTED else ""
+    return ", ".join(run.name for run in runs[:MOST_LISTED]) + more
 
 
 def check_name(name: str) -> None:
-    """Raises ValueError unless a name is a plain folder name."""
-    if Path(name).name != name or name[:1] in ("", ".") or not name.isprintable():
-        raise ValueError(f"name must be a folder's name without a path, got {name!r}")
+    """Raises ValueError unless a name is a plain folder name; tables and shells take it as text."""
+    if Path(name).name != name or name[:1] in ("", *".-=+@") or not name.isprintable():
+        raise ValueError(
+            "name must be a folder's name without a path, and begin with none of .-=+@; "
+            f"got {name!r}"
+        )

@@ -1,17 +1,28 @@
 """Trained policies: files of parameters, runs' folders and the shipped agents."""
 
 from pathlib import Path
+from typing import TypedDict
 
 import jax
+import numpy as np
 
 from agents import pretrained
 from agents.acting.policy import Policy
 from agents.arrays import SUFFIX, Arrays, from_arrays, read_arrays, to_arrays, write_arrays
 from agents.config import Config
+from agents.files import expand, is_file
 from agents.networks.agent import PARTS, Agent, Params
 from agents.runs import checkpoint
-from agents.runs.folder import RunFolder, runs_next_to
+from agents.runs.folder import CONFIG_FILE, RunFolder, Settings, runs_near
+from trap_tube_jax.checks import check_integer
 from trap_tube_jax.imports import import_modules
+
+
+class StoredPolicy(TypedDict):
+    """The plain values in a policy's file."""
+
+    config: Settings
+    iteration: int
 
 
 def load(
@@ -30,7 +41,8 @@ def load(
     Loading runs no code that the source names; only modules in `imports` are imported.
 
     Args:
-      source: a run's folder, a file of parameters, or the name of a shipped agent.
+      source: a run's folder, a file of parameters, or the name of a shipped agent; `~` in a path
+        is the home folder.
       iteration: checkpoint of a run; if None, the best policy of a run that selects one
         (`--evaluate-every`), else the newest checkpoint.
       greedy: take the most probable actions; False samples them.
@@ -40,38 +52,51 @@ def load(
       ValueError: there is no such policy, or it is damaged or of another version.
       OSError: a file cannot be opened.
     """
-    folder, path = RunFolder(Path(source)), Path(source)
-    if not folder.config.is_file():
-        if not path.is_file() and str(source) in pretrained.names():
-            path = pretrained.FOLDER / f"{source}{SUFFIX}"
-        if not path.is_file():
-            raise ValueError(
-                f"{source} is neither a run, a file nor a shipped agent; {runs_next_to(path)}; "
-                f"shipped agents: {', '.join(pretrained.names())}"
-            )
-        if iteration is not None:
-            raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
-        import_modules(imports)
-        return read_policy(path).replace(greedy=greedy)
+    folder = RunFolder(source)
+    if is_file(folder.config):
+        return _load_run(folder, iteration, imports).replace(greedy=greedy)
+    path = folder.path
+    if not path.is_file():
+        path = pretrained.FILES.get(str(source), path)
+    if path.is_dir() or not is_file(path):
+        raise ValueError(
+            f"{source} is neither a run, a file nor a shipped agent; {runs_near(path)}; "
+            f"shipped agents: {', '.join(pretrained.names())}"
+        )
+    if is_file(path.parent.parent / CONFIG_FILE) and path.parent.name == folder.checkpoints.name:
+        raise ValueError(
+            f"{source} is a checkpoint; give its run, {path.parent.parent}, and iteration "
+            f"{path.stem}"
+        )
+    if iteration is not None:
+        raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
+    import_modules(imports)
+    return read_policy(path).replace(greedy=greedy)
+
+
+def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]) -> Policy:
     run, options = folder.read(imports)
     name = f"seed {run.seed}"
-    if iteration is None and options.evaluate_every and folder.best.is_file():
-        return read_policy(folder.best).replace(name=name, greedy=greedy)
+    if iteration is None and options.evaluate_every and is_file(folder.best):
+        return read_policy(folder.best).replace(name=name)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)
     stored = {name: array for name, array in arrays.items() if name.startswith(prefixes)}
     try:
         params = _params(run.config, {k.removeprefix("params/"): v for k, v in stored.items()})
     except ValueError as error:
-        raise ValueError(f"{folder.checkpoints} does not fit this version: {error}") from error
-    return Policy(name, run.config, params, record["iteration"], greedy)
+        raise ValueError(
+            f"checkpoint {record['iteration']} in {folder.checkpoints} does not fit this version: "
+            f"{error}"
+        ) from error
+    return Policy(name, run.config, params, record["iteration"])
 
 
 def save(path: str | Path, policy: Policy) -> None:
     """Saves a policy to one safetensors file, which `load` reads; its name is not stored."""
     params = {part: policy.params[part] for part in PARTS}
     about = {"config": policy.config.to_dict(), "iteration": policy.iteration}
-    write_arrays(Path(path), to_arrays(params), about)
+    write_arrays(expand(path), to_arrays(params), about)
 
 
 def read_policy(path: Path) -> Policy:
@@ -81,14 +106,20 @@ def read_policy(path: Path) -> Policy:
       ValueError: the file is damaged, of another kind, or its settings are unknown.
       OSError: the file cannot be opened.
     """
-    arrays, about = read_arrays(path)
+    arrays, about = read_arrays(path, StoredPolicy)
     try:
-        config, iteration = Config.from_dict(about["config"]), int(about["iteration"])
+        iteration = check_integer("iteration", about["iteration"], minimum=0)
+        config = Config.from_dict(about["config"])
         params = _params(config, arrays)
-    except (KeyError, TypeError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{path} does not hold a policy of this version: {error}") from error
     return Policy(path.name.removesuffix(SUFFIX), config, params, iteration)
 
 
 def _params(config: Config, arrays: Arrays) -> Params:
-    return from_arrays(arrays, jax.eval_shape(Agent(config).init, jax.random.key(0)))
+    """Returns the parameters of a network; ValueError names one that does not fit or is NaN."""
+    params = from_arrays(arrays, jax.eval_shape(Agent(config).init, jax.random.key(0)))
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
+    return params

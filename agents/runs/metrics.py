@@ -1,7 +1,11 @@
-"""CSV files that a run appends to."""
+"""CSV files of rows: the metrics of a run's iterations, and its evaluations."""
 
+import csv
+import dataclasses
 import io
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +13,76 @@ import pandas as pd
 
 from agents.acting.policy import Policy
 from agents.config import Config
-from agents.files import write_bytes
+from agents.files import append_text, damage_named, is_file, read_text, write_bytes
+from trap_tube_jax.checks import check_registered_name
 from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import Purpose
 
 Row = Mapping[str, Any]
-NO_ROWS = "iteration,purpose,task_set,tasks,solved,validation_success,episodes\n"
-Frame = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
+Table = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
+Frame = Table
+
+
+def _text(value: str) -> str:
+    if not value.isprintable():
+        raise ValueError("not printable")
+    return value
+
+
+def _name(value: str) -> str:
+    check_registered_name("task set", value)
+    return value
+
+
+def _count(value: str) -> int:
+    if not re.fullmatch("[0-9]{1,15}", value):
+        raise ValueError("not a count")
+    return int(value)
+
+
+def _positive(value: str) -> int:
+    if not _count(value):
+        raise ValueError("not positive")
+    return int(value)
+
+
+def _number(value: str) -> float:
+    number = float(value or "nan")
+    if value and not math.isfinite(number):
+        raise ValueError("not finite")
+    return number
+
+
+@dataclasses.dataclass(frozen=True)
+class Schema:
+    """The columns of a CSV file.
+
+    Attributes:
+      columns: a parser for the values of every required column.
+      other: a parser for the values of all other columns.
+    """
+
+    columns: Mapping[str, Callable[[str], Any]]
+    other: Callable[[str], Any] = _number
+
+
+COSTS = {"iteration": _count, "episodes": _count, "transitions": _count, "seconds": _number}
+METRICS = {**COSTS, "validation_success": _number}
+EVALUATIONS = {
+    "iteration": _count,
+    "purpose": _text,
+    "task_set": _name,
+    "tasks": _positive,
+    "solved": _count,
+}
+LAYOUTS = {"layouts": _number, "layouts_total": _number}
+OF_A_RUN = {"algorithm": _text, "seed": _count}
+SCHEMAS = {  # by the name of the file
+    "metrics.csv": Schema(METRICS),
+    "evaluations.csv": Schema(EVALUATIONS),
+    "curves.csv": Schema({**OF_A_RUN, **METRICS, "success": _number}),
+    "results.csv": Schema({**OF_A_RUN, **EVALUATIONS, **LAYOUTS}, _text),
+}
 
 
 def append_rows(path: Path, rows: Sequence[Row]) -> None:
@@ -25,31 +92,78 @@ def append_rows(path: Path, rows: Sequence[Row]) -> None:
       ValueError: the rows have other columns than the file.
       OSError: the file cannot be written.
     """
-    frame, is_new = pd.DataFrame(rows), not path.exists()
-    if not is_new and list(pd.read_csv(path, nrows=0)) != list(frame):
-        raise ValueError(f"{path} has other columns than {', '.join(frame)}; move it away")
-    frame.to_csv(path, mode="a", header=is_new, index=False)
+    table = pd.DataFrame(rows)
+    lines = table.to_csv(index=False, header=False)
+    append_text(path, lines, head=table[:0].to_csv(index=False))
 
 
-def read_rows(path: Path, **options: Any) -> Frame:
-    """Reads a CSV file of a run; drops a last line that a killed process left incomplete.
+def read_rows(path: Path) -> Table:
+    """Reads a CSV file by the schema of its name; an empty table if the file is missing.
 
-    Returns an empty table if the file is missing. Passes `options` to `pandas.read_csv`.
+    A last line that a killed process left incomplete is passed over.
+
+    Raises:
+      ValueError: the file is damaged; the message names it.
+      OSError: the file cannot be opened.
     """
-    text = path.read_text(encoding="utf-8") if path.exists() else ""
-    return pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1] or NO_ROWS), **options)
+    return _table(path, _records(path))
+
+
+def _table(path: Path, records: list[list[str]]) -> Table:
+    header, *rows = records
+    schema = SCHEMAS[path.name]
+    parsers = [schema.columns.get(name, schema.other) for name in header]
+    with damage_named(path):
+        for name in schema.columns:
+            if name not in header:
+                raise ValueError(f"it has no column {name!r}")
+        columns = zip(*rows, strict=True) if rows else [[] for _ in header]
+        table = {
+            name: [_parsed(parse, value, name) for value in values]
+            for name, parse, values in zip(header, parsers, columns, strict=True)
+        }
+        return pd.DataFrame(table, columns=header)
+
+
+def _records(path: Path) -> list[list[str]]:
+    """Reads the header and the complete rows of a CSV file; only a header if it is missing."""
+    text = read_text(path) if is_file(path) else ""
+    if "\n" not in text:  # not even the header is complete
+        return [list(SCHEMAS[path.name].columns)]
+    with damage_named(path):
+        header, *rows = filter(None, csv.reader(io.StringIO(text, newline=""), strict=True))
+        if rows and not text.endswith("\n") and len(rows[-1]) < len(header):
+            rows.pop()
+        if len(set(header)) < len(header) or "" in header:
+            raise ValueError("its columns need a name each")
+        for number, row in enumerate(rows, 1):
+            if len(row) != len(header):
+                raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
+        return [header, *rows]
+
+
+def _parsed(parse: Callable[[str], Any], value: str, name: str) -> Any:
+    try:
+        return parse(value)
+    except ValueError as error:
+        raise ValueError(f"{name} cannot be {value[:40]!r}: {error}") from error
 
 
 def rewind_rows(path: Path, iteration: int) -> None:
-    """Deletes the rows after an iteration; ValueError if the file has no column `iteration`."""
-    rows = read_rows(path, dtype=str, keep_default_na=False)
-    if "iteration" not in rows:
-        raise ValueError(f"{path} has no column 'iteration'; delete or restore it")
-    kept = rows[rows["iteration"].astype(int) <= iteration]
-    if len(kept):
-        write_bytes(path, kept.to_csv(index=False).encode())
-    else:
-        path.unlink(missing_ok=True)
+    """Removes the rows after an iteration, from whose checkpoint training makes them again.
+
+    Raises ValueError, and leaves the file as it is, if it is damaged.
+    """
+    records = _records(path)
+    table = _table(path, records)
+    kept = [
+        row for row, done in zip(records[1:], table["iteration"], strict=True) if done <= iteration
+    ]
+    file = io.StringIO(newline="")
+    if kept:
+        csv.writer(file, lineterminator="\n").writerows([records[0], *kept])
+    if is_file(path) and file.getvalue() != read_text(path):
+        write_bytes(path, file.getvalue().encode())
 
 
 def evaluation_rows(scores: Scores, policy: Policy, purpose: Purpose) -> list[Row]:

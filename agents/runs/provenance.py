@@ -6,16 +6,33 @@ import pathlib
 import platform
 import re
 import subprocess
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import jax
 
-from agents.files import read_json, write_json
+from agents.files import is_file, read_json, write_json
 
 ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Code that decides results; records and texts may change between two of them.
 CODE = ("agents/*.py", "benchmarks/*.py", "trap_tube_jax/*.py", "pyproject.toml")
+
+
+class Machine(TypedDict):
+    """Hardware, versions and commit, as provenance.json holds them."""
+
+    processor: str
+    cores: int
+    device: str
+    platform: str
+    python: str
+    jax: str
+    jaxlib: str
+    flax: str
+    optax: str
+    numpy: str
+    commit: str | None
+    devices: NotRequired[str]
 
 
 def provenance() -> dict[str, Any]:
@@ -32,11 +49,24 @@ def provenance() -> dict[str, Any]:
 
 
 def note_provenance(path: pathlib.Path, devices: str) -> None:
-    """Adds this machine, its versions and the commit to a JSON file of earlier entries."""
-    known = read_json(path) if path.exists() else []
+    """Adds this machine, its versions and the commit to a JSON file of earlier entries.
+
+    Raises:
+      ValueError: the file is damaged; it stays as it is.
+    """
+    known = read_provenance(path)
     here = {**provenance(), "devices": devices}
     if here not in known:
         write_json(path, [*known, here])
+
+
+def read_provenance(path: pathlib.Path) -> list[Machine]:
+    """Reads the machines that a run was trained on, in order; none if the file is missing.
+
+    Raises:
+      ValueError: the file is damaged; the message names it.
+    """
+    return read_json(path, list[Machine]) if is_file(path) else []
 
 
 def commit() -> str | None:

@@ -19,14 +19,18 @@ import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
-from agents.files import write_bytes
+from agents.files import draft_of, write_bytes
+from agents.runs.drawing import drawing, to_png
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
-from agents.runs.metrics import Frame, read_rows
+from agents.runs.metrics import Table, read_rows
+from agents.runs.provenance import read_provenance
 from agents.runs.run import Run
 from trap_tube_jax import solver
+from trap_tube_jax._version import __version__
 from trap_tube_jax.objects import DIRECTION_NAMES, NO_DIRECTION
 from trap_tube_jax.rendering import episode_frames, save_gif
+from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import label
 from trap_tube_jax.state import State, take
 
@@ -49,23 +53,67 @@ Played = Mapping[str, Evaluation]
 
 
 def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played) -> None:
-    """Writes curves, GIF and page of a run, from an evaluator and its outcomes `played`."""
-    save_curves(read_rows(folder.metrics), folder.curves, folder.path.name)
-    folder.animation.unlink(missing_ok=True)
-    own = tt.task_set(run.config.env_id).short
-    save_first_solved(folder.animation, evaluator, played, own)
+    """Writes curves, GIF and page of a run, from an evaluator and its outcomes `played`.
+
+    A file that cannot be drawn costs one line of warning.
+    """
+    curves = b""
+    with drawing(folder.curves):
+        curves = draw_curves(read_rows(folder.metrics), folder.title)
+        write_bytes(folder.curves, curves)
+    with drawing(folder.animation):
+        train_set = tt.task_set(run.config.env_id).short
+        save_first_solved(folder.animation, evaluator, played, train_set)
+    with drawing(folder.page):
+        write_bytes(folder.page, _page(folder, run, evaluator, played, curves).encode())
+
+
+def _page(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played, curves: bytes) -> str:
+    config = run.config
     episodes = json.dumps(_episodes(evaluator, played))
-    page = string.Template(PAGE.read_text(encoding="utf-8")).substitute(
-        title=html.escape(folder.path.name),
-        scores=evaluator.scores(played),
-        curves=base64.b64encode(folder.curves.read_bytes()).decode(),
+    return string.Template(PAGE.read_text(encoding="utf-8")).substitute(
+        title=html.escape(folder.title),
+        about=html.escape(
+            f"{run.algorithm} on {tt.task_set(config.env_id).label}, seed {run.seed}. "
+            f"{_origin(folder)}"
+        ),
+        scores=_score_rows(evaluator.scores(played)),
+        curves=base64.b64encode(curves).decode(),
         settings=html.escape(json.dumps(run.to_dict(), indent=1)),
         episodes=episodes.replace("</", "<\\/"),
     )
-    write_bytes(folder.page, page.encode())
 
 
-def save_curves(rows: Frame, path: Path, title: str) -> None:
+def _origin(folder: RunFolder) -> str:
+    """Returns version, commit and machine of a run in words."""
+    words = [f"trap_tube_jax {__version__}"]
+    for machine in read_provenance(folder.provenance)[-1:]:
+        words += [
+            f"commit {machine['commit'] or 'unknown'}",
+            f"jax {machine['jax']}",
+            f"{machine['cores']} core(s) of {machine['processor']}",
+            machine["device"],
+        ]
+    return ", ".join(words)
+
+
+def _score_rows(scores: Scores) -> str:
+    """Returns the rows of the page's table."""
+    rows = []
+    for score in scores.sets:
+        cells = [
+            score.label,
+            f"{score.tasks:,}",
+            f"{score.percent:.1f}",
+            "" if score.interval is None else "{:.1f} to {:.1f}".format(*score.interval),
+            "" if score.mean_steps is None else f"{score.mean_steps:.1f}",
+            "" if score.layouts is None else str(score.layouts),
+        ]
+        rows.append("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>")
+    return "\n".join(rows)
+
+
+def draw_curves(rows: Table, title: str) -> bytes:
     """Draws learning curves over episodes as PNG."""
     from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
 
@@ -76,8 +124,8 @@ def save_curves(rows: Frame, path: Path, title: str) -> None:
     ]
     figure = Figure(figsize=(10, 2.6 * math.ceil(len(panels) / 2) + 0.5), layout="constrained")
     figure.suptitle(title, parse_math=False)
-    for place, (name, unit, metrics) in enumerate(panels, 1):
-        axis = figure.add_subplot(math.ceil(len(panels) / 2), 2, place)
+    for index, (name, unit, metrics) in enumerate(panels, 1):
+        axis = figure.add_subplot(math.ceil(len(panels) / 2), 2, index)
         axis.set(ylabel=unit, xlabel="episodes")
         axis.set_title(name, loc="left")
         axis.grid(alpha=0.3)
@@ -86,7 +134,7 @@ def save_curves(rows: Frame, path: Path, title: str) -> None:
             axis.plot(rows["episodes"], rows[metric], label=metric.replace("_", " "), **style)
         if len(metrics) > 1:
             axis.legend(fontsize="small")
-    figure.savefig(path, format="png", dpi=100)
+    return to_png(figure, dpi=100)
 
 
 def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: str) -> str | None:
@@ -100,7 +148,8 @@ def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: 
             index = int(np.argmax(outcome.solved))
             actions = np.asarray(outcome.action[index, : outcome.length[index]])
             state = take(evaluator.tasks[name], index)
-            save_gif(episode_frames(state, actions, GIF_CELL_SIZE), path, fps=4)
+            with draft_of(path) as draft:
+                save_gif(episode_frames(state, actions, GIF_CELL_SIZE), draft, fps=4)
             return name
     return None
 
@@ -108,8 +157,8 @@ def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: 
 def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
     """Returns the first solved and the first unsolved episode of each set.
 
-    They hold `title`, `solved`, the replays `agent` and `plan` (see `_replay`), and `values`, the
-    network's of each step.
+    An episode holds `title`, `solved`, the replays `agent` and `plan` (see `_replay`), and
+    `values`, the network's value of every board.
     """
     shown = [
         (name, int(found[0]))
@@ -143,8 +192,8 @@ def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
 def _replay(state: State, actions: np.ndarray) -> dict[str, Any]:
     """Replays actions i32[T, 2], padded with -1.
 
-    Returns `frames`, the board before each step and after the last as PNG in base64, and
-    `actions`, those of each step in words.
+    Returns `frames`, the boards before every step and after the last one as PNG in base64, and
+    `actions`, the steps in words.
     """
     taken = actions[(actions >= 0).all(axis=1)]
     frames = episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]

@@ -7,9 +7,10 @@ from typing import Any
 
 import pandas as pd
 
-from agents.files import read_json
-from agents.runs.folder import CONFIG_FILE, RunFolder
+from agents.files import expand
+from agents.runs.folder import CONFIG_FILE, RunFolder, runs_near
 from agents.runs.metrics import read_rows
+from agents.runs.provenance import read_provenance
 
 Paths = str | Path | Iterable[str | Path]
 
@@ -18,7 +19,7 @@ def results(paths: Paths) -> pd.DataFrame:
     """Returns the evaluations of all runs in folders, one row each.
 
     Args:
-      paths: one or several folders: of a run, or of runs at any depth.
+      paths: one or several folders: of a run, or of runs at any depth; `~` is the home folder.
 
     Returns:
       A data frame with a row for each run, evaluated iteration, purpose of the tasks (validation
@@ -27,14 +28,15 @@ def results(paths: Paths) -> pd.DataFrame:
       length), and every setting.
 
     Raises:
-      ValueError: a folder holds no run, or a file cannot be read.
+      ValueError: a folder holds no run, or a file is damaged.
+      OSError: a file or folder cannot be opened.
     """
     tables = []
     for folder in find_runs(paths):
-        machines = read_json(folder.provenance) if folder.provenance.exists() else []
+        machines = read_provenance(folder.provenance)
         commit = machines[-1]["commit"] if machines else None
         table = _table(folder, folder.evaluations, commit=commit)
-        settings = read_json(folder.config)["config"].items()
+        settings = folder.stored()["config"].items()
         tables.append(table.assign(**{k: str(v) if type(v) is list else v for k, v in settings}))
     return _join(tables)
 
@@ -48,20 +50,42 @@ def metrics(paths: Paths) -> pd.DataFrame:
 
 
 def find_runs(paths: Paths) -> list[RunFolder]:
-    """Returns the runs in folders, sorted by path; ValueError for a folder without."""
-    found: list[RunFolder] = []
-    for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
-        walk = os.walk(path, followlinks=True)  # unlike `rglob`, passes over deleted folders
-        runs = sorted(Path(folder) for folder, _, files in walk if CONFIG_FILE in files)
+    """Returns the runs in folders, sorted by path, a folder once whatever links lead to it.
+
+    Raises:
+      ValueError: a folder holds no run.
+      OSError: a folder cannot be opened.
+    """
+    found: dict[str, Path] = {}
+    for path in map(expand, [paths] if isinstance(paths, str | Path) else paths):
+        runs = sorted(_runs_below(path, set()))
         if not runs:
-            raise ValueError(f"{path} holds no run")
-        found.extend(map(RunFolder, runs))
-    return found
+            raise ValueError(f"{path} holds no run; {runs_near(path)}")
+        for run in runs:
+            found.setdefault(os.path.realpath(run), run)
+    return list(map(RunFolder, found.values()))
+
+
+def _runs_below(path: Path, seen: set[str]) -> Iterable[Path]:
+    """Yields the runs in a folder and below; adds the folders looked into to `seen`."""
+    if os.path.realpath(path) in seen:
+        return
+    seen.add(os.path.realpath(path))
+    try:
+        entries = sorted(path.iterdir(), key=lambda entry: (entry.is_symlink(), entry))
+    except (FileNotFoundError, NotADirectoryError):  # deleted meanwhile, or never there
+        return
+    if (path / CONFIG_FILE) in entries:
+        yield path
+    for entry in entries:
+        if entry.is_dir():
+            yield from _runs_below(entry, seen)
 
 
 def _table(folder: RunFolder, path: Path, **about: Any) -> pd.DataFrame:
-    run = read_json(folder.config)  # plain values: no name in it is looked up or imported
-    rows, names = read_rows(path), ("algorithm", "seed")
+    run = folder.stored()
+    rows = read_rows(path)
+    names = ("algorithm", "seed")
     first = {"run": str(folder.path), **{name: run[name] for name in names}, **about}
     return rows.assign(**first)[[*first, *rows]]
 

@@ -1,6 +1,7 @@
 """A training run: its settings and seed, and the options for carrying it out."""
 
 import dataclasses
+import re
 from typing import Any, Self
 
 from agents.command_line import option
@@ -10,6 +11,7 @@ from trap_tube_jax.registry import task_set
 
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
+MAX_DEVICES = 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +21,7 @@ class Run:
     Attributes:
       config: the settings.
       seed: seed of all draws.
-      algorithm: name in tables; `ppo+<curiosity>` if empty.
+      algorithm: name in tables, by default `ppo+<curiosity>`; see `check_algorithm`.
       imports: modules that registered names of the settings. They are recorded, and imported
         again only at the caller's request.
     """
@@ -30,7 +32,7 @@ class Run:
     imports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Completes task set and algorithm; ValueError names an unknown set or a wrong seed."""
+        """Completes task set and algorithm; ValueError names a value that is not allowed."""
         check_seed(self.seed)
         env_id = task_set(self.config.env_id).id
         object.__setattr__(self, "config", dataclasses.replace(self.config, env_id=env_id))
@@ -38,6 +40,7 @@ class Run:
             curiosity = self.config.curiosity
             name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"
             object.__setattr__(self, "algorithm", name)
+        check_algorithm(self.algorithm)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, for JSON."""
@@ -45,12 +48,12 @@ class Run:
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
-        """Inverts `to_dict`; ValueError names a setting that is unknown or not allowed."""
+        """Inverts `to_dict`; ValueError names an unknown setting or a value that is not allowed."""
         config = Config.from_dict(values["config"])
         return cls(**{**values, "config": config, "imports": tuple(values["imports"])})
 
     def check_continues(self, before: "Run") -> None:
-        """Raises ValueError unless resuming `before` trains as this run alone would have."""
+        """Raises ValueError unless resuming `before` gives the result of an uninterrupted run."""
         old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
         scheduled = old["lr_decay_fraction"] > 0 or old["intrinsic_coef_init"] > 0
         free = {*EXTENDABLE, "config", "imports"} - ({"iterations"} if scheduled else set())
@@ -64,6 +67,15 @@ class Run:
                 )
 
 
+def check_algorithm(name: str) -> None:
+    """Raises ValueError unless a name can stand in tables of CSV, Markdown and HTML as it is."""
+    if not re.fullmatch(r"\w[\w .,:;=+/()\[\]{}-]*", name):
+        raise ValueError(
+            "algorithm must begin with a letter or digit, and hold letters, digits, spaces and "
+            f"any of .,:;=+/()[]{{}}- alone, got {name!r}"
+        )
+
+
 @dataclasses.dataclass(frozen=True)
 class DeviceOptions:
     """Options that take effect before JAX starts.
@@ -73,6 +85,11 @@ class DeviceOptions:
     """
 
     devices: int | None = option(None, "devices and hosts")
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a number of devices that no job has."""
+        if self.devices is not None:
+            check_integer("devices", self.devices, maximum=MAX_DEVICES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +116,8 @@ class RunOptions(DeviceOptions):
     wandb: bool = option(False, "run")
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a number that is too small or an unknown set."""
+        """Raises ValueError for a number that is not allowed or an unknown set."""
+        super().__post_init__()
         check_integer("checkpoint_every", self.checkpoint_every)
         check_integer("evaluate_every", self.evaluate_every, minimum=0)
         if self.test_tasks is not None:

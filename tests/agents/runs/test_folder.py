@@ -78,7 +78,9 @@ def test_a_second_writer_is_refused(tmp_path):
 def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
     (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
     monkeypatch.chdir(tmp_path)
-    values = {"version": "0", **Run(Config(), imports=("evil",)).to_dict()}
+    RunFolder(tmp_path / "x").path.mkdir()
+    RunFolder(tmp_path / "x").note(Run(Config(), imports=("evil",)))
+    values = read_json(tmp_path / "x" / "config.json")
     values["config"]["curiosity"] = "evil-curiosity"
     write_json(tmp_path / "x" / "config.json", values)
     assert_refused(

@@ -90,15 +90,15 @@ def header(iteration: int | str = 1, **settings):
     ("stored", "changes", "message"),
     [
         *(
-            (header, {}, "is not a file of arrays of this package")
-            for header in ({}, *({"json": text} for text in ("{", "[]")))
+            (header, {}, "cannot be read: ")
+            for header in ({}, *({"json": text} for text in ("{", "[]", '{"config": []}')))
         ),
-        ({"json": '{"config": []}'}, {}, "does not hold a policy of this version"),
-        (header(iteration="x"), {}, "does not hold a policy of this version"),
+        (header(iteration="x"), {}, "iteration must be int, got 'x'"),
         (header(clip=0.2), {}, "unknown setting 'clip'"),
         (header(hidden=5), {}, r"core/params/bias is float32\[2, 12\], not float32\[2, 15\]"),
         (header(encoder="own"), {}, "unknown encoder 'own'.*--import MODULE"),
         (header(), {"heads/params/more": np.ones(1)}, "heads/params/more is not expected"),
+        (header(), {"heads/params/value/bias": np.full(1, np.nan, np.float32)}, "is not finite"),
         (header(), {"heads/params/value/bias": None}, "heads/params/value/bias is missing"),
     ],
 )

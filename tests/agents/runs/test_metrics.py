@@ -36,16 +36,16 @@ def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
 
 def test_a_missing_folder_is_an_error_of_the_file_system(tmp_path):
     with pytest.raises(OSError, match="none"):
-        append_rows(tmp_path / "none" / "x.csv", [row(1)])
+        append_rows(tmp_path / "none" / "metrics.csv", [row(1)])
 
 
 def test_other_columns_are_refused(tmp_path):
-    path = tmp_path / "x.csv"
+    path = tmp_path / "metrics.csv"
     append_rows(path, [row(1)])
-    with pytest.raises(ValueError, match=r"x.csv has other columns than .*, more; move it away"):
+    with pytest.raises(ValueError, match=r"metrics.csv does not begin with .*move it away"):
         append_rows(path, [row(2, more=1)])
     path.write_text("2,1\n3,1\n")
-    with pytest.raises(ValueError, match=r"x.csv has no column 'iteration'"):
+    with pytest.raises(ValueError, match=r"metrics.csv cannot be read: it has no column"):
         rewind_rows(path, 3)
 
 

@@ -7,6 +7,7 @@ import math
 import re
 
 import jax
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,6 +19,7 @@ from agents.runs import display, report
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
+from agents.runs.provenance import commit, note_provenance
 from agents.runs.run import Run
 from small_runs import small_config
 from tiny_policy import food_next_to_agent, random_params
@@ -50,6 +52,7 @@ def page(played, tmp_path_factory):
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "<mine>")
     folder.path.mkdir()
     append_rows(folder.metrics, [row(1), row(2, policy_loss=0.5)])
+    note_provenance(folder.provenance, "cpu")
     report.write(folder, Run(CONFIG), evaluator, outcome)
     start, end = '<script type="application/json" id="data">', "</script>"
     return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
@@ -59,7 +62,8 @@ def test_a_page_needs_no_network_and_holds_the_settings(page):
     text = page[0].page.read_text()
     assert "<h1>&lt;mine&gt;</h1>" in text
     assert "&quot;hidden&quot;: 4" in text
-    assert "| {P}  |     2 |" in text
+    assert "<tr><td>{P}</td><td>2</td>" in text
+    assert f"commit {commit() or 'unknown'}, jax {jax.__version__}" in text
     assert not re.search(r"https?:|(src|href)=\"(?!data:)", text)
     assert "NaN" not in text
 
@@ -98,15 +102,44 @@ def test_a_page_shows_shortest_plans(played, page):
         assert plan["frames"][0] == report._png(shown)
 
 
-def test_curves_of_a_run_that_solves_nothing_say_so(tmp_path):
+def test_curves_of_a_run_that_solves_nothing_say_so():
     """As many panels as if it did."""
     heights = []
     for share in (0.0, 0.5):
         rows = pd.DataFrame([row(i, success=share, validation_success=share) for i in (1, 2)])
-        report.save_curves(rows, tmp_path / "x.png", "no formula: $^$")
-        with Image.open(tmp_path / "x.png") as picture:
+        content = report.draw_curves(rows, "no formula: $^$")
+        with Image.open(io.BytesIO(content)) as picture:
             heights.append(picture.height)
     assert heights[0] == heights[1]
+
+
+def test_figures_are_drawn_under_matplotlibs_defaults(played, tmp_path, monkeypatch, capsys):
+    """Here by a reader whose settings ask for a LaTeX that is not there."""
+    monkeypatch.setitem(mpl.rcParams, "text.usetex", True)
+    monkeypatch.setenv("PATH", "")
+    folder = RunFolder(tmp_path)
+    append_rows(folder.metrics, [row(1)])
+    report.write(folder, Run(CONFIG), *played)
+    assert folder.curves.is_file()
+    assert mpl.rcParams["text.usetex"]
+    assert not capsys.readouterr().err
+
+
+def test_a_figure_that_fails_costs_a_line_and_leaves_the_other_files(
+    played, tmp_path, monkeypatch, capsys
+):
+    def fail(*args, **kwargs):
+        raise RuntimeError("no font\nwas \x1b[2J found")
+
+    folder = RunFolder(tmp_path)
+    append_rows(folder.metrics, [row(1)])
+    folder.curves.write_text("earlier")
+    monkeypatch.setattr(report, "to_png", fail)
+    report.write(folder, Run(CONFIG), *played)
+    assert folder.page.is_file()
+    assert folder.curves.read_text() == "earlier"
+    warning = f"warning: {folder.curves} was not drawn: no font was \\x1b[2J found\n"
+    assert capsys.readouterr().err == warning
 
 
 def test_a_solved_episode_becomes_a_gif(played, tmp_path):
