@@ -19,7 +19,7 @@ from agents.fast.grouping import Groups, group, group_rows, slots
 from agents.networks.agent import Params
 from agents.networks.encoder import Encoder
 from trap_tube_jax.observation import observe
-from trap_tube_jax.positions import NUM_POSITIONS, position_id
+from trap_tube_jax.positions import NUM_POSITIONS, layout_rows, position_id
 from trap_tube_jax.state import State, take
 
 CACHE_BITS = 20  # hash bits; `Cache` has a slot for each value
@@ -63,7 +63,7 @@ class FastEncoding(Encoding):
         boards = jax.eval_shape(jax.vmap(observe), initial)
         batch, width = jax.eval_shape(self.agent.encode, params, boards).shape
         return Cache(
-            layout_id=group_rows(layout_content(initial)).group_id,
+            layout_id=group_rows(layout_rows(initial)).group_id,
             position=jnp.zeros((num_steps + 1, batch), jnp.int32),
             features=jnp.zeros((num_steps + 1, batch, width), jnp.float32),
             newest=jnp.full(2**CACHE_BITS, -1, jnp.int32),
@@ -99,7 +99,7 @@ class FastEncoding(Encoding):
     def encode_episodes(self, params: Params, episodes: Episodes) -> tuple[jax.Array, jax.Array]:
         """Encodes all observations of episodes; see `Encoding`."""
         position = episodes.position_ids()
-        layout_id = group_rows(layout_content(episodes.layout)).group_id
+        layout_id = group_rows(layout_rows(episodes.layout)).group_id
         groups = _group_observations(layout_id, position)
         episode, time = jnp.divmod(groups.representative, position.shape[1])
         layout = take(episodes.layout, episode)
@@ -123,12 +123,6 @@ class FastEncoding(Encoding):
             return windows.encode_rows(params["encoder"], rows, remembered)
         with convolutions_as_products():
             return self.agent.encode(params, rows), None
-
-
-def layout_content(layout: State) -> jax.Array:
-    """Returns rows u8[B, K], equal only for equal boards, palettes and tool extents."""
-    parts = (layout.board, layout.palette, layout.tool_extent.astype(jnp.uint8))
-    return jnp.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
 
 def _group_observations(layout_id: jax.Array, position: jax.Array) -> Groups:

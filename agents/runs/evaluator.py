@@ -1,8 +1,7 @@
 """Greedy evaluation on the fixed tasks of the benchmark's protocol."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -12,29 +11,21 @@ from agents.acting.evaluation import Evaluation, evaluate
 from agents.config import Config
 from agents.networks.agent import Params
 from agents.ppo import machine
-from trap_tube_jax.scoring.benchmark import blocks, score_of
-from trap_tube_jax.scoring.scores import Scores
-from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, Purpose, evaluation_tasks
-from trap_tube_jax.state import State, take
+from trap_tube_jax.scoring import ALL_SETS, Purpose, Scores, Suite
+from trap_tube_jax.state import State
 
 
 class Evaluator:
-    """Greedy play on the tasks of several sets, compiled once for any parameters."""
+    """Greedy play on the tasks of several sets, compiled once for any parameters.
 
-    def __init__(self, config: Config, tasks: Mapping[str, State]):
-        """Prepares the play of each set's tasks by policies of these settings.
+    Attributes:
+      suite: the tasks and their step limits.
+    """
 
-        If `config.max_steps` is None, the limits of the registered sets hold; ValueError names one
-        that is not registered.
-        """
-        self.tasks = dict(tasks)
-        self.limits = {name: config.step_limit(name) for name in self.tasks}
-        self._ends = np.cumsum([len(states.time) for states in self.tasks.values()])
-        together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
-        self._blocks = [take(together, block) for block in blocks(int(self._ends[-1]))]
-        # All sets are played up to the largest limit; a call cuts off steps beyond a set's.
-        longest = max(self.limits.values())
-        env = tt.Environment(base=tt.base_state(config.num_features), max_steps=longest)
+    def __init__(self, config: Config, suite: Suite):
+        """Prepares the play of tasks by policies of these settings."""
+        self.suite = suite
+        env = tt.Environment(base=tt.base_state(config.num_features), max_steps=suite.longest)
         agent = machine.make_agent(config)
         encoding = machine.make_encoding(agent)
         self._play: Any = jax.jit(
@@ -44,45 +35,34 @@ class Evaluator:
     @classmethod
     def of_sets(
         cls, config: Config, sets: Sequence[str], num_tasks: int, purpose: Purpose = "test"
-    ) -> "Evaluator":
+    ) -> Self:
         """Makes an evaluator of registered task sets, whose step limits hold, as in the protocol.
 
         Raises:
           ValueError: unknown set, or no task.
         """
-        names = [tt.task_set(name).short for name in sets]
-        features = config.num_features
-        config = dataclasses.replace(config, max_steps=None)
-        return cls(config, {x: evaluation_tasks(x, num_tasks, features, purpose) for x in names})
+        suite = Suite.of_sets(sets, num_tasks, num_features=config.num_features, purpose=purpose)
+        return cls(config, suite)
+
+    @property
+    def tasks(self) -> Mapping[str, State]:
+        """The states [B] of every set, by its short name."""
+        return self.suite.tasks
 
     def __call__(self, params: Params) -> dict[str, Evaluation]:
         """Plays all tasks; returns NumPy arrays by the names of the sets."""
-        played = [jax.tree.map(np.asarray, self._play(params, states)) for states in self._blocks]
-        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *played)
-        outcomes = {}
-        for name, start, end in zip(self.tasks, [0, *self._ends], self._ends, strict=False):
-            outcome, limit = take(whole, slice(start, end)), self.limits[name]
-            outcomes[name] = outcome._replace(
-                solved=outcome.solved & (outcome.length <= limit),
-                length=np.minimum(outcome.length, limit),
-            )
-        return outcomes
+        return self.suite.play(lambda states: self._play(params, states))
 
     def scores(
         self,
         played: Mapping[str, Evaluation],
         shortest: Mapping[str, np.ndarray] | None = None,
     ) -> Scores:
-        """Computes the score of every set from the outcomes that a call returned.
+        """Scores the outcomes that a call returned.
 
-        `shortest` has the lengths i32[B] of each set's shortest plans, to compare with.
+        `shortest` has the lengths i32[B] of the shortest plans of every set, to compare with.
         """
-        made = []
-        for name, outcome in played.items():
-            found = np.asarray(outcome.solved), np.asarray(outcome.length)
-            plans = None if shortest is None else shortest[name]
-            made.append(score_of(name, self.tasks[name], *found, self.limits[name], plans))
-        return Scores(PROTOCOL, tt.__version__, None, tuple(made))
+        return self.suite.scores(played, shortest=shortest)
 
 
 def own_and_paper_sets(config: Config) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from agents.networks.agent import Agent
 from agents.runs.evaluator import Evaluator
 from easy import COPIES, assert_same
 from tiny_policy import CONFIG, FOOD_CELLS, STEPS, food_next_to_agent, random_policy
-from trap_tube_jax.scoring.tasks import evaluation_tasks
+from trap_tube_jax.scoring import Suite, evaluation_tasks
 
 
 def drive(policy, tasks):
@@ -43,7 +43,8 @@ def drive(policy, tasks):
 def test_a_policy_reaches_the_evaluators_outcomes(seed, settings):
     policy, tasks = random_policy(seed, **settings), food_next_to_agent()
     solved, length, actions = drive(policy, tasks)
-    played = Evaluator(policy.config, {"mine": tasks})(policy.params)["mine"]
+    suite = Suite({"mine": tasks}, {"mine": STEPS})
+    played = Evaluator(policy.config, suite)(policy.params)["mine"]
     np.testing.assert_array_equal(solved, played.solved)
     np.testing.assert_array_equal(length, played.length)
     assert solved.any() or policy.config.align_to_food  # whose four tasks look the same

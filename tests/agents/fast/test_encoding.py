@@ -15,6 +15,7 @@ from agents.acting.rollout import rollout
 from agents.fast import FastEncoding, chunks, encoding
 from agents.ppo.learner import Learner
 from small_runs import small_config
+from trap_tube_jax.positions import layout_rows
 
 BATCH = 12
 
@@ -73,7 +74,7 @@ def test_several_seeds_in_one_program_are_encoded_as_alone():
 
 def distinct_observations(episodes: Any) -> int:
     """Counts the pairs of layout and cells."""
-    layout = np.asarray(encoding.layout_content(episodes.layout))
+    layout = np.asarray(layout_rows(episodes.layout))
     cells = np.asarray(episodes.cells)
     content = [
         np.concatenate(

@@ -15,7 +15,7 @@ from agents.runs.evaluator import Evaluator, own_and_paper_sets
 from easy import assert_same
 from tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
 from trap_tube_jax.registry import PAPER_TASK_SETS
-from trap_tube_jax.scoring import benchmark
+from trap_tube_jax.scoring import Suite, suite
 from trap_tube_jax.scoring.scores import Optimality
 from trap_tube_jax.scoring.tasks import evaluation_tasks, fixed_tasks
 
@@ -26,7 +26,8 @@ Played = tuple[Evaluator, Any, dict[str, Evaluation]]
 def played() -> Played:
     """A random policy on two sets, and on tasks of which it solves some."""
     tasks = {name: evaluation_tasks(name, 2, 1) for name in ("base", "p")}
-    evaluator = Evaluator(CONFIG, {**tasks, "mine": food_next_to_agent()})
+    tasks["mine"] = food_next_to_agent()
+    evaluator = Evaluator(CONFIG, Suite(tasks, dict.fromkeys(tasks, STEPS)))
     params = random_params()
     return evaluator, params, evaluator(params)
 
@@ -42,37 +43,29 @@ def test_tasks_of_your_own_are_scored(played):
 
 def test_playing_in_blocks_changes_nothing(played, monkeypatch):
     evaluator, params, outcomes = played
-    monkeypatch.setattr(benchmark, "BLOCK", 3)
-    assert_same(Evaluator(CONFIG, evaluator.tasks)(params), outcomes)
+    monkeypatch.setattr(suite, "BLOCK", 3)
+    assert_same(Evaluator(CONFIG, evaluator.suite)(params), outcomes)
 
 
-def test_each_sets_own_limit_holds_unless_the_settings_have_one(played, own_task_sets):
+def test_each_sets_limit_holds(played):
     """With limits of 1 and 12, tasks that took longer than 1 are not solved."""
     evaluator, params, outcomes = played
     mine = outcomes["mine"]
-    for name, limit in (("one", 1), ("twelve", STEPS)):
-        tt.register(name, (), base=tt.base_state(1), max_steps=limit)
-    tasks: dict[str, tt.State] = dict.fromkeys(("one", "twelve"), evaluator.tasks["mine"])
-    config = Config.from_dict({**CONFIG.to_dict(), "max_steps": None})
-    own = Evaluator(config, tasks)
-    assert own.limits == {"one": 1, "twelve": STEPS}
-    assert Evaluator(CONFIG, tasks).limits == {"one": STEPS, "twelve": STEPS}
-    found = own(params)
+    limits = {"one": 1, "twelve": STEPS}
+    found = Evaluator(CONFIG, Suite(dict.fromkeys(limits, evaluator.tasks["mine"]), limits))(params)
     np.testing.assert_array_equal(found["twelve"].solved, mine.solved)
     np.testing.assert_array_equal(found["twelve"].length, mine.length)
     at_once = mine.solved & (mine.length == 1)
     assert 0 < at_once.sum()
     np.testing.assert_array_equal(found["one"].solved, at_once)
     np.testing.assert_array_equal(found["one"].length, 1)
-    with pytest.raises(ValueError, match="unknown task set 'mine'"):
-        Evaluator(config, {"mine": tasks["one"]})
 
 
 def test_a_limit_of_training_does_not_change_the_protocol(own_task_sets):
     tt.register("Own-v0", (), short="own", max_steps=6)
     for max_steps in (1, 500):
         evaluator = Evaluator.of_sets(Config(max_steps=max_steps), ["pst", "own"], 2)
-        assert evaluator.limits == {"pst": 50, "own": 6}
+        assert evaluator.suite.max_steps == {"pst": 50, "own": 6}
 
 
 def test_scores_use_the_papers_notation():
