@@ -107,7 +107,11 @@ class Session:
         key = jax.random.key(run.seed)
         shapes = jax.eval_shape(self.learner.init, key)
         state, self.last = restore(stored.checkpoints, run.config.iterations, shapes)
+        check_agreement(stored, self.iteration)
         self.state = self.placement.put(self.learner.init(key) if state is None else state)
+        folder.note(run, options)  # they may differ from those before
+        if self.last is None:
+            self._save()  # from now on, rows without a checkpoint mean that files were removed
         for rows in (folder.metrics, folder.evaluations):
             rewind_rows(rows, self.iteration)
         self._validate = None
@@ -115,7 +119,6 @@ class Session:
             tasks = run.config.eval_episodes
             self._validate = Evaluator.of_sets(run.config, self.sets, tasks, "validation")
             self._keep_best()  # a kill may have come between checkpoint and best policy
-        folder.note(run, options)  # they may differ from those before
 
     @property
     def iteration(self) -> int:
@@ -224,13 +227,13 @@ class Session:
 
     def _save(self) -> None:
         state = self.placement.local(self.state)
-        checkpoint.save(self.folder.checkpoints, self.iteration, state, self.last or {})
+        checkpoint.save(self.folder.checkpoints, self.iteration, state, dict(self.last or {}))
 
 
 def restore(
     folder: Path, iterations: int, shapes: TrainState
-) -> tuple[TrainState | None, dict[str, Any] | None]:
-    """Returns the newest checkpoint's state and row of metrics, or None and None.
+) -> tuple[TrainState | None, Row | None]:
+    """Returns the newest checkpoint's state and row of metrics; None for what there is not yet.
 
     Raises ValueError for a checkpoint of other settings.
     """
@@ -244,7 +247,28 @@ def restore(
         raise ValueError(f"checkpoint {done} in {folder} cannot be continued: {error}") from error
     if done > iterations:
         raise ValueError(f"iterations must be at least {done}, which are done, got {iterations}")
-    return state, row
+    return state, row if done else None
+
+
+def check_agreement(folder: RunFolder, iteration: int) -> None:
+    """Raises ValueError unless a run's rows lead up to its newest checkpoint, at `iteration`.
+
+    Rows may go on after the checkpoint: training makes them again. Without a checkpoint it would
+    make all of them again, in the place of results that may be the only ones.
+    """
+    rows = read_rows(folder.metrics)
+    evaluated = read_rows(folder.evaluations)
+    if not checkpoint.iterations(folder.checkpoints):
+        if len(rows) or len(evaluated) or folder.checkpoints.is_file():
+            raise ValueError(
+                f"{folder.path} holds results, but no checkpoint to continue from; restore "
+                f"{folder.checkpoints}, or train under another --name"
+            )
+    elif max(rows["iteration"], default=0) < iteration:
+        raise ValueError(
+            f"{folder.metrics} ends before the checkpoint of iteration {iteration}; restore it, or "
+            "train under another --name"
+        )
 
 
 def best_iteration(rows: Any, own: str) -> int | None:

@@ -189,6 +189,56 @@ def test_a_finished_run_is_extended(copy, monkeypatch):
         train_run(copy, small_run(), TRACKED)
 
 
+def cut(path):
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+
+
+def remove(path):
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def make_a_file(path):
+    remove(path)
+    path.touch()
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("checkpoints", remove, "no checkpoint to continue from; restore"),
+        ("checkpoints", make_a_file, "no checkpoint to continue from; restore"),
+        ("metrics.csv", remove, "metrics.csv ends before the checkpoint of iteration 6"),
+        ("metrics.csv", cut, "metrics.csv ends before the checkpoint of iteration 6"),
+    ],
+)
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_run_with_missing_files_is_refused_unchanged(copy, name, damage, message, more):
+    """Resumed as it is, and extended."""
+    damage(copy / name)
+    before = contents(copy)
+    with pytest.raises(ValueError, match=message):
+        train_run(copy, small_run(iterations=ITERATIONS + more), TRACKED)
+    assert contents(copy) == before
+
+
+def contents(folder):
+    return {
+        path: path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def test_a_run_that_is_killed_before_its_first_iteration_begins_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "make_advance", lambda *_: _raise(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train_run(tmp_path / "x", small_run(), PLAIN)
+    assert final_state(tmp_path / "x")[0] == 0
+    monkeypatch.undo()
+    train_run(tmp_path / "x", small_run(iterations=1), PLAIN)
+    assert len(untimed(tmp_path / "x")) == 1
+
+
 @pytest.mark.parametrize(
     ("own", "sets", "best"),
     [("p", ("base", "p", "st"), 2), ("base", ("base", "p", "st"), 1), ("p", ("base",), 1)],
