@@ -41,7 +41,7 @@ Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
 
 
 def train_run(
-    path: Path,
+    path: str | Path,
     run: Run,
     options: RunOptions | None = None,
     *,
@@ -53,7 +53,7 @@ def train_run(
     A finished run is left unchanged. Only one process at a time may call `train_run` for a folder.
 
     Args:
-      path: the run's folder, made if missing.
+      path: the run's folder, made if missing; `~` is the home folder.
       run: what to train; of a stored run only `EXTENDABLE` settings may differ.
       options: how to train.
       console: where progress is shown; nowhere if None.
@@ -69,7 +69,7 @@ def train_run(
       Stopped: on SIGINT or SIGTERM, after the current iteration has been saved.
     """
     options, console = options or RunOptions(), console or Console(quiet=True)
-    stored = RunFolder(path)
+    stored = RunFolder(Path(path).expanduser())
     if stored.config.is_file():
         run.check_continues(stored.read()[0])
     is_first = jax.process_index() == 0

@@ -239,6 +239,12 @@ def test_a_run_that_is_killed_before_its_first_iteration_begins_again(tmp_path, 
     assert len(untimed(tmp_path / "x")) == 1
 
 
+def test_a_path_may_begin_at_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    train_run("~/x", small_run(iterations=1), PLAIN)
+    assert len(untimed(tmp_path / "x")) == 1
+
+
 @pytest.mark.parametrize(
     ("own", "sets", "best"),
     [("p", ("base", "p", "st"), 2), ("base", ("base", "p", "st"), 1), ("p", ("base",), 1)],
