@@ -14,6 +14,7 @@ from agents.runs.loading import load
 from agents.runs.metrics import evaluation_rows
 from agents.runs.report import save_first_solved
 from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.solver import solve_batch
 
 
@@ -71,4 +72,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

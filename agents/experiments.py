@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from agents import sweep
 from agents.sweeps.grids import GRIDS
+from trap_tube_jax.interruptions import run_command
 
 PROGRAM = "python -m agents.experiments"
 
@@ -21,4 +22,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -15,6 +15,7 @@ from agents.runs import compilation
 from agents.runs.loading import load
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.interruptions import run_command
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,4 +70,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-from rich.console import Console
 
 import trap_tube_jax as tt
 from agents.command_line import option, parse_all
@@ -13,11 +12,12 @@ from agents.config import Config
 from agents.parallel import processes
 from agents.parallel.devices import split_cpu
 from agents.runs import compilation, display
+from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder, check_name
 from agents.runs.run import DeviceOptions, Run, RunOptions
 from agents.runs.session import train_run
-from agents.runs.stopping import Stopped, exit_code
 from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.interruptions import run_command, stopping
 
 PROGRAM = "python -m agents.train"
 
@@ -53,36 +53,43 @@ class Options:
 @plain_errors()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
-    start_devices(arguments)
-    train(*parse(arguments))
+    # Some options decide how the others are read.
+    first, devices = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
+    start_devices(first, devices)
+    train(*parse(first, arguments))
 
 
-def start_devices(arguments: Sequence[str] | None) -> None:
+def start_devices(first: Options, devices: DeviceOptions) -> None:
     """Splits the CPU and joins the other processes, before modules of --import start JAX."""
-    options, run_options = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
-    stored = None if options.resume is None else RunFolder(options.resume).devices()
-    split_cpu(run_options.devices or stored)
-    processes.join(options.distributed)
+    stored = None if first.resume is None else RunFolder(first.resume).devices()
+    split_cpu(devices.devices or stored)
+    processes.join(first.distributed)
 
 
-def parse(arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
-    """Reads a command line and, with --resume, the stored run."""
-    # The preset, or the stored run, decides the defaults of all other options.
-    (first,) = parse_all([Options], arguments, PROGRAM, partly=True)
-    defaults, run, run_options = Options(), Run(Config.preset(first.preset)), RunOptions()
-    if first.resume is not None:
-        if (first.name, first.preset) != (defaults.name, defaults.preset):
-            raise ValueError("--resume continues a run as it is; leave out --name and --preset")
+def parse(first: Options, arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
+    """Reads a command line; the preset of `first`, or its stored run, has the defaults."""
+    if first.resume is None:
+        run, run_options = Run(Config.preset(first.preset)), RunOptions()
+        defaults = Options()
+    else:
+        new = Options()
+        if (first.name, first.preset, first.out) != (new.name, new.preset, new.out):
+            raise ValueError(
+                "--resume continues a run as it is; leave out --name, --out and --preset"
+            )
         run, run_options = RunFolder(first.resume).read(first.imports)
         defaults = Options(seed=run.seed)
     options, config, run_options = parse_all(
         [defaults, run.config, run_options], arguments, PROGRAM
     )
-    imports = tuple(dict.fromkeys((*run.imports, *options.imports)))
-    given = {"config": config, "seed": options.seed, "imports": imports}
-    if first.resume is None:
-        given["algorithm"] = ""  # named after the settings given
-    return options, dataclasses.replace(run, **given), run_options
+    run = dataclasses.replace(
+        run,
+        config=config,
+        seed=options.seed,
+        imports=tuple(dict.fromkeys((*run.imports, *options.imports))),
+        algorithm=run.algorithm if first.resume else "",  # "": named after the settings
+    )
+    return options, run, run_options
 
 
 def train(options: Options, run: Run, run_options: RunOptions) -> None:
@@ -91,19 +98,16 @@ def train(options: Options, run: Run, run_options: RunOptions) -> None:
     if options.resume is None:
         folder.check_free()
         processes.max_over_processes(None)  # no process writes before all have checked
-    console = Console(quiet=jax.process_index() > 0, highlight=False)
+    is_first = jax.process_index() == 0
+    console = CommandConsole(quiet=not is_first, highlight=False)
     compilation.enable_cache()
     try:
-        scores = train_run(folder.path, run, run_options, console=console)
-    except (Stopped, KeyboardInterrupt) as stopped:
-        console.out(f"Stopped. {display.resume_hint(folder, run)}")
-        raise SystemExit(exit_code(stopped)) from None
-    except BrokenPipeError:
-        raise
+        with stopping(lambda: display.resume_hint(folder, run) if is_first else ""):
+            scores = train_run(folder.path, run, run_options, console=console)
+            for line in ([scores] if scores else []) + display.summary(folder, run):
+                console.out(line)
     except OSError as error:
         raise OSError(f"{error}. {display.resume_hint(folder, run)}") from error
-    for line in ([scores] if scores else []) + display.summary(folder, run):
-        console.out(line)
 
 
 def run_path(options: Options, run: Run) -> Path:
@@ -117,4 +121,4 @@ def run_path(options: Options, run: Run) -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -15,7 +15,7 @@ from paths import ROOT
 
 # Lower rooms never import higher ones. Modules of a package itself are rooms of their own.
 ENVIRONMENT = (
-    ("_version", "by_value", "checks", "imports", "command_line", "tables"),
+    ("_version", "by_value", "checks", "imports", "interruptions", "command_line", "tables"),
     ("objects", "geometry", "prng"),
     ("state", "positions"),
     ("dynamics", "layouts", "transfers", "graded", "observation"),

@@ -7,6 +7,8 @@ import os
 import sys
 from collections.abc import Iterator
 
+CLOSED_PIPE = 128 + 13  # as by SIGPIPE, which Windows lacks
+
 
 def prepare_terminal() -> None:
     """Lets stdout and stderr print "?" for characters that their encoding lacks."""
@@ -20,7 +22,7 @@ def plain_errors() -> Iterator[None]:
     """Prepares the terminal, and ends the process with one line in place of a traceback.
 
     The exit code is 2 for a ValueError or a missing library, 1 for an OSError such as a full
-    disk. Code 1 without a line stands for a closed pipe, as in `command | head -1`.
+    disk. A closed pipe, as in `command | head -1`, ends it without a line, as by SIGPIPE.
     """
     prepare_terminal()
     try:
@@ -28,7 +30,7 @@ def plain_errors() -> Iterator[None]:
         print(end="", flush=True)  # does nothing where stdout is closed, unlike sys.stdout.flush
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python warns at exit
-        raise SystemExit(1) from None
+        raise SystemExit(CLOSED_PIPE) from None
     except (ValueError, ImportError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1 if isinstance(error, OSError) else 2) from error

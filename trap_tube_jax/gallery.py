@@ -12,6 +12,7 @@ import numpy as np
 from trap_tube_jax.checks import check_integer, check_seed
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
+from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.objects import NUM_OBJECTS, OBJECT_NAMES
 from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
@@ -127,4 +128,4 @@ def _signs() -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

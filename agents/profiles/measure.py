@@ -12,6 +12,7 @@ from agents.profiles.subgoals import SUBGOALS, last_subgoals
 from agents.profiles.tasks import PARTS, STRENGTHS, Part, Sampling
 from agents.runs.evaluator import Evaluator
 from trap_tube_jax.objects import MAX_STEPS
+from trap_tube_jax.scoring import Suite
 from trap_tube_jax.solver import solve_batch
 
 BIN = 5  # steps, the width of the groups by plan length
@@ -81,7 +82,8 @@ def _play(
 ) -> pd.DataFrame:
     """Plays all parts with a policy; returns a row for each episode."""
     config = dataclasses.replace(policy.config, max_steps=MAX_STEPS)
-    evaluator = Evaluator(config, {part: drawn.tasks for part, drawn in parts.items()})
+    tasks = {part: drawn.tasks for part, drawn in parts.items()}
+    evaluator = Evaluator(config, Suite(tasks, dict.fromkeys(tasks, MAX_STEPS)))
     frames = []
     for part, played in evaluator(policy.params).items():
         tasks, levels = parts[part]

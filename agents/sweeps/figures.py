@@ -7,9 +7,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from agents.runs.metrics import Frame
+from agents.runs.metrics import Frame as Table
 from agents.sweeps import tables
-from trap_tube_jax.scoring.tasks import label
 
 WIDTH = 8.3  # inches, as in a page 830 pixels wide
 DPI = 150
@@ -17,12 +16,13 @@ DPI = 150
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 
 
-def save(root: Path, results: Frame, curves: Frame, about: Mapping[str, Any]) -> list[Path]:
+def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) -> list[Path]:
     """Writes the figures that the results allow, and returns their files.
 
-    The arguments are those of `tables.tables`.
+    See `tables.tables` for the arguments.
     """
-    names, tested = list(curves["algorithm"].unique()), tables.reported(results)
+    names = list(curves["algorithm"].unique())
+    tested = tables.reported(results)
     drawn = {}
     if len(names) <= len(COLORS):
         drawn["curves.png"] = draw_curves(results, curves, about)
@@ -35,18 +35,19 @@ def save(root: Path, results: Frame, curves: Frame, about: Mapping[str, Any]) ->
     return [root / name for name in drawn]
 
 
-def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
+def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
     """Draws percent solved over iterations: in training, and greedily on each set."""
-    own = about["train_set"]
-    panels = {
-        "training": curves.assign(value=curves["success"]),
-        f"greedy, {label(own)}": curves.assign(value=curves["validation_success"]),
-    }
+    train_set = about["train_set"]
     greedy = results[results["purpose"] == "validation"]
     greedy = greedy.assign(value=greedy["solved"] / greedy["tasks"])
+    titles = tables.set_titles([train_set, *greedy["task_set"].unique()])
+    panels = {
+        "training": curves.assign(value=curves["success"]),
+        f"greedy, {titles[train_set]}": curves.assign(value=curves["validation_success"]),
+    }
     for name, rows in greedy.groupby("task_set", sort=False):
-        if name != own and rows.groupby(["algorithm", "seed"]).size().min() > 1:
-            panels[f"greedy, {label(str(name))}"] = rows
+        if name != train_set and rows.groupby(["algorithm", "seed"]).size().min() > 1:
+            panels[f"greedy, {titles[str(name)]}"] = rows
     figure, axes = make_panels(list(panels), min(3, len(panels)), 2.1, about["title"])
     for axis, rows in zip(axes, panels.values(), strict=True):
         for color, name in zip(COLORS, curves["algorithm"].unique(), strict=False):
@@ -59,23 +60,24 @@ def draw_curves(results: Frame, curves: Frame, about: Mapping[str, Any]) -> Any:
     return figure
 
 
-def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
+def draw_success(tested: Table, about: Mapping[str, Any]) -> Any:
     """Draws percent of test tasks solved by set: a bar per algorithm, a point per seed."""
     table = tables.by_set(tested)
     paper = tables.PAPER_SUCCESS if about["train_set"] == "pstsy" else {}
-    own = list(tested["algorithm"].unique())
-    names = [*own, *paper]
-    figure, axes = make_panels(list(map(label, table)), 5, 0.25 * len(names) + 0.4, about["title"])
+    algorithms = list(tested["algorithm"].unique())
+    names = [*algorithms, *paper]
+    titles = list(tables.set_titles(table).values())
+    figure, axes = make_panels(titles, 5, 0.25 * len(names) + 0.4, about["title"])
     for axis, column in zip(axes, table, strict=True):
-        for row, name in enumerate(own):
+        for row, name in enumerate(algorithms):
             values = table.loc[name, column].to_numpy()
             axis.barh(row, values.mean(), color=COLORS[5])
             axis.plot(values, [row] * len(values), "o", color=COLORS[0], alpha=0.7, markersize=4)
-        for row, (means, sds) in enumerate(paper.values(), len(own)):
+        for row, (means, sds) in enumerate(paper.values(), len(algorithms)):
             if column in tables.PAPER_SETS:
-                place = tables.PAPER_SETS.index(column)
-                axis.barh(row, means[place], xerr=sds[place], color="#BBBBBB", error_kw={"lw": 1})
-                if not means[place]:
+                index = tables.PAPER_SETS.index(column)
+                axis.barh(row, means[index], xerr=sds[index], color="#BBBBBB", error_kw={"lw": 1})
+                if not means[index]:
                     axis.text(0, row, "0", va="center", fontsize="small")
             else:
                 axis.text(0, row, "not reported", va="center", fontsize="small")
@@ -91,7 +93,7 @@ def draw_success(tested: Frame, about: Mapping[str, Any]) -> Any:
 def make_panels(
     titles: Sequence[str], columns: int, height: float, title: str = "", *, sharex: bool = True
 ) -> tuple[Figure, list[Any]]:
-    """Makes a figure of panels with a title each, in rows of `height` inches."""
+    """Makes a figure of titled panels, in rows of `height` inches."""
     rows = math.ceil(len(titles) / columns)
     figure = Figure(figsize=(WIDTH, rows * height + 0.9), layout="constrained")
     figure.suptitle(title, parse_math=False)
@@ -107,14 +109,15 @@ def make_panels(
     return figure, axes[: len(titles)]
 
 
-def _draw_seeds(axis: Any, rows: Frame, color: str, name: str) -> None:
+def _draw_seeds(axis: Any, rows: Table, color: str, name: str) -> None:
     """Plots a line per seed, and the mean of several seeds if all end at the same iteration."""
     values = 100 * rows.pivot_table(index="iteration", columns="seed", values="value")
     with_mean = values.shape[1] > 1 and bool(values.iloc[-1].notna().all())
     for count, seed in enumerate(values):
-        own = values[seed].dropna()
+        curve = values[seed].dropna()
         style = {"linewidth": 0.7, "alpha": 0.45} if with_mean else {"linewidth": 1.2}
-        axis.plot(own.index, own, color=color, label="" if with_mean or count else name, **style)
+        name_once = "" if with_mean or count else name
+        axis.plot(curve.index, curve, color=color, label=name_once, **style)
     if with_mean:
         mean = values.dropna().mean(axis=1)
         axis.plot(mean.index, mean, color=color, linewidth=1.8, label=f"{name}, mean of seeds")

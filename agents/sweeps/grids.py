@@ -14,6 +14,7 @@ from agents.config import Config
 from agents.ppo.learner import make_learner
 from agents.runs.folder import RunFolder, check_name
 from agents.runs.run import Run, RunOptions
+from trap_tube_jax.checks import check_integer
 
 COMMA = re.compile(r",(?![^\[]*\])")  # but not those of a list
 
@@ -36,7 +37,9 @@ class Options:
       seed: the first seed.
       name: the grid's folder within --out, by default named after grid, preset and task set.
       out: the folder of all grids.
-      processes: runs at a time, by default one per core, or one on a GPU or TPU.
+      processes: programs at a time, by default one per core, or one on a GPU or TPU.
+      seeds_per_program: seeds of a point that one program trains, by default all on a GPU or TPU
+        unless the network convolves, else one.
       cluster: address of a Dask scheduler whose workers train the runs, as in tcp://HOST:8786.
     """
 
@@ -50,6 +53,7 @@ class Options:
     name: str | None = None
     out: Path = Path("runs")
     processes: int | None = None
+    seeds_per_program: int | None = None
     cluster: str | None = None
 
 
@@ -73,6 +77,8 @@ class Grid:
         """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
         if options.seeds < 1:
             raise ValueError(f"seeds must be >= 1, got {options.seeds}")
+        if options.seeds_per_program is not None:
+            check_integer("seeds_per_program", options.seeds_per_program)
         configs = self.configs(options)
         short = tt.task_set(next(iter(configs.values())).env_id).short
         if (options.preset, short) != (self.options.preset, self.options.env):

@@ -1,72 +1,139 @@
 """Trains the runs of a grid, several at a time, by any executor."""
 
 import multiprocessing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 
 from rich.console import Console
 
+from agents.runs.folder import RunFolder
+from agents.runs.progress import has_ended
 from agents.runs.run import Run, RunOptions
-from agents.runs.stopping import Stopped, stop_signals
-from agents.sweeps.workers import ProcessPerCall, log_of, train_logged
+from agents.sweeps.overview import Overview
+from agents.sweeps.workers import (
+    DONE,
+    STOPPED,
+    Launch,
+    backend_of,
+    is_being_written,
+    log_of,
+    train_logged,
+)
+from trap_tube_jax.interruptions import Stopped, deferring
+
+Group = Mapping[Path, Run]
+LOST = "its worker, or the scheduler of the cluster, was lost"
+
+
+def group_runs(runs: Group, sizes: Mapping[Path, int]) -> list[dict[Path, Run]]:
+    """Groups runs that one program trains: seeds of the same settings, `sizes` at most."""
+    groups: list[dict[Path, Run]] = []
+    for path, run in runs.items():
+        for group in groups:
+            first = next(iter(group.values()))
+            same = (first.config, first.algorithm) == (run.config, run.algorithm)
+            if same and len(group) < sizes[path]:
+                group[path] = run
+                break
+        else:
+            groups.append({path: run})
+    return groups
+
+
+def program_sizes(
+    runs: Group, options: RunOptions, executor: Executor, size: int | None
+) -> dict[Path, int]:
+    """Returns the largest number of seeds in the program of every run, by default what pays.
+
+    On a CPU seeds train faster on a core each. The kernels of convolutions differ between seeds,
+    for which GPUs have no fast program.
+    """
+    if len({run.seed for run in runs.values()}) == 1 or (options.devices or 1) > 1:
+        return dict.fromkeys(runs, 1)
+    if size is not None:
+        return dict.fromkeys(runs, size)
+    alone = backend_of(executor) == "cpu"
+    return {path: 1 if alone or convolves(run) else len(runs) for path, run in runs.items()}
+
+
+def convolves(run: Run) -> bool:
+    """Returns whether the run's network convolves, as every encoder but `objects` may."""
+    return run.config.encoder != "objects"
 
 
 def launch(
-    runs: Mapping[Path, Run], options: RunOptions, executor: Executor, console: Console
+    groups: Sequence[Group], options: RunOptions, executor: Executor, console: Console
 ) -> list[Path]:
     """Trains all runs, whose folders share a parent, and returns the folders of those that failed.
 
-    The executor's workers share this file system. The console shows each outcome.
+    The executor's workers share this file system. The console shows outcomes and progress.
 
     Raises:
-      Stopped: on SIGINT or SIGTERM, after all runs have saved their current iteration.
+      Stopped: on a signal, after all runs have saved their current iteration.
       KeyboardInterrupt: on a second signal; processes of this machine are killed.
     """
-    stop_file = next(iter(runs)).parent.absolute() / ".stop"
-
-    def ask(text: str) -> None:
-        stop_file.touch()
-        console.out(text)
-
-    stop_file.unlink(missing_ok=True)
-    calls: dict[Future, Path] = {}
+    runs = {path: run for group in groups for path, run in group.items()}
+    present = Launch.begin(next(iter(runs)).parent)
     failed: list[Path] = []
-    with stop_signals(ask) as request:
-        try:
-            for path, run in runs.items():
-                where = path.absolute()  # workers of a cluster may run in another folder
-                calls[executor.submit(train_logged, where, run, options, stop_file)] = path
-            for count, call in enumerate(_ended(calls), 1):
-                if request() and isinstance(executor, ProcessPerCall):
-                    for each in calls:  # on Dask this would also drop running calls
-                        each.cancel()
-                if call.cancelled():
-                    continue
-                error = call.exception()  # its process was killed, or Dask gave up
-                path, outcome = calls[call], f"failed: {error}" if error else call.result()
-                log = f"; see {log_of(path)}" if outcome.startswith("failed") else ""
-                console.out(f"[{count}/{len(runs)}] {path.name}: {outcome}{log}")
-                failed += [] if outcome == "done" else [path]
-        except BaseException:  # do not even wait for the current iteration
-            stop_file.touch()
-            for call in calls:
-                call.cancel()
-            for process in multiprocessing.active_children():
-                process.kill()
-            raise
-    stop_file.unlink(missing_ok=True)
-    if number := request():
-        raise Stopped(number)
+    count = 0
+    try:
+        with deferring() as request, Overview(console, runs) as overview:
+            calls = {executor.submit(*_call(group, options, present)): group for group in groups}
+            pending = set(calls)
+            while pending:
+                overview.show()
+                # A wait without a timeout would miss a signal that arrives just before it.
+                ended, pending = wait(pending, timeout=1, return_when=FIRST_COMPLETED)
+                if request():
+                    present.end()
+                    _cancel_waiting({call: calls[call] for call in pending})
+                for call in (call for call in calls if call in ended):
+                    for path, outcome in _outcomes(call, calls[call], bool(request())).items():
+                        count += 1
+                        text = f"{path.name}: {outcome}{_log(outcome, path)}"
+                        console.out(f"[{count}/{len(runs)}] {text}")
+                        failed += [] if outcome in (DONE, STOPPED) else [path]
+            if number := request():
+                raise Stopped(number)
+    except KeyboardInterrupt:  # do not even wait for the current iteration
+        for process in multiprocessing.active_children():
+            process.kill()
+        raise
+    finally:
+        present.end()
     return failed
 
 
-def _ended(calls: Iterable[Future]) -> Iterator[Future]:
-    """Yields calls as they end; calls that end together keep their order.
+def _call(group: Group, options: RunOptions, present: Launch) -> tuple:
+    absolute = {path.absolute(): run for path, run in group.items()}  # a worker may run elsewhere
+    return train_logged, absolute, options, present
 
-    A wait without a timeout, as in `as_completed`, would miss a signal that arrives just before it.
+
+def _outcomes(call: Future, group: Group, stopped: bool) -> dict[Path, str]:
+    """Returns how the runs of a call ended: `done`, `stopped` or an error.
+
+    Of a call that was lost, and of one that says `done`, the runs' files have the last word.
     """
-    pending = set(calls)
-    while pending:
-        ended, pending = wait(pending, timeout=1, return_when=FIRST_COMPLETED)
-        yield from (call for call in calls if call in ended)
+    error = None if call.cancelled() else call.exception()  # its process was killed, for example
+    if call.cancelled() or error:
+        found = dict.fromkeys(group, STOPPED if call.cancelled() and stopped else DONE)
+    else:
+        found = dict(zip(group, call.result().values(), strict=True))
+    for path, outcome in found.items():
+        has_to_go_on = outcome == STOPPED and not stopped
+        if has_to_go_on or (outcome == DONE and not has_ended(RunFolder(path), group[path])):
+            found[path] = f"failed: {error or LOST}"
+    return found
+
+
+def _cancel_waiting(pending: Mapping[Future, Group]) -> None:
+    """Cancels the calls that train nothing yet. Dask would also drop those that do."""
+    for call, group in pending.items():
+        if not any(path.exists() and is_being_written(path) for path in group):
+            call.cancel()
+
+
+def _log(outcome: str, path: Path) -> str:
+    log = log_of(path)
+    return f"; see {log}" if outcome not in (DONE, STOPPED) and log.exists() else ""

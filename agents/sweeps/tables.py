@@ -3,14 +3,15 @@
 Source: the paper's Tables 1 and 2; Student's t for the interval of a mean of few seeds.
 """
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from agents.runs.metrics import Frame
+from agents.runs.metrics import Frame as Table
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 from trap_tube_jax.tables import markdown_table
 
@@ -33,31 +34,47 @@ MEAN = "mean without base"  # over task sets, each counting the same
 NOTHING = "–"
 
 
-def tables(results: Frame, curves: Frame, about: Mapping[str, Any]) -> dict[str, Frame]:
+def tables(results: Table, curves: Table, about: Mapping[str, Any]) -> dict[str, Table]:
     """Returns the tables by their headings.
 
     Args:
       results: rows of `agents.results`.
       curves: rows of metrics, with the columns of `report.CURVES`.
-      about: `train_set`, which decides the paper's table to compare with, and `threshold`, the
-        share of its validation tasks that counts as solved.
+      about: `train_set`, which decides the paper's table to compare with, `threshold`, the share of
+        its validation tasks that counts as solved, and `unfinished`, algorithm and seed of runs.
     """
-    tested, train_set = reported(results), about["train_set"]
-    found = {"Training": training_table(curves, about["threshold"], train_set == "base")}
+    tested = reported(results)
+    train_set = about["train_set"]
+    unfinished = Counter(algorithm for algorithm, _ in about.get("unfinished", ()))
+    with_paper = train_set == "base"
+    found = {"Training": training_table(curves, about["threshold"], with_paper, unfinished)}
     if len(tested):
         found["Test tasks solved, %"] = success_table(tested, train_set == "pstsy")
     return found
 
 
-def reported(results: Frame) -> Frame:
-    """Returns each seed's newest rows on test tasks, once each, with their `percent` solved."""
+def unfinished_note(about: Mapping[str, Any]) -> list[str]:
+    """Names the runs that have not reached their end, in one sentence; none if all have."""
+    runs = [f"{algorithm} seed {seed}" for algorithm, seed in about.get("unfinished", ())]
+    return [f"Unfinished, so the table may change: {', '.join(runs)}."] if runs else []
+
+
+def set_titles(names: Iterable[str]) -> dict[str, str]:
+    """Returns the titles of task sets by their short names; equal labels are told apart."""
+    labels = {name: label(name) for name in names}
+    count = Counter(labels.values())
+    return {name: text if count[text] == 1 else f"{text} ({name})" for name, text in labels.items()}
+
+
+def reported(results: Table) -> Table:
+    """Returns the newest rows on test tasks by seed, without repeats, with `percent` solved."""
     rows = results[results["purpose"] == "test"]
     newest = rows.groupby(["algorithm", "seed"], sort=False)["iteration"].transform("max")
     rows = rows[rows["iteration"] == newest].drop_duplicates(["algorithm", "seed", "task_set"])
     return rows.assign(percent=100 * rows["solved"] / rows["tasks"])
 
 
-def by_set(tested: Frame) -> Frame:
+def by_set(tested: Table) -> Table:
     """Returns percent solved by algorithm and seed, a column per set and one for their mean."""
     table = tested.pivot(index=["algorithm", "seed"], columns="task_set", values="percent")
     order = [name for name in ALL_SETS if name in table]
@@ -66,41 +83,48 @@ def by_set(tested: Frame) -> Frame:
     return table.reindex(tested["algorithm"].unique(), level="algorithm")
 
 
-def training_table(curves: Frame, threshold: float, with_paper: bool) -> Frame:
-    """Returns seeds that solved their training set, episodes until they did, and means of costs."""
+def training_table(
+    curves: Table, threshold: float, with_paper: bool, unfinished: Mapping[Any, int]
+) -> Table:
+    """Returns seeds that solved their training set, episodes until they did, and means of costs.
+
+    `unfinished` counts the seeds that have not reached their end, by algorithm.
+    """
     columns = ("solved", "episodes to solve", "steps", "minutes")
     rows: dict[Any, tuple[str, ...]] = {}
-    for name, own in curves.groupby("algorithm", sort=False):
-        episodes = (
-            own[own["validation_success"] >= threshold].groupby("seed")["episodes"].min().to_numpy()
-        )
-        ends = own.groupby("seed")[["transitions", "seconds"]].max()
+    for name, found in curves.groupby("algorithm", sort=False):
+        solving = found[found["validation_success"] >= threshold]
+        episodes = solving.groupby("seed")["episodes"].min().to_numpy()
+        ends = found.groupby("seed")[["transitions", "seconds"]].max()
         steps, seconds = ends.mean()
         solved = f"{len(episodes)} of {len(ends)}"
+        if unfinished.get(name):
+            solved += f", {unfinished[name]} unfinished"
         rows[name] = (solved, mean_text(episodes, ",.0f"), f"{steps:,.0f}", f"{seconds / 60:,.1f}")
     rows |= PAPER_SOLVED if with_paper else {}
     return pd.DataFrame(rows, columns).T
 
 
-def success_table(tested: Frame, with_paper: bool) -> Frame:
+def success_table(tested: Table, with_paper: bool) -> Table:
     """Returns percent solved: a row per set, a column per algorithm."""
     by_task_set = tested.groupby(["algorithm", "task_set"])
     layouts = by_task_set[["layouts", "layouts_total"]].mean().dropna()
     columns: dict[Any, dict[str, str]] = {}
-    for name, own in by_set(tested).groupby("algorithm", sort=False):
+    for name, found in by_set(tested).groupby("algorithm", sort=False):
         columns[name] = {}
-        for each, values in own.items():
+        for column, values in found.items():
             text = mean_text(values.to_numpy(), ".1f", high=100)
-            if (name, each) in layouts.index:
-                solved, total = layouts.loc[(name, each)]
+            if (name, column) in layouts.index:
+                solved, total = layouts.loc[(name, column)]
                 text = f"{values.mean():.1f} ({solved:.3g} of {total:g})"
-            columns[name][each] = text
+            columns[name][column] = text
     for name, paper in PAPER_SUCCESS.items() if with_paper else ():
         columns[name] = {
-            each: f"{mean:.1f} ± {sd:.1f}" if sd else f"{mean:.1f}"
-            for each, mean, sd in zip(PAPER_SETS, *paper, strict=True)
+            short: f"{mean:.1f} ± {sd:.1f}" if sd else f"{mean:.1f}"
+            for short, mean, sd in zip(PAPER_SETS, *paper, strict=True)
         }
-    return pd.DataFrame(columns).fillna(NOTHING).rename(index=label)
+    table = pd.DataFrame(columns).fillna(NOTHING)
+    return table.rename(index=set_titles(table.index))
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:
@@ -109,11 +133,12 @@ def mean_text(values: Any, form: str, high: float = np.inf) -> str:
     if len(values) < 2:
         return format(values[0], form) if len(values) else NOTHING
     margin = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
-    low, top = max(0, values.mean() - margin), min(high, values.mean() + margin)
+    low = max(0, values.mean() - margin)
+    top = min(high, values.mean() + margin)
     return f"{values.mean():{form}} [{low:{form}}, {top:{form}}]"
 
 
-def markdown(table: Frame) -> str:
+def markdown(table: Table) -> str:
     """Returns a table as Markdown."""
     heads = ["", *map(str, table.columns)]
     return markdown_table([heads, *([str(name), *row] for name, *row in table.itertuples())])

@@ -1,39 +1,54 @@
-"""Executors for a grid's runs, and the function that trains one run in a worker process."""
+"""Executors for a grid's runs, and the function that trains runs in a worker process."""
 
 import contextlib
+import dataclasses
 import multiprocessing
 import os
-import signal
 import threading
+import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+from uuid import uuid4
 
 import jax
 from rich.console import Console
 
+from agents.files import write_bytes
 from agents.parallel.devices import split_cpu
 from agents.runs.compilation import enable_cache
+from agents.runs.folder import RunFolder
 from agents.runs.provenance import cores
 from agents.runs.run import Run, RunOptions
-from agents.runs.session import train_run
-from agents.runs.stopping import Stopped
+from agents.runs.session import train_runs
 from trap_tube_jax.imports import import_modules, needs_extra
+from trap_tube_jax.interruptions import Stopped, block_signals
 
 SPAWN = multiprocessing.get_context("spawn")
+DONE = "done"
+STOPPED = "stopped"
+PATIENCE = 600  # seconds; the longest iterations, with their evaluation, take a few minutes
 
 
 class ProcessPerCall(ThreadPoolExecutor):
-    """Makes each call in a fresh process, so that a crash costs one call; threads only wait."""
+    """Makes each call in a fresh process; threads only wait.
+
+    A crash costs one call, unlike in `ProcessPoolExecutor(max_tasks_per_child=1)`, of which it
+    breaks all calls. Signals do not reach the processes: `Launch` ends them.
+    """
+
+    def __init__(self, processes: int):
+        super().__init__(processes, initializer=block_signals)
+        self.processes = processes
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
         """Schedules a call; function, arguments and result are pickled."""
         return super().submit(self._call, function, *args, **kwargs)
 
     def _call(self, *call: Any, **kwargs: Any) -> Any:
-        threads = max(1, cores() // self._max_workers)
+        threads = max(1, cores() // self.processes)
         with ProcessPoolExecutor(1, SPAWN, _begin, (threads,)) as pool:
             return pool.submit(*call, **kwargs).result()
 
@@ -54,28 +69,98 @@ def make_executor(processes: int | None, cluster: str | None) -> Iterator[Execut
             yield client.get_executor(pure=False)
         return
     if processes is None:
-        with ProcessPoolExecutor(1, SPAWN) as pool:  # this process leaves GPUs to the runs
-            processes = cores() if pool.submit(jax.default_backend).result() == "cpu" else 1
+        with ProcessPerCall(1) as executor:
+            processes = cores() if backend_of(executor) == "cpu" else 1
     with ProcessPerCall(processes) as executor:
         yield executor
 
 
-def train_logged(path: Path, run: Run, options: RunOptions, stop_file: Path) -> str:
-    """Trains a run, logs it next to its folder, and returns `done`, `stopped` or an error."""
-    if stop_file.exists():
-        return "stopped"
-    with log_of(path).open("a", buffering=1, encoding="utf-8") as log:
+def capacity(executor: Executor) -> str:
+    """Says how many calls an executor makes at a time."""
+    if isinstance(executor, ProcessPerCall):
+        return f"up to {executor.processes} at a time"
+    return "at a time as many as the cluster has workers"
+
+
+def backend_of(executor: Executor) -> str:
+    """Asks a worker for its kind of device; the launcher leaves GPUs to the workers."""
+    return executor.submit(jax.default_backend).result()
+
+
+@dataclasses.dataclass(frozen=True)
+class Launch:
+    """A launch of a grid, which its workers obey wherever they run.
+
+    Unlike a signal, a file reaches other hosts, and workers whose launcher has died.
+
+    Attributes:
+      file: holds the name of the grid's present launch; missing between two launches.
+      name: this launch.
+    """
+
+    file: Path
+    name: str
+
+    @classmethod
+    def begin(cls, root: Path) -> Self:
+        """Begins a launch of the grid in a folder; workers of earlier ones stop."""
+        launch = cls(root.absolute() / ".launch", uuid4().hex)
+        write_bytes(launch.file, launch.name.encode())
+        return launch
+
+    def end(self) -> None:
+        """Asks the workers to stop after their present iteration."""
+        self.file.unlink(missing_ok=True)
+
+    def has_ended(self) -> bool:
+        """Returns whether the workers are to stop."""
+        try:
+            return self.file.read_text() != self.name
+        except FileNotFoundError:
+            return True
+
+
+def train_logged(runs: Mapping[Path, Run], options: RunOptions, launch: Launch) -> dict[Path, str]:
+    """Trains runs by one program, and logs them next to their folders.
+
+    Returns `done`, `stopped` or an error by folder.
+    """
+    if launch.has_ended():
+        return dict.fromkeys(runs, STOPPED)
+    with contextlib.ExitStack() as stack:
+        consoles = {}
+        for path in runs:
+            log = log_of(path).open("a", buffering=1, encoding="utf-8")
+            consoles[path] = Console(file=stack.enter_context(log))
+        outcomes: Mapping[Path, Any]
         try:
             split_cpu(options.devices)  # first, because a module may start JAX
-            import_modules(run.imports)
+            for run in runs.values():
+                import_modules(run.imports)
             enable_cache()
-            train_run(path, run, options, console=Console(file=log), stop_file=stop_file)
-        except Stopped:
-            return "stopped"
+            for path, console in consoles.items():
+                wait_for_earlier_launch(path, launch, console)
+            outcomes = train_runs(runs, options, consoles=consoles, stop=launch.has_ended)
         except Exception as error:
-            traceback.print_exc(file=log)
-            return f"failed: {error}"
-    return "done"
+            outcomes = dict.fromkeys(runs, error)
+        return {path: _described(outcomes[path], console) for path, console in consoles.items()}
+
+
+def wait_for_earlier_launch(path: Path, launch: Launch, console: Console) -> None:
+    """Waits until a worker whose launcher has died has saved a run, at most for `PATIENCE`."""
+    end = time.monotonic() + PATIENCE
+    while is_being_written(path) and time.monotonic() < end and not launch.has_ended():
+        console.out("Waiting for the process that writes to this run ...")
+        time.sleep(1)
+
+
+def is_being_written(path: Path) -> bool:
+    """Returns whether a process writes to a run's folder."""
+    try:
+        with RunFolder(path).lock():
+            return False
+    except ValueError:
+        return True
 
 
 def log_of(path: Path) -> Path:
@@ -83,9 +168,17 @@ def log_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.log")
 
 
+def _described(outcome: Any, console: Console) -> str:
+    if isinstance(outcome, Stopped):
+        return STOPPED
+    if isinstance(outcome, Exception):
+        traceback.print_exception(outcome, file=console.file)
+        return f"failed: {outcome}"
+    return DONE
+
+
 def _begin(threads: int) -> None:
     os.environ.setdefault("NPROC", str(threads))  # for XLA, which starts one per core
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C arrives through the stop file
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

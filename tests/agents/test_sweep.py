@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 
 import pandas as pd
@@ -16,12 +16,14 @@ import small_runs
 from agents import experiments, sweep
 from agents.config import Config
 from agents.runs.folder import RunFolder
+from agents.runs.metrics import append_rows
 from agents.runs.run import Run, RunOptions
-from agents.runs.stopping import Stopped
-from agents.sweeps import workers
+from agents.sweeps import launcher, overview, workers
+from agents.sweeps.grids import Grid, Options
 from agents.sweeps.launcher import launch
 from paths import ROOT
 from refusal import refused
+from trap_tube_jax.interruptions import Stopped
 
 SETTINGS = [
     f"{name}={json.dumps(value, separators=(',', ':'))}"
@@ -30,57 +32,152 @@ SETTINGS = [
 NEAR_FOOD = ["--import", "agents.examples.near_food", "--env", "near-food", "--sets", "near-food"]
 
 
-def launch_three(monkeypatch, tmp_path, train_run, names=("a", "b", "c")):
+def launch_three(monkeypatch, tmp_path, train_runs, names=("a", "b", "c")):
     """Launches runs in a thread; returns the failed ones' names and what was printed."""
-    monkeypatch.setattr(workers, "train_run", train_run)
+    monkeypatch.setattr(workers, "train_runs", train_runs)
     console = Console(record=True, width=60)
-    runs = {tmp_path / name: Run(Config()) for name in names}
+    groups = [{tmp_path / name: Run(Config())} for name in names]
     with ThreadPoolExecutor(1) as executor:
-        failed = launch(runs, RunOptions(), executor, console)
+        failed = launch(groups, RunOptions(), executor, console)
     return [path.name for path in failed], console.export_text()
 
 
-def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
-    def train_run(path, run, options, *, console, stop_file):
-        del run, options, console, stop_file
-        if path.name == "b[red]":
-            raise ValueError("no such luck")
+def end(path):
+    """Makes a run's files those of a run that has ended."""
+    folder = RunFolder(path)
+    folder.path.mkdir(exist_ok=True)
+    row = {"iteration": 250, "validation_success": 0.0, "transitions": 5}
+    append_rows(folder.metrics, [row])
+    append_rows(folder.evaluations, [{"iteration": 250, "purpose": "test"}])
 
-    names = ("a", "b[red]", "c")
-    failed, shown = launch_three(monkeypatch, tmp_path, train_run, names)
-    assert failed == ["b[red]"]
+
+def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
+    """A run is done only if its files say so."""
+
+    def train_runs(runs, options, *, consoles, stop):
+        del options, consoles, stop
+        ((path, _),) = runs.items()
+        if path.name == "b[red]":
+            return {path: ValueError("no such luck")}
+        if path.name != "c":
+            end(path)
+        return {path: None}
+
+    names = ("a", "b[red]", "c", "d")
+    failed, shown = launch_three(monkeypatch, tmp_path, train_runs, names)
+    assert failed == ["b[red]", "c"]
     failure = f"b[red]: failed: no such luck; see {tmp_path / 'b[red].log'}"
-    for words in ("a: done", failure, "[3/3] c: done"):
+    for words in ("a: done", failure, "c: failed: its worker", "[4/4] d: done"):
         assert words in shown
 
 
 def test_workers_may_run_in_another_folder(monkeypatch, tmp_path):
     found = []
     monkeypatch.chdir(tmp_path)
-    train_run = lambda path, *_, stop_file, **__: found.append((path, stop_file))  # noqa: E731
-    launch_three(monkeypatch, Path(), train_run, "a")
-    assert found == [(tmp_path / "a", tmp_path / ".stop")]
+
+    def train_runs(runs, *_, stop, **__):
+        found.extend(runs)
+        return dict.fromkeys(runs, Stopped(2))
+
+    launch_three(monkeypatch, Path(), train_runs, "a")
+    assert found == [tmp_path / "a"]
 
 
-@pytest.mark.parametrize("signals", [1, 2])
-def test_a_signal_stops_all_runs_and_a_second_one_at_once(monkeypatch, tmp_path, signals):
+def test_a_signal_stops_all_runs_and_they_go_on_with_the_next_launch(monkeypatch, tmp_path):
     begun = []
 
-    def train_run(path, run, options, *, console, stop_file):
-        del run, options, console
-        begun.append(path.name)
-        for _ in range(signals):
-            os.kill(os.getpid(), signal.SIGTERM)  # asks the launcher, in the main thread
-            while not stop_file.exists():
-                pass
-        raise Stopped(signal.SIGTERM)
+    def train_runs(runs, options, *, consoles, stop):
+        del options, consoles
+        begun.extend(path.name for path in runs)
+        os.kill(os.getpid(), signal.SIGTERM)  # asks the launcher, in the main thread
+        while not stop():
+            pass
+        return dict.fromkeys(runs, Stopped(signal.SIGTERM))
 
-    with pytest.raises(Stopped if signals == 1 else KeyboardInterrupt):
-        launch_three(monkeypatch, tmp_path, train_run)
+    with pytest.raises(Stopped):
+        launch_three(monkeypatch, tmp_path, train_runs)
     assert begun == ["a"]
-    assert (tmp_path / ".stop").exists() == (signals == 2), "else a late process would train"
-    launch_three(monkeypatch, tmp_path, lambda path, *_, **__: begun.append(path.name))
+
+    def train(runs, *_, **__):
+        begun.extend(path.name for path in runs)
+        for path in runs:
+            end(path)
+        return dict.fromkeys(runs)
+
+    assert launch_three(monkeypatch, tmp_path, train)[0] == []
     assert begun == ["a", "a", "b", "c"]
+
+
+class Lost(Executor):
+    """An executor whose calls are lost as those of a Dask cluster are without its scheduler."""
+
+    def submit(self, function, /, *args, **kwargs):
+        call = Future()
+        call.cancel()
+        call.set_running_or_notify_cancel()
+        return call
+
+
+def test_calls_that_are_lost_are_failures_unless_their_runs_have_ended(tmp_path):
+    runs = {tmp_path / name: Run(Config()) for name in "ab"}
+    end(tmp_path / "a")
+    console = Console(record=True)
+    assert launch([runs], RunOptions(), Lost(), console) == [tmp_path / "b"]
+    assert "b: failed: its worker, or the scheduler" in console.export_text()
+    assert not (tmp_path / ".launch").exists(), "orphans stop"
+
+
+def test_workers_obey_the_present_launch(tmp_path):
+    first = workers.Launch.begin(tmp_path)
+    assert not first.has_ended()
+    second = workers.Launch.begin(tmp_path)
+    assert (first.has_ended(), second.has_ended()) == (True, False)
+    second.end()
+    assert second.has_ended()
+
+
+def test_a_worker_waits_for_that_of_an_earlier_launch(tmp_path, monkeypatch):
+    asked = iter([True, True, False])
+    monkeypatch.setattr(workers, "is_being_written", lambda path: next(asked))
+    monkeypatch.setattr(workers.time, "sleep", lambda _: None)
+    console = Console(record=True)
+    workers.wait_for_earlier_launch(tmp_path / "a", workers.Launch.begin(tmp_path), console)
+    assert console.export_text().count("Waiting") == 2
+
+
+@pytest.mark.parametrize(
+    ("backend", "preset", "devices", "size", "groups"),
+    [
+        ("gpu", "best", None, None, [[0, 1, 2]]),
+        ("gpu", "best", None, 2, [[0, 1], [2]]),
+        ("gpu", "best", 2, None, [[0], [1], [2]]),
+        ("gpu", "fast", None, None, [[0], [1], [2]]),
+        ("cpu", "best", None, None, [[0], [1], [2]]),
+        ("cpu", "fast", None, 3, [[0, 1, 2]]),
+    ],
+)
+def test_seeds_share_a_program_where_that_pays(
+    monkeypatch, tmp_path, backend, preset, devices, size, groups
+):
+    """By the workers' kind of device; the launcher has no other than a CPU."""
+    monkeypatch.setattr(launcher, "backend_of", lambda executor: backend)
+    points = {"a": {"curiosity": "none"}, "b": {"curiosity": "effects"}}
+    given = Options(preset=preset, seeds=3, out=tmp_path)
+    runs = Grid(points=points).make_runs("x", given)
+    sizes = launcher.program_sizes(runs, RunOptions(devices=devices), Lost(), size)
+    found = launcher.group_runs(runs, sizes)
+    for name in points:
+        of_point = [[run.seed for run in g.values() if run.algorithm == name] for g in found]
+        assert [seeds for seeds in of_point if seeds] == groups
+
+
+def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
+    runs = {tmp_path / name: Run(Config(iterations=4)) for name in "ab"}
+    console = Console(record=True, width=80)
+    end(tmp_path / "a")
+    with overview.Overview(console, runs):
+        pass
+    assert console.export_text() == "12% of 2 run(s), time left not known yet\n"
 
 
 @pytest.mark.parametrize(
@@ -98,6 +195,7 @@ def test_a_signal_stops_all_runs_and_a_second_one_at_once(monkeypatch, tmp_path,
         (["--seeds", "0"], "seeds must be >= 1, got 0"),
         (["--seed", "-1"], "seed must be an integer >= 0"),
         (["--processes", "0"], "must be greater than 0"),
+        (["--seeds-per-program", "0"], "seeds_per_program must be an integer"),
         (["--name", "a/b"], "folder's name"),
         (["--env", "nowhere"], "nowhere"),
     ],
@@ -147,10 +245,12 @@ def test_a_grid_from_its_command_to_its_table(capsys, tmp_path):
 
     def run():
         sweep.main(command)
-        return (root / "results.csv").read_text(), capsys.readouterr().out
+        progress, _, tables = capsys.readouterr().out.partition("Training\n")
+        assert f"1 run(s), up to 1 at a time; logs: {root}/*.log\n" in progress
+        assert "[1/1] max_transitions=null-seed0: done" in progress
+        return (root / "results.csv").read_text(), tables
 
     _, shown = first = run()
-    assert "[1/1] max_transitions=null-seed0: done" in shown
     assert str(root / "table.md") in shown
     assert run() == first, "nothing is left to do"
     rows = pd.read_csv(root / "results.csv")
@@ -165,9 +265,9 @@ def test_a_grid_from_its_command_to_its_table(capsys, tmp_path):
 
 DIES_ONCE = """
 import os, pathlib, signal
-from agents.runs.session import Session
+from agents.runs.progress import Progress
 
-save, marker = Session._save, pathlib.Path({marker!r})
+save, marker = Progress.save, pathlib.Path({marker!r})
 
 def save_and_die(self):
     save(self)
@@ -176,7 +276,7 @@ def save_and_die(self):
         os.kill(os.getpid(), signal.SIGKILL)
 
 if "dask" in __import__("sys").modules:
-    Session._save = save_and_die
+    Progress.save = save_and_die
 """
 
 
@@ -205,3 +305,79 @@ def test_a_run_of_a_killed_dask_worker_goes_on_elsewhere(tmp_path, monkeypatch):
     rows = {name: pd.read_csv(tmp_path / name / "results.csv") for name in ("cluster", "here")}
     assert rows["cluster"].equals(rows["here"])
     assert rows["here"].groupby("purpose").size().to_dict() == {"validation": 6, "test": 2}
+
+
+CLUSTER = """
+import distributed
+if __name__ == "__main__":
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as c:
+        print(c.scheduler_address, flush=True)
+        input()
+"""
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A process of a Dask cluster with one worker, and its address."""
+    pytest.importorskip("distributed")
+    (tmp_path / "cluster.py").write_text(CLUSTER)
+    process = subprocess.Popen(
+        [sys.executable, tmp_path / "cluster.py"],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    with process:
+        yield process, process.stdout.readline().strip()
+        process.kill()
+
+
+def start_endless(tmp_path, *arguments):
+    """Starts a sweep of two runs without an end; returns it when the first has trained."""
+    command = ["--seeds", 2, "--out", tmp_path, "--name", "x", "--sets", "base", *arguments]
+    settings = ["--settings", *SETTINGS, "iterations=1000000", "stop_when_solved=0"]
+    process = small_runs.start("agents.sweep", *command, *settings)
+    while not (tmp_path / "x" / "fast-seed0" / "metrics.csv").exists():
+        assert process.poll() is None, process.communicate()
+    return process
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_is_a_failure(tmp_path, cluster):
+    process, address = cluster
+    sweep_process = start_endless(tmp_path, "--cluster", address)
+    process.kill()
+    output, errors = sweep_process.communicate()
+    assert sweep_process.returncode == 1, errors
+    for seed in range(2):
+        assert f"fast-seed{seed}: failed" in output
+    assert "unfinished" in output
+    assert not (tmp_path / "x" / ".launch").exists(), "its workers would train on"
+
+
+@pytest.mark.slow
+def test_ctrl_c_does_not_wait_for_queued_runs(tmp_path, cluster):
+    sweep_process = start_endless(tmp_path, "--cluster", cluster[1])
+    sweep_process.send_signal(signal.SIGINT)
+    output, errors = sweep_process.communicate()
+    assert sweep_process.returncode == 130, errors
+    assert [f"fast-seed{seed}: stopped" in output for seed in range(2)] == [True, True]
+    assert "Stopped. The same command continues." in errors
+    assert small_runs.final_state(tmp_path / "x" / "fast-seed0")[0] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("signals", [1, 2])
+def test_ctrl_c_ends_a_sweep_on_this_machine(tmp_path, signals):
+    """It reaches the workers, too, as in a terminal."""
+    process = start_endless(tmp_path, "--processes", 1)
+    assert process.stderr is not None
+    for _ in range(signals):
+        os.kill(process.pid, signal.SIGINT)
+        process.stderr.readline()
+    errors = process.stderr.read()
+    process.communicate()
+    assert process.returncode == 130
+    assert "Traceback" not in errors

@@ -10,17 +10,19 @@ import pytest
 
 import agents
 from agents import evaluate
+from agents.command_line import parse_all
 from agents.config import PRESETS, Config
 from agents.files import read_json
-from agents.runs import session
+from agents.runs import program
 from agents.runs.folder import RunFolder
 from agents.runs.loading import save
 from agents.runs.provenance import commit
 from agents.runs.run import Run, RunOptions
-from agents.train import main, parse, run_path
+from agents.train import Options, main, parse, run_path
 from refusal import refused
 from small_runs import final_state, options, read_iterations, run, start, untimed
 from tiny_policy import random_policy
+from trap_tube_jax import interruptions
 
 ITERATIONS = 30
 
@@ -73,9 +75,9 @@ def test_ctrl_c_saves_and_says_how_to_continue(tmp_path):
     assert second.returncode == 2
     assert f"{path} is being written by another process" in errors
     process.send_signal(signal.SIGINT)
-    output, errors = process.communicate()
-    assert (process.returncode, errors) == (130, "")
-    assert f"Stopped. Continue with: python -m agents.train --resume {path}" in output
+    _, errors = process.communicate()
+    hint = f"Stopped. Continue with: python -m agents.train --resume {path}"
+    assert (process.returncode, errors) == (130, f"{interruptions.FINISHING}\n{hint}\n")
     assert final_state(path)[0] == len(untimed(path)) >= 3
 
 
@@ -94,8 +96,14 @@ def test_a_run_in_training_is_read_at_any_moment(tmp_path):
     process.communicate()
 
 
-@pytest.mark.parametrize("vanishes", ["pipe", "folder"])
-def test_training_ends_without_a_traceback_where(vanishes, tmp_path):
+@pytest.mark.parametrize(
+    ("vanishes", "code", "says"),
+    [
+        ("pipe", 128 + signal.SIGPIPE, "Stopped. Continue with: "),
+        ("folder", 1, "error: "),
+    ],
+)
+def test_training_ends_without_a_traceback_where(vanishes, code, says, tmp_path):
     arguments = ["--iterations", 100_000, "--out", tmp_path, "--name", "x"]
     with start("agents.train", *options(), *arguments) as process:
         assert process.stdout is not None
@@ -106,8 +114,9 @@ def test_training_ends_without_a_traceback_where(vanishes, tmp_path):
         else:
             (tmp_path / "x").rename(tmp_path / "gone")
         errors = process.stderr.read()
-    assert process.returncode == 1
+    assert process.returncode == code
     assert "Traceback" not in errors
+    assert says in errors
 
 
 def test_training_runs_in_a_thread(tmp_path):
@@ -144,14 +153,17 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),
         ("--max-transitions 5", "must allow an iteration, which takes up to 12,800"),
         ("--name a/b", "name must be a folder's name without a path, got 'a/b'"),
-        ("--resume no/such", "no/such holds no run; runs in no: none"),
-        ("--resume x --preset best", "leave out --name and --preset"),
+        ("--resume x", "--resume continues a run as it is; leave out --name, --out and --preset"),
         ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
 )
 def test_impossible_settings_are_refused_and_write_no_run(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, main, *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.rglob("*.json"))
+
+
+def test_a_missing_run_is_not_resumed(capsys):
+    assert "no/such holds no run; runs in no: none" in refused(capsys, main, "--resume", "no/such")
 
 
 def test_a_folder_of_other_files_is_not_written_to(capsys, tmp_path):
@@ -182,15 +194,15 @@ def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
     assert folder.config.read_bytes() == settings
 
 
-def test_a_stop_before_the_first_file_promises_nothing(capsys, monkeypatch, tmp_path):
+def test_a_stop_before_the_first_file_promises_nothing(capfd, monkeypatch, tmp_path):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "make_learner", stop)
+    monkeypatch.setattr(program, "make_learner", stop)
     with pytest.raises(SystemExit) as exit_info:
         main(["--out", str(tmp_path), "--name", "x"])
     assert exit_info.value.code == 130
-    assert capsys.readouterr().out == f"Stopped. {tmp_path / 'x'} holds no run to continue.\n"
+    assert capfd.readouterr().err == f"Stopped. {tmp_path / 'x'} holds no run to continue.\n"
 
 
 def test_an_unknown_training_set_is_refused_before_anything_is_played(capsys, tmp_path):
@@ -201,25 +213,30 @@ def test_an_unknown_training_set_is_refused_before_anything_is_played(capsys, tm
     assert not (tmp_path / "x.csv").exists()
 
 
+def read(arguments):
+    (first,) = parse_all([Options], arguments.split(), "", partly=True)
+    return parse(first, arguments.split())
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_options_take_precedence_over_every_preset(preset):
     arguments = f"--preset {preset} --env psy --seed 3 --hidden 32 --curiosity none"
-    found, wanted, *_ = parse(arguments.split())
+    found, wanted, *_ = read(arguments)
     own = {"env_id": "PerceptualSymbolicTrapTube-v0", "hidden": 32, "curiosity": "none"}
     assert wanted == Run(Config.preset(preset, **own), 3)
     assert run_path(found, wanted).name == f"{preset}-psy-3"
-    assert str(run_path(*parse([])[:2])) == "runs/fast-base-0"
+    assert str(run_path(*read("")[:2])) == "runs/fast-base-0"
 
 
 def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     stored = Run(Config.preset("paper", hidden=32), 5, "mine", ("json",))
     how = RunOptions(test_tasks=7, sets=("p", "st"))
     RunFolder(tmp_path / "x").note(stored, how)
-    arguments = ["--resume", str(tmp_path / "x")]
-    found, *wanted = parse(arguments)
+    arguments = f"--resume {tmp_path / 'x'}"
+    found, *wanted = read(arguments)
     assert wanted == [stored, how]
     assert run_path(found, stored) == tmp_path / "x"
-    _, *wanted = parse([*arguments, "--iterations", "999", "--test-tasks", "2"])
+    _, *wanted = read(f"{arguments} --iterations 999 --test-tasks 2")
     expected = dataclasses.replace(stored.config, iterations=999)
     run = dataclasses.replace(stored, config=expected)
     assert wanted == [run, dataclasses.replace(how, test_tasks=2)]

@@ -1,6 +1,7 @@
 """Errors in a line, and words that any terminal can show."""
 
 import io
+import signal
 import subprocess
 import sys
 
@@ -48,7 +49,7 @@ def test_a_closed_pipe_ends_a_command_in_silence():
         assert process.stdout.readline() == b"0\n"
         process.stdout.close()
         assert process.stderr.read() == b""
-    assert process.returncode == 1
+    assert process.returncode == 128 + signal.SIGPIPE
 
 
 def test_a_command_without_stdout_ends_in_silence(monkeypatch):

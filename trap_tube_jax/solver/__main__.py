@@ -12,6 +12,7 @@ import numpy as np
 from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
 from trap_tube_jax.command_line import add_import_option, plain_errors
 from trap_tube_jax.imports import import_modules
+from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
@@ -144,4 +145,4 @@ def _caption(plan: Plan, time: int) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

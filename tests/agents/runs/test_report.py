@@ -24,7 +24,7 @@ from agents.runs.run import Run
 from small_runs import small_config
 from tiny_policy import food_next_to_agent, random_params
 from trap_tube_jax.objects import DIRECTION_NAMES
-from trap_tube_jax.scoring.tasks import evaluation_tasks
+from trap_tube_jax.scoring import Suite, evaluation_tasks
 
 CONFIG = small_config(curiosity="effects", stop_when_solved=0.0)
 
@@ -41,7 +41,7 @@ def played():
     """An untrained policy's evaluator on base, {P} and a set of known outcome, and outcomes."""
     tasks = {name: evaluation_tasks(name, 2) for name in ("base", "p")}
     tasks["mine"] = food_next_to_agent(3)
-    evaluator = Evaluator(CONFIG, tasks)
+    evaluator = Evaluator(CONFIG, Suite(tasks, dict.fromkeys(tasks, 6)))
     return evaluator, evaluator(random_params(CONFIG))
 
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -16,15 +17,18 @@ from rich.console import Console
 import agents
 from agents.acting.evaluation import Evaluation
 from agents.ppo.learner import Learner
-from agents.runs import checkpoint, evaluator, session
+from agents.runs import checkpoint, program, progress, session
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
+from agents.runs.progress import Progress
 from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
-from agents.runs.session import train_run
-from agents.runs.stopping import Stopped
+from agents.runs.session import train_run, train_runs
 from small_runs import final_state, small_config, untimed
+from trap_tube_jax.interruptions import Stopped
+from trap_tube_jax.scoring import suite
+from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks
 
 ITERATIONS = 6
@@ -62,7 +66,7 @@ def whole(tmp_path_factory):
         return evaluation_tasks(name, number, features, purpose)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (evaluator, session):
+        for module in (suite, program):
             patch.setattr(module, "evaluation_tasks", record)
         train_run(path, small_run(), TRACKED)
     return path
@@ -90,8 +94,10 @@ def test_a_run_leaves_its_rows(whole):
 
 
 def test_only_the_final_evaluation_plays_test_tasks(whole):
-    chosen_by = [(name, "validation") for name in ("base", "p", "TrapTube-v0")]
-    assert [*chosen_by, ("base", "test"), ("p", "test")] == ASKED
+    chosen_by = [
+        (name, "validation") for name in ("TrapTube-v0", "PerceptualTrapTube-v0", "TrapTube-v0")
+    ]
+    assert [*chosen_by, ("TrapTube-v0", "test"), ("PerceptualTrapTube-v0", "test")] == ASKED
 
 
 def test_results_are_a_tidy_table(whole, tmp_path):
@@ -109,13 +115,14 @@ def test_results_are_a_tidy_table(whole, tmp_path):
 
 def test_stopped_runs_continue_to_the_same_bits(whole, tmp_path, monkeypatch):
     """Stopped between two checkpoints; the rows and the best parameters are the same, too."""
-    path, advance = tmp_path / "stopped", session.Session._iterate
+    path, record = tmp_path / "stopped", Progress.record
 
-    def stop(self, program):
-        row = advance(self, program)
-        return row if self.iteration != 3 else _raise(Stopped(2))
+    def stop(self, metrics, seconds):
+        record(self, metrics, seconds)
+        if self.iteration == 3:
+            raise Stopped(2)
 
-    monkeypatch.setattr(session.Session, "_iterate", stop)
+    monkeypatch.setattr(Progress, "record", stop)
     with pytest.raises(Stopped):  # as a kill would: the iteration is not saved
         train_run(path, small_run(), TRACKED)
     monkeypatch.undo()
@@ -132,17 +139,17 @@ def _raise(error):
 
 
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
-    monkeypatch.setattr(session, "make_advance", None)
+    monkeypatch.setattr(program, "make_advance", None)
     before, output = (copy / "evaluations.csv").read_bytes(), io.StringIO()
     more = dataclasses.replace(TRACKED, test_tasks=9)
     assert train_run(copy, small_run(), more, console=Console(file=output)) is None
     assert (copy / "evaluations.csv").read_bytes() == before
-    assert "agents.evaluate plays other" in output.getvalue()
+    assert "to play other tasks, run python -m agents.evaluate" in output.getvalue()
 
 
 def test_the_best_policy_is_never_newer_than_the_last_checkpoint(tmp_path, monkeypatch):
     """Of a run that is killed between two checkpoints."""
-    monkeypatch.setattr(session, "append_rows", lambda path, rows: _raise_at(3, path, rows))
+    monkeypatch.setattr(progress, "append_rows", lambda path, rows: _raise_at(3, path, rows))
     options = dataclasses.replace(TRACKED, evaluate_every=1, checkpoint_every=100)
     with pytest.raises(KeyboardInterrupt):
         train_run(tmp_path / "x", small_run(), options)
@@ -151,7 +158,7 @@ def test_the_best_policy_is_never_newer_than_the_last_checkpoint(tmp_path, monke
 
 
 def test_a_kill_before_the_best_policy_is_saved_is_made_good(whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(session, "save", lambda *_: _raise(KeyboardInterrupt))
+    monkeypatch.setattr(progress, "save", lambda *_: _raise(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         train_run(tmp_path / "x", small_run(), TRACKED)
     monkeypatch.undo()
@@ -177,7 +184,7 @@ def test_a_finished_run_is_extended(copy, monkeypatch):
     """Its last parameters are made the best, so they are tested; an iteration takes a second."""
     clock = SimpleNamespace(perf_counter=itertools.count().__next__)
     monkeypatch.setattr(session, "time", clock)
-    monkeypatch.setattr(session, "best_iteration", lambda rows, own: ITERATIONS + 1)
+    monkeypatch.setattr(progress, "is_better", lambda *_: True)
     train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
     assert final_state(copy)[0] == ITERATIONS + 1
     assert RunFolder(copy).read()[0].config.iterations == ITERATIONS + 1
@@ -189,21 +196,106 @@ def test_a_finished_run_is_extended(copy, monkeypatch):
         train_run(copy, small_run(), TRACKED)
 
 
+def cut(path):
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+
+
+def remove(path):
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def make_a_file(path):
+    remove(path)
+    path.touch()
+
+
 @pytest.mark.parametrize(
-    ("own", "sets", "best"),
-    [("p", ("base", "p", "st"), 2), ("base", ("base", "p", "st"), 1), ("p", ("base",), 1)],
+    ("name", "damage", "message"),
+    [
+        ("checkpoints", remove, "no checkpoint to continue from; restore"),
+        ("checkpoints", make_a_file, "no checkpoint to continue from; restore"),
+        ("metrics.csv", remove, "metrics.csv ends before the checkpoint of iteration 6"),
+        ("metrics.csv", cut, "metrics.csv ends before the checkpoint of iteration 6"),
+        ("evaluations.csv", remove, "evaluations.csv lacks the evaluation of iteration"),
+        ("best.safetensors", remove, "best.safetensors is missing"),
+        ("best.safetensors", make_a_file, "best.safetensors is not a file of arrays"),
+    ],
 )
-def test_the_best_iteration_is_the_first_of_the_highest_mean_over_sets(own, sets, best):
-    """Sets count the same whatever their size; base only where it is trained on; tests never."""
-    solved = {1: (1, 1, 50), 2: (0, 4, 0), 3: (0, 2, 50)}
-    rows = [
-        {"iteration": i, "purpose": "validation", "task_set": name, "tasks": tasks, "solved": count}
-        for i, counts in solved.items()
-        for name, tasks, count in zip(("base", "p", "st"), (1, 4, 100), counts, strict=True)
-    ]
-    tested = [{**x, "iteration": 4, "purpose": "test", "solved": x["tasks"]} for x in rows[:3]]
-    found = pd.DataFrame(rows + tested)
-    assert session.best_iteration(found[found["task_set"].isin(sets)], own) == best
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_run_with_missing_files_is_refused_unchanged(copy, name, damage, message, more):
+    """Resumed as it is, and extended."""
+    damage(copy / name)
+    before = contents(copy)
+    with pytest.raises(ValueError, match=message):
+        train_run(copy, small_run(iterations=ITERATIONS + more), TRACKED)
+    assert contents(copy) == before
+
+
+def test_other_sets_are_compared_by_those_in_common(copy):
+    other = dataclasses.replace(TRACKED, sets=("st",))
+    before = contents(copy)
+    with pytest.raises(ValueError, match=r"--sets must include one of base, p, .* got st"):
+        train_run(copy, small_run(iterations=ITERATIONS + 1), other)
+    assert contents(copy) == before
+
+
+def test_scores_of_new_sets_are_recorded(copy):
+    more = dataclasses.replace(TRACKED, sets=("p", "st"))
+    scores = train_run(copy, small_run(), more)
+    assert scores is not None
+    assert [score.set for score in scores.sets] == ["p", "st"]
+    tested = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
+    assert tested["task_set"].tolist() == ["base", "p", "st"]
+    assert train_run(copy, small_run(), more) is None
+
+
+def contents(folder):
+    return {
+        path: path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def test_a_run_that_is_killed_before_its_first_iteration_begins_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(program, "make_advance", lambda *_: _raise(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train_run(tmp_path / "x", small_run(), PLAIN)
+    assert final_state(tmp_path / "x")[0] == 0
+    monkeypatch.undo()
+    train_run(tmp_path / "x", small_run(iterations=1), PLAIN)
+    assert len(untimed(tmp_path / "x")) == 1
+
+
+def test_a_path_may_begin_at_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    train_run("~/x", small_run(iterations=1), PLAIN)
+    assert len(untimed(tmp_path / "x")) == 1
+
+
+@pytest.mark.parametrize(
+    ("own", "earlier", "later", "better"),
+    [
+        ("p", {"base": 0, "p": 0.25, "st": 0.25}, {"base": 0, "p": 0.5, "st": 0.2}, True),
+        ("p", {"base": 0, "p": 0.25}, {"base": 1, "p": 0.25}, False),
+        ("base", {"base": 0, "p": 0.25}, {"base": 1, "p": 0.25}, True),
+        ("p", {"base": 0}, {"base": 1}, True),
+        ("p", {"p": 0.25}, {"p": 0.25}, False),
+        ("p", {"p": 0.25, "st": 1}, {"p": 0.5}, True),
+        ("p", {"p": 0.5}, {"p": 0.25, "st": 1}, False),
+    ],
+)
+def test_the_best_policy_has_the_highest_mean_over_the_sets_in_common(own, earlier, later, better):
+    """Sets count the same whatever their size; base only where it is trained on, or alone."""
+    tasks = {"base": 1, "p": 4, "st": 100}
+    found = pd.DataFrame(
+        {"iteration": i, "task_set": name, "tasks": tasks[name], "solved": share * tasks[name]}
+        for i, shares in enumerate((earlier, later))
+        for name, share in shares.items()
+    )
+    assert progress.is_better(found, 1, 0, own) == better
+    assert progress.is_better(found, 1, None, own)
+    assert not progress.is_better(found, 2, 0, own), "not evaluated"
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
@@ -231,11 +323,25 @@ def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch
 def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypatch):
     """Whose float32 mean is 0.99999994."""
     solved = Evaluation(jnp.full(41, True), *jnp.ones((3, 41)))
-    monkeypatch.setattr(session, "evaluate", lambda *_: solved)
+    monkeypatch.setattr(program, "evaluate", lambda *_: solved)
     replace_training(monkeypatch, lambda *returned: returned)
     run = Run(small_config(iterations=3, stop_when_solved=1.0))
     train_run(tmp_path / "x", run, PLAIN)
     assert [row["validation_success"] for row in untimed(tmp_path / "x")] == ["1.0"]
+
+
+def test_success_is_measured_within_the_limit_of_the_task_set(tmp_path, monkeypatch):
+    """Not within that of training."""
+    limits = []
+    played = program.evaluate
+
+    def record(agent, params, env, tasks, encoding):
+        limits.append(env.max_steps)
+        return played(agent, params, env, tasks, encoding)
+
+    monkeypatch.setattr(program, "evaluate", record)
+    train_run(tmp_path / "x", small_run(iterations=1), PLAIN)
+    assert set(limits) == {50}
 
 
 def test_without_evaluation_the_final_policy_is_tested_on_all_sets(tmp_path):
@@ -244,3 +350,79 @@ def test_without_evaluation_the_final_policy_is_tested_on_all_sets(tmp_path):
     assert rows["task_set"].tolist() == list(ALL_SETS)
     assert set(zip(rows["purpose"], rows["iteration"], strict=True)) == {("test", 1)}
     assert not RunFolder(tmp_path / "x").best.exists()
+
+
+SEEDS = (3, 4)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Folders of two seeds that train alone for three iterations."""
+    root = tmp_path_factory.mktemp("alone")
+    for seed in SEEDS:
+        train_run(root / f"{seed}", small_run(3, seed=seed), TRACKED)
+    return root
+
+
+def assert_same_rows(found, wanted):
+    for seed in SEEDS:
+        ours, theirs = (pd.DataFrame(untimed(root / f"{seed}")) for root in (found, wanted))
+        pd.testing.assert_frame_equal(ours.astype(float), theirs.astype(float), rtol=1e-3)
+
+
+def test_seeds_of_one_program_equal_seeds_alone(alone, tmp_path):
+    runs = {tmp_path / f"{seed}": small_run(3, seed=seed) for seed in SEEDS}
+    assert all(train_runs(runs, TRACKED).values())
+    assert_same_rows(tmp_path, alone)
+    for path in runs:
+        ours, theirs = (
+            read_rows(root / path.name / "evaluations.csv") for root in (tmp_path, alone)
+        )
+        pd.testing.assert_frame_equal(ours, theirs)
+        assert final_state(path)[0] == read_policy(RunFolder(path).best).iteration + 1 == 3
+
+
+def test_seeds_of_one_program_stop_together_and_go_on_from_where_they_stand(alone, tmp_path):
+    """The first is one iteration ahead."""
+    runs = {tmp_path / f"{seed}": small_run(3, seed=seed) for seed in SEEDS}
+    train_run(tmp_path / "3", small_run(1, seed=3), TRACKED)
+    outcomes = train_runs(runs, TRACKED, stop=lambda: True)
+    assert all(isinstance(outcome, Stopped) for outcome in outcomes.values())
+    assert [final_state(path)[0] for path in runs] == [2, 1]
+    train_runs(runs, TRACKED)
+    assert_same_rows(tmp_path, alone)
+
+
+def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
+    """Seed 0 cannot be begun, 1 diverges in iteration 2, 2 is solved then, 3 goes on."""
+    advance = program.Cohort.advance
+
+    def end(cohort):
+        metrics = {name: np.array(values) for name, values in advance(cohort).items()}
+        if metrics["episodes"].max() == 2 * 8:
+            metrics["loss"][0] = np.nan
+            metrics["validation_success"][1] = True
+        return metrics
+
+    monkeypatch.setattr(program.Cohort, "advance", end)
+    config = small_config(iterations=3, stop_when_solved=1.0)
+    runs = {tmp_path / f"{seed}": Run(config, seed) for seed in range(4)}
+    RunFolder(tmp_path / "0").checkpoints.mkdir(parents=True)
+    append_rows(tmp_path / "0" / "metrics.csv", [{"iteration": 1}])
+    failed, diverged, solved, other = train_runs(runs, PLAIN).values()
+    assert "no checkpoint" in str(failed)
+    assert "diverged in iteration 2" in str(diverged)
+    assert isinstance(solved, Scores)
+    assert isinstance(other, Scores)
+    assert [final_state(path)[0] for path in runs if path.name != "0"] == [0, 2, 3]
+    (tested,) = read_rows(tmp_path / "2" / "evaluations.csv")["iteration"]
+    assert tested == 2
+
+
+def test_runs_of_one_program_differ_only_in_their_seed(tmp_path):
+    runs = {tmp_path / "a": small_run(), tmp_path / "b": small_run(7)}
+    with pytest.raises(ValueError, match="differ only in their seed"):
+        train_runs(runs)
+    runs = {tmp_path / "a": small_run(), tmp_path / "b": small_run(seed=1)}
+    with pytest.raises(ValueError, match="use one device"):
+        train_runs(runs, RunOptions(devices=2))

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+import trap_tube_jax as tt
 from agents.files import read_json
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
@@ -92,11 +93,11 @@ def test_success_is_by_set_and_algorithm_with_the_papers_figures():
 def test_training_is_summed_up_with_the_papers_trials():
     three = ((0, 1), (0, 0, 1), (0, 0, 0))
     made = pd.concat([curves("ppo+icm", three), curves("<b>", ((0.5,),))])
-    table = tables.training_table(made, 1.0, with_paper=True)
+    table = tables.training_table(made, 1.0, True, {"<b>": 1})
     assert table.loc["ppo+icm"].tolist() == ["2 of 3", "250 [0, 885]", "2,667", "2.7"]
-    assert table.loc["<b>"].tolist() == ["0 of 1", "–", "1,000", "1.0"]
+    assert table.loc["<b>"].tolist() == ["0 of 1, 1 unfinished", "–", "1,000", "1.0"]
     assert table.loc["PPO + ICM, paper"].tolist()[:2] == ["5 of 5", "102,000 ± 60,000"]
-    assert tables.training_table(made, 0.5, with_paper=False).loc["<b>", "solved"] == "1 of 1"
+    assert tables.training_table(made, 0.5, False, {}).loc["<b>", "solved"] == "1 of 1"
 
 
 def test_runs_that_have_tested_nothing_yet_have_a_table_and_curves(tmp_path):
@@ -144,6 +145,37 @@ def test_the_tables_of_the_records_fit_a_terminal(record, tmp_path):
     shown = records.write(copy)
     assert "**Test tasks solved, %**" in (copy / "table.md").read_text()
     assert max(map(len, shown.splitlines()[:-5])) <= records.WIDTH
+
+
+def test_equal_labels_are_told_apart_and_a_set_may_be_named_na(tmp_path, own_task_sets):
+    for short in ("NA", "other"):
+        tt.register(f"{short}-v0", (tt.symbolic,), short=short)
+    tested = rows("ppo", [3], task_set="NA") + rows("ppo", [4], task_set="other")
+    greedy = [{**row, "purpose": "validation", "iteration": i} for row in tested for i in (1, 2)]
+    pd.DataFrame(tested + greedy).to_csv(tmp_path / "results.csv", index=False)
+    results = records.read_table(tmp_path / "results.csv")
+    table = tables.tables(results, curves(), ABOUT)["Test tasks solved, %"]
+    assert table.loc[["{Sy} (NA)", "{Sy} (other)"], "ppo"].tolist() == ["30.0", "40.0"]
+    figure = figures.draw_curves(results, curves(), ABOUT)
+    assert {"greedy, {Sy} (NA)", "greedy, {Sy} (other)"} <= {
+        axis.get_title() for axis in figure.axes
+    }
+
+
+def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
+    for seed, iterations in ((0, 2), (1, 3)):
+        folder = RunFolder(tmp_path / f"seed{seed}")
+        folder.note(Run(small_config(iterations=iterations, stop_when_solved=0), seed))
+        done = curves(evaluations=((0, 1),)).to_dict("records")
+        append_rows(folder.metrics, done)
+        append_rows(folder.evaluations, rows("ppo", [1]))
+    for command in ("first", "second", "first"):
+        records.collect(tmp_path, command)
+    shown = records.write(tmp_path)
+    assert "2 of 2, 1 unfinished" in shown
+    assert "Unfinished, so the table may change: ppo+effects seed 1." in shown
+    text = (tmp_path / "table.md").read_text()
+    assert "`first`\n\n`second`\n" in text
 
 
 def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):

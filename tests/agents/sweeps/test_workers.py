@@ -1,5 +1,6 @@
 """Processes of runs: one per call, failures alone, logs next to the folders."""
 
+import contextlib
 import os
 import signal
 
@@ -7,8 +8,8 @@ import pytest
 
 from agents.config import Config
 from agents.runs.run import Run, RunOptions
-from agents.runs.stopping import Stopped
 from agents.sweeps import workers
+from trap_tube_jax.interruptions import Stopped
 
 
 def test_a_killed_process_costs_one_call():
@@ -19,35 +20,52 @@ def test_a_killed_process_costs_one_call():
         assert other.result() != os.getpid()
 
 
+def test_signals_do_not_reach_the_processes():
+    """Neither while they start: a terminal sends Ctrl-C to all."""
+    with workers.make_executor(1, None) as executor:
+        executor.submit(signal.raise_signal, signal.SIGINT).result()
+        executor.submit(signal.raise_signal, signal.SIGTERM).result()
+
+
 @pytest.mark.parametrize(
-    ("raises", "outcome", "logged"),
+    ("ends", "outcome", "logged"),
     [
         (None, "done", "training [b]x[/b]\n"),
         (Stopped(15), "stopped", "training [b]x[/b]\n"),
         (ValueError("no [red]luck"), "failed: no [red]luck", "ValueError: no [red]luck\n"),
     ],
 )
-def test_a_run_is_logged_next_to_its_folder(tmp_path, monkeypatch, raises, outcome, logged):
-    def train_run(path, run, options, *, console, stop_file):
-        console.print("training [b]x[/b]", markup=False)
-        if raises:
-            raise raises
+def test_runs_are_logged_next_to_their_folders(tmp_path, monkeypatch, ends, outcome, logged):
+    def train_runs(runs, options, *, consoles, stop):
+        for console in consoles.values():
+            console.print("training [b]x[/b]", markup=False)
+        return {path: ends if path.name == "a" else None for path in runs}
 
-    monkeypatch.setattr(workers, "train_run", train_run)
-    stop_file = tmp_path / ".stop"
-    arguments = (tmp_path / "a-seed0", Run(Config()), RunOptions(), stop_file)
-    assert workers.train_logged(*arguments) == outcome
-    assert (tmp_path / "a-seed0.log").read_text().endswith(logged)
-    stop_file.touch()
-    assert workers.train_logged(*arguments) == "stopped"
+    monkeypatch.setattr(workers, "train_runs", train_runs)
+    launch = workers.Launch.begin(tmp_path)
+    runs = {tmp_path / name: Run(Config(), seed) for seed, name in enumerate("ab")}
+    found = workers.train_logged(runs, RunOptions(), launch)
+    assert found == {tmp_path / "a": outcome, tmp_path / "b": "done"}
+    assert (tmp_path / "a.log").read_text().endswith(logged)
+    launch.end()
+    assert set(workers.train_logged(runs, RunOptions(), launch).values()) == {"stopped"}
+
+
+def test_a_program_that_cannot_be_made_fails_all_its_runs(tmp_path):
+    runs = {tmp_path / name: Run(Config(), seed) for seed, name in enumerate("ab")}
+    launch = workers.Launch.begin(tmp_path)
+    found = workers.train_logged(runs, RunOptions(devices=2), launch)
+    assert all(text.startswith("failed: runs of one program must") for text in found.values())
 
 
 def test_devices_are_split_before_modules_are_imported(tmp_path, monkeypatch):
     order = []
-    for name in ("split_cpu", "import_modules", "train_run"):
+    for name in ("split_cpu", "import_modules", "train_runs"):
         monkeypatch.setattr(workers, name, lambda *_, name=name, **__: order.append(name))
-    workers.train_logged(tmp_path / "a", Run(Config()), RunOptions(devices=2), tmp_path / ".stop")
-    assert order == ["split_cpu", "import_modules", "train_run"]
+    launch = workers.Launch.begin(tmp_path)
+    with contextlib.suppress(TypeError):  # no outcomes
+        workers.train_logged({tmp_path / "a": Run(Config())}, RunOptions(devices=2), launch)
+    assert order == ["split_cpu", "import_modules", "train_runs"]
 
 
 def test_dask_is_an_extra(monkeypatch):

@@ -1,0 +1,311 @@
+"""The files and the progress of one run: rows, checkpoints, best policy, evaluations, report."""
+
+import contextlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from rich.console import Console
+
+import trap_tube_jax as tt
+from agents.acting.policy import Policy
+from agents.arrays import from_arrays, read_arrays
+from agents.networks.agent import PARTS
+from agents.ppo.learner import TrainState
+from agents.runs import checkpoint, report
+from agents.runs.display import ProgressLine
+from agents.runs.evaluator import Evaluator
+from agents.runs.folder import RunFolder
+from agents.runs.loading import read_policy, save
+from agents.runs.loggers import open_loggers
+from agents.runs.metrics import (
+    Frame,
+    Row,
+    append_rows,
+    evaluation_rows,
+    is_last,
+    read_rows,
+    rewind_rows,
+)
+from agents.runs.program import Metrics, Program
+from agents.runs.provenance import note_provenance
+from agents.runs.run import Run
+from trap_tube_jax.scoring.scores import Scores
+
+
+class Progress:
+    """One run as far as it has come, and the writer of its files.
+
+    Attributes:
+      state: returns the present training state. Training replaces the function.
+      last: the newest row of metrics; None before the first iteration.
+    """
+
+    def __init__(
+        self, run: Run, program: Program, stored: RunFolder, folder: RunFolder, console: Console
+    ):
+        """Reads the newest checkpoint of `stored` and checks the files; writes nothing.
+
+        Args:
+          run: the run.
+          program: what the run shares with others.
+          stored: the run's folder.
+          folder: the folder to write to; see `session.writing`.
+          console: where progress is shown.
+
+        Raises:
+          ValueError: the run cannot be continued, or files contradict one another.
+          OSError: a file cannot be read.
+        """
+        self.run, self.program, self.console = run, program, console
+        self.stored, self.folder = stored, folder
+        if stored.config.is_file():
+            run.check_continues(stored.read()[0])
+        restored, self.last = restore(stored, run.config.iterations, program.state_shapes)
+        check_rows(stored, self.iteration)
+        if program.validation:
+            check_best(stored, self.iteration, program.sets)
+        first = program.init(run.seed) if restored is None else restored
+        self.state: Callable[[], TrainState] = lambda: first
+
+    @property
+    def iteration(self) -> int:
+        """Iterations done."""
+        return self.last["iteration"] if self.last else 0
+
+    @property
+    def is_trained(self) -> bool:
+        """True if training has reached a limit."""
+        return self.last is not None and is_last(self.last, self.run.config)
+
+    def begin(self) -> None:
+        """Notes what goes on, and removes the rows that training makes again."""
+        self.folder.note(self.run, self.program.options)  # they may differ from those before
+        if self.last is None:
+            self.save()  # from now on, rows without a checkpoint mean that files were removed
+        for rows in (self.folder.metrics, self.folder.evaluations):
+            rewind_rows(rows, self.iteration)
+        if self.program.validation:
+            self._keep_best()  # a kill may have come between checkpoint and best policy
+
+    def begin_training(self, stack: contextlib.ExitStack, seeds: int) -> None:
+        """Opens loggers and progress line until the end of `stack`, and says what is trained.
+
+        `seeds` are trained together.
+        """
+        config, options = self.run.config, self.program.options
+        if options.report:
+            self.folder.page.unlink(missing_ok=True)  # it would show the run as it was
+        note_provenance(self.folder.provenance, str(self.program.placement))
+        chosen = {"tensorboard": options.tensorboard, "wandb": options.wandb}
+        self._log = stack.enter_context(open_loggers(self.folder.path, self.run, **chosen))
+        self._line = stack.enter_context(ProgressLine(self.console, config.iterations))
+        together = f", with {seeds - 1} other seed(s)" if seeds > 1 else ""
+        self.console.out(
+            f"{self.folder.path}: {tt.task_set(config.env_id).id}, curiosity {config.curiosity}, "
+            f"seed {self.run.seed}, {self.program.num_parameters:,} parameters, on "
+            f"{self.program.placement}{together}. Compiling, which takes up to a minute ..."
+        )
+
+    def record(self, metrics: Metrics, seconds: float) -> None:
+        """Writes an iteration's row of metrics; evaluates and saves where it is due.
+
+        Args:
+          metrics: by `program.make_advance`.
+          seconds: wall time of the iteration, of all seeds of the program.
+
+        Raises:
+          ValueError: a loss or a gradient is not finite.
+        """
+        options = self.program.options
+        row = self._row(metrics, seconds)
+        append_rows(self.folder.metrics, [row])
+        self.last = row
+        due = options.evaluate_every and self.iteration % options.evaluate_every == 0
+        if self.program.validation and (due or self.is_trained):
+            self._validate(self.program.validation)
+        self._log(row)
+        self._line.show(row)
+        if self.iteration % options.checkpoint_every == 0 or self.is_trained:
+            self.save()
+        if self.is_trained:  # other seeds of the program may go on
+            last = self.state()
+            self.state = lambda: last
+
+    def save(self) -> None:
+        """Saves a checkpoint."""
+        state = self.program.placement.local(self.state())
+        checkpoint.save(self.folder.checkpoints, self.iteration, state, dict(self.last or {}))
+
+    def finish(self) -> Scores | None:
+        """Plays the test tasks with the final policy, or the best one; writes the results.
+
+        Returns the scores; None if all are in the files.
+        """
+        policy, options = self._policy(), self.program.options
+        if self.program.validation and self.stored.best.is_file():
+            policy = read_policy(self.stored.best)
+        tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
+        tested = set(tested[tested["iteration"] == policy.iteration]["task_set"])
+        has_page = self.folder.page.exists() or not options.report
+        if tested.issuperset(self.program.sets) and has_page:
+            self.console.out("Already tested; to play other tasks, run python -m agents.evaluate.")
+            return None
+        self.console.out("Evaluating ...")
+        evaluator = self.program.test
+        played = evaluator(policy.params)
+        scores = evaluator.scores(played)
+        rows = evaluation_rows(scores, policy, "test")
+        append_rows(self.folder.evaluations, [row for row in rows if row["task_set"] not in tested])
+        if options.report:
+            report.write(self.folder, self.run, evaluator, played)
+        return scores
+
+    def _row(self, metrics: Metrics, seconds: float) -> Row:
+        """Returns a row of metrics.
+
+        `transitions_per_second` counts the run's steps, over the time of all seeds together.
+        """
+        iteration = self.iteration + 1
+        # A parameter is infinite or NaN only if the norm of a gradient is.
+        if not all(np.isfinite(metric).all() for metric in metrics.values()):
+            raise ValueError(
+                f"training diverged in iteration {iteration}: a loss or a gradient is not "
+                f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
+            )
+        shares = {name: metric.mean() for name, metric in metrics.items() if metric.ndim}
+        numbers = {**metrics, **shares}  # means in float64, to compare with thresholds
+        steps = numbers.pop("steps")
+        before = self.last["seconds"] if self.last else 0.0
+        return {
+            "iteration": iteration,
+            **{name: numbers[name].item() for name in sorted(numbers)},
+            "transitions_per_second": round(float(steps) / seconds, 1),
+            "seconds": round(before + seconds, 3),
+        }
+
+    def _validate(self, evaluator: Evaluator) -> None:
+        policy = self._policy()
+        scores = evaluator.scores(evaluator(policy.params))
+        append_rows(self.folder.evaluations, evaluation_rows(scores, policy, "validation"))
+        self._keep_best()
+
+    def _keep_best(self) -> None:
+        """Saves the present policy if its evaluation is better than the best policy's."""
+        rows = read_rows(self.folder.evaluations)
+        own = tt.task_set(self.run.config.env_id).short
+        if is_better(rows, self.iteration, best_iteration(self.folder), own):
+            self.save()  # first, or a resume could start before the best policy
+            save(self.folder.best, self._policy())
+
+    def _policy(self) -> Policy:
+        state = self.state()
+        params = {part: state.params[part] for part in PARTS}
+        name = f"seed {self.run.seed}"
+        return Policy(name, self.run.config, self.program.placement.local(params), self.iteration)
+
+
+def restore(
+    folder: RunFolder, iterations: int, shapes: TrainState
+) -> tuple[TrainState | None, Row | None]:
+    """Returns the newest checkpoint's state and row of metrics; None for what there is not yet.
+
+    Raises ValueError for a checkpoint of other settings.
+    """
+    if not checkpoint.iterations(folder.checkpoints):
+        return None, None
+    arrays, row = checkpoint.load(folder.checkpoints)
+    done = row["iteration"]
+    try:
+        state = from_arrays(arrays, shapes)
+    except ValueError as error:
+        raise ValueError(
+            f"checkpoint {done} in {folder.checkpoints} cannot be continued: {error}"
+        ) from error
+    if done > iterations:
+        raise ValueError(f"iterations must be at least {done}, which are done, got {iterations}")
+    return state, row if done else None
+
+
+def check_rows(folder: RunFolder, iteration: int) -> None:
+    """Raises ValueError unless a run's rows lead up to its newest checkpoint, at `iteration`.
+
+    Rows may go on after the checkpoint: training makes them again. Without a checkpoint it would
+    make all of them again, in the place of results that may be the only ones.
+    """
+    rows = read_rows(folder.metrics)
+    evaluated = read_rows(folder.evaluations)
+    if not checkpoint.iterations(folder.checkpoints):
+        if len(rows) or len(evaluated) or folder.checkpoints.is_file():
+            raise ValueError(
+                f"{folder.path} holds results, but no checkpoint to continue from; restore "
+                f"{folder.checkpoints}, or train under another --name"
+            )
+    elif max(rows["iteration"], default=0) < iteration:
+        raise ValueError(
+            f"{folder.metrics} ends before the checkpoint of iteration {iteration}; restore it, or "
+            "train under another --name"
+        )
+
+
+def has_ended(folder: RunFolder, run: Run) -> bool:
+    """Returns whether a run's files hold its last iteration and the test of its policy."""
+    try:
+        rows = read_rows(folder.metrics)
+        tested = set(read_rows(folder.evaluations).query("purpose == 'test'")["iteration"])
+        if not len(rows) or not is_last(rows.iloc[-1], run.config):
+            return False
+        return bool(tested & {rows["iteration"].iloc[-1], best_iteration(folder)})
+    except (KeyError, ValueError, OSError):  # damaged, or being removed
+        return False
+
+
+def check_best(folder: RunFolder, iteration: int, sets: Sequence[str]) -> None:
+    """Raises ValueError unless a run's best policy can be compared with those to come on `sets`."""
+    rows = validation_rows(folder)
+    best = best_iteration(folder)
+    if best is None:
+        if min(rows["iteration"], default=iteration) < iteration:
+            raise ValueError(
+                f"{folder.best} is missing, although {folder.evaluations} has evaluations; restore "
+                "it, or continue with --evaluate-every 0"
+            )
+        return
+    read_policy(folder.best)  # or damage would be noticed only at the end
+    known = rows[rows["iteration"] == best]["task_set"]
+    if best <= iteration and not len(known):
+        raise ValueError(
+            f"{folder.evaluations} lacks the evaluation of iteration {best}, whose policy is in "
+            f"{folder.best}; restore it, or continue with --evaluate-every 0"
+        )
+    if len(known) and not set(known) & set(sets):
+        raise ValueError(
+            f"--sets must include one of {', '.join(known)}, on which the best policy so far was "
+            f"evaluated; got {', '.join(sets)}"
+        )
+
+
+def validation_rows(folder: RunFolder) -> Frame:
+    """Returns the evaluations that select the best policy."""
+    return read_rows(folder.evaluations).query("purpose == 'validation'")
+
+
+def best_iteration(folder: RunFolder) -> int | None:
+    """Returns the iteration of the best policy so far; None if there is none."""
+    return read_arrays(folder.best)[1]["iteration"] if folder.best.is_file() else None
+
+
+def is_better(rows: Frame, iteration: int, best: int | None, own: str) -> bool:
+    """Returns whether an evaluation is better than that of the best iteration so far.
+
+    Compares the mean fractions of validation tasks solved, over the task sets that both have. Base,
+    a single task, counts only if it is the training set `own` or the only set.
+    """
+    solved = rows.assign(share=rows["solved"] / rows["tasks"]).pivot_table(
+        index="task_set", columns="iteration", values="share", aggfunc="last"
+    )
+    if iteration not in solved or best not in solved or iteration == best:
+        return iteration in solved and iteration != best
+    both = solved[[best, iteration]].dropna()
+    ranked = both if own == "base" else both.drop(index="base", errors="ignore")
+    means = (ranked if len(ranked) else both).mean()
+    return bool(means[iteration] > means[best])

@@ -1,0 +1,77 @@
+"""Progress of all runs of a grid: one line that changes on a terminal, else a line a minute."""
+
+import contextlib
+import datetime
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from agents.runs.folder import RunFolder
+from agents.runs.run import Run
+
+REFRESH = 5  # seconds between two readings of the runs' files
+LINE = 60  # seconds between two lines where there is no terminal
+
+
+class Overview(Progress):
+    """Shows the share of all iterations that are done, and the time left.
+
+    A context manager. Reads the runs' files; nothing is drawn in the background.
+    """
+
+    def __init__(self, console: Console, runs: Mapping[Path, Run]):
+        super().__init__(
+            BarColumn(bar_width=12),
+            TextColumn("{task.description}", markup=False),
+            console=console,
+            auto_refresh=False,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self.runs = runs
+        self.add_task("", total=1)
+        self.began = self.shown = time.monotonic()
+        self.share_before = self._share()
+
+    def __enter__(self) -> Self:
+        """Shows the first line."""
+        super().__enter__()
+        self._show()
+        return self
+
+    def show(self) -> None:
+        """Shows the progress if that is due; to be called every second."""
+        if time.monotonic() - self.shown >= (REFRESH if self.console.is_terminal else LINE):
+            self._show()
+
+    def _show(self) -> None:
+        self.shown = time.monotonic()
+        share = self._share()
+        text = f"{share:.0%} of {len(self.runs)} run(s), {self._time_left(share)}"
+        if self.console.is_terminal:
+            self.update(self.task_ids[0], completed=share, description=text, refresh=True)
+        else:
+            self.console.out(text)
+
+    def _share(self) -> float:
+        """Returns the mean share of the iterations that runs may take, which is from 0 to 1."""
+        shares = [_rows(path) / run.config.iterations for path, run in self.runs.items()]
+        return sum(shares) / len(shares)
+
+    def _time_left(self, share: float) -> str:
+        trained = share - self.share_before
+        if trained <= 0:
+            return "time left not known yet"
+        seconds = (self.shown - self.began) * (1 - share) / trained
+        return f"at most {datetime.timedelta(seconds=round(seconds))} left"
+
+
+def _rows(path: Path) -> int:
+    """Counts the iterations in a run's file, which a worker may be writing."""
+    with contextlib.suppress(OSError):
+        return max(0, RunFolder(path).metrics.read_bytes().count(b"\n") - 1)
+    return 0

@@ -1,0 +1,94 @@
+"""Signals end a command with one line and their code, whatever it does, or are deferred."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from trap_tube_jax.interruptions import FINISHING, SIGNALS
+
+PROGRAM = """
+import hashlib, signal
+from trap_tube_jax.interruptions import Stopped, deferring, run_command, stopping
+
+def compute():  # as XLA does: Python's own handlers would wait for its end
+    print("ready", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+
+def main():
+    with stopping(lambda: "Go on like this."):
+        {body}
+
+run_command(main)
+"""
+AT_ONCE = "compute()"
+SAVES = """with deferring() as request:
+            print("ready", flush=True)
+            while not request():
+                pass
+            raise Stopped(request())"""
+NEVER_SAVES = """with deferring():
+            compute()"""
+
+
+def start(body, **options):
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM.format(body=body)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "times", "lines"),
+    [
+        (AT_ONCE, 1, ["Stopped. Go on like this."]),
+        (SAVES, 1, [FINISHING, "Stopped. Go on like this."]),
+        (NEVER_SAVES, 2, [FINISHING, "Stopped. Go on like this."]),
+    ],
+)
+def test_a_signal_ends_a_command_with_one_line_and_its_code(body, times, lines):
+    processes = {number: start(body) for number in SIGNALS}
+    for number, process in processes.items():
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        assert process.stderr is not None
+        errors = ""
+        for _ in range(times):
+            process.send_signal(number)
+            errors += process.stderr.readline()  # equal signals that come together are one
+        errors += process.stderr.read()
+        process.communicate()
+        assert (process.returncode, errors.splitlines()) == (128 + number, lines)
+
+
+def test_ignored_signals_stay_ignored():
+    """As `nohup` ignores that of a closed terminal."""
+    process = start(SAVES, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGHUP)
+    process.send_signal(signal.SIGTERM)
+    process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM
+
+
+def test_outside_a_command_a_second_signal_is_a_keyboard_interrupt():
+    """A notebook goes on after it."""
+    program = """
+import signal
+from trap_tube_jax.interruptions import deferring
+try:
+    with deferring() as request:
+        signal.raise_signal(signal.SIGINT)
+        assert request() == signal.SIGINT
+        signal.raise_signal(signal.SIGINT)
+except KeyboardInterrupt:
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    print("goes on")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert done.stdout == b"goes on\n"

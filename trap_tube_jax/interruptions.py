@@ -1,0 +1,151 @@
+"""Signals that end a command: one line, the exit code 128 + number, and nothing lost.
+
+A signal ends a command at once, whatever it computes, except within `deferring`, which lets it
+finish and save what it has begun.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+# Ctrl-C, the end of a job, a closed terminal, and the warning before the end of a Slurm job.
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
+FINISHING = "Finishing the current iteration; Ctrl-C again stops now."
+SHOW_CURSOR = "\x1b[?25h"  # a progress line hides it
+
+
+class Stopped(Exception):  # noqa: N818  not an error
+    """The program was asked to stop and has saved.
+
+    Attributes:
+      signal: number of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(f"signal {number}")
+        self.signal = number
+
+
+class _Process:
+    """The process's answer to the next signal."""
+
+    def __init__(self) -> None:
+        self.is_command = False  # else the process is somebody's, as a notebook's
+        self.hint: Callable[[], str] = lambda: "The same command starts again."
+        self.deferred: list[list[int]] = []  # by block, the signals received in it
+
+
+_process = _Process()
+
+
+def receive(number: int) -> None:
+    """Does what a signal is to do now; also for an end that is no signal, as of a closed pipe.
+
+    Raises:
+      KeyboardInterrupt: at once is now, and the process is not a command's.
+    """
+    if _process.deferred and not _process.deferred[-1]:
+        _process.deferred[-1].append(number)
+        _write(FINISHING)
+    elif _process.is_command:
+        if sys.stdout is not None and sys.stdout.isatty():
+            _write(SHOW_CURSOR, end="")
+        _write_stopped()
+        os._exit(128 + number)  # else the compiler's threads crash a process that takes leave
+    else:
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def deferring() -> Iterator[Callable[[], int | None]]:
+    """Defers the first signal; a second one is obeyed at once.
+
+    Yields a function that returns the number of the first signal, or None. In a thread other than
+    the main one of a process that is no command's, no signals arrive.
+    """
+    received: list[int] = []
+    _process.deferred.append(received)
+    before = {} if _process.is_command else _handle(lambda number, _: receive(number))
+    try:
+        yield lambda: received[0] if received else None
+    finally:
+        _process.deferred.pop()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def stopping(hint: Callable[[], str]) -> Iterator[None]:
+    """Ends with a line in which `hint` says how to go on, and the exit code 128 + number.
+
+    An empty hint prints no line.
+
+    Raises:
+      SystemExit: `Stopped` or KeyboardInterrupt was raised within.
+    """
+    before, _process.hint = _process.hint, hint
+    try:
+        yield
+    except (Stopped, KeyboardInterrupt) as stopped:
+        _write_stopped()
+        number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT
+        raise SystemExit(128 + number) from None
+    finally:
+        _process.hint = before
+
+
+def run_command(main: Callable[[], Any]) -> None:
+    """Runs the command line that this process is for.
+
+    Signals are read by a thread, since Python's handlers wait for a running compiler or program.
+    """
+    _process.is_command = True
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(reader,), daemon=True).start()
+    _handle(lambda *_: None)  # to the end of the process, which no signal makes a traceback
+    main()
+
+
+def block_signals() -> None:
+    """Keeps signals from this thread and from the processes that it starts."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+
+
+def close_stdout() -> None:
+    """Sends what is still to be printed nowhere, or Python would complain about a closed pipe."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def _watch(reader: int) -> None:
+    while True:
+        for number in os.read(reader, 64):
+            if number in SIGNALS:
+                receive(number)
+
+
+def _handle(handler: Any) -> dict[int, Any]:
+    """Handles the signals that the process does not ignore, as `nohup` asks for SIGHUP.
+
+    Returns the handlers before.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    handled = [n for n in SIGNALS if is_main and signal.getsignal(n) is not signal.SIG_IGN]
+    return {number: signal.signal(number, handler) for number in handled}
+
+
+def _write_stopped() -> None:
+    if hint := _process.hint():
+        _write(f"Stopped. {hint}")
+
+
+def _write(text: str, end: str = "\n") -> None:
+    """Writes to stderr, past Python's buffers, whose locks another thread may hold."""
+    with contextlib.suppress(OSError):
+        os.write(2, (text + end).encode(errors="replace"))
