@@ -9,18 +9,27 @@ from pathlib import Path
 from agents.command_line import option, parse
 from agents.files import write_json
 from agents.profiles import plots
-from agents.profiles.measure import failure_table, profile, success_table
-from agents.profiles.tasks import PARTS, STRENGTHS
+from agents.profiles.measure import (
+    Table,
+    control_table,
+    failure_table,
+    knowledge_table,
+    profile,
+    success_table,
+)
+from agents.profiles.tasks import FIRST_PUSH_PARTS, PARTS, STRENGTHS
 from agents.runs import compilation
 from agents.runs.loading import load
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import run_command
 
+FIGURES = ("success.png", "controls.png")
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Profiles trained agents: success by distance from the base task and by kind of task.
+    """Profiles trained agents: success by kind of task, and knowledge of the trap.
 
     Agents play greedily, one episode a task, on tasks drawn with keys that training never uses.
     Writes profile.csv, provenance.json and, if their parts are measured, success.png and
@@ -28,16 +37,18 @@ class Options:
 
     Attributes:
       runs: runs' folders, files of parameters, or names of shipped agents.
-      output: folder for the files.
-      parts: some of structural, perceptual and both (success by strength), symbolic (by swapped
-        object), kind and plan-length (of the tasks of {P}) and control.
+      output: folder for the files; runs/profile-NAMES if absent. A profile there is replaced.
+      parts: some of structural, perceptual and both (success by strength), symbolic (by the object
+        that is the tool), kind and plan-length (of the tasks of {P}), first-push-p and
+        first-push-pst (towards the exit or away from it, in {P} and {P, St}) and control (from
+        every cell where the agent may start).
       strengths: strengths of the graded transfers, from 0 (base) to 1 (the paper's transfer).
-      tasks: tasks of each strength, each symbolic swap, and {P}.
+      tasks: tasks of each strength, each symbolic swap, {P}, and {P, St}.
       imports: modules to import first, which register names in an agent's settings.
     """
 
     runs: tuple[str, ...]
-    output: Path = Path("runs/profile")
+    output: Path | None = None
     parts: tuple[str, ...] = tuple(PARTS)
     strengths: tuple[float, ...] = STRENGTHS
     tasks: int = 200
@@ -56,17 +67,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "iterations": {name: policy.iteration for name, policy in policies.items()},
         **provenance(),
     }
-    options.output.mkdir(parents=True, exist_ok=True)
+    output = options.output or Path("runs", f"profile-{'+'.join(Path(x).stem for x in policies)}")
+    output.mkdir(parents=True, exist_ok=True)
     found = profile(policies, options.parts, options.strengths, options.tasks)
-    found.to_csv(options.output / "profile.csv", index=False, float_format="%.6g")
-    write_json(options.output / "provenance.json", origin)
+    for figure in FIGURES:  # of an earlier profile
+        (output / figure).unlink(missing_ok=True)
+    found.to_csv(output / "profile.csv", index=False, float_format="%.6g")
+    write_json(output / "provenance.json", origin)
+    _print_tables(found)
     if set(options.parts) & set(plots.PANELS):
-        plots.save_success(found, options.output / "success.png")
+        plots.save_success(found, output / "success.png")
     if "control" in options.parts:
-        plots.save_controls(found, options.output / "controls.png")
-    print(f"Tasks solved, %\n\n{success_table(found).to_string()}\n")
-    print(f"Failed episodes, by last subgoal reached\n\n{failure_table(found).to_string()}\n")
-    print(f"results: {options.output}")
+        plots.save_controls(found, output / "controls.png")
+    print(f"results: {output}")
+
+
+def _print_tables(found: Table) -> None:
+    """Prints the tables of the measured parts."""
+    parts = set(found["part"])
+    tables = {"Failed episodes, by last subgoal reached": failure_table(found)}
+    if parts - set(FIRST_PUSH_PARTS):
+        tables["Tasks solved, % [95 % interval]"] = success_table(found)
+    if "control" in parts:
+        tables["Controls solved directly, % [95 % interval]"] = control_table(found)
+    if parts & set(FIRST_PUSH_PARTS):
+        tables["First pushes where the food could go either way"] = knowledge_table(found)
+    for title, table in tables.items():
+        print(f"{title}\n\n{table.to_string()}\n")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import trap_tube_jax as tt
 from agents.sweeps import figures, tables
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
+from trap_tube_jax.scoring.tasks import label
 
 with needs_extra("pictures"):
     import matplotlib as mpl
@@ -55,6 +56,13 @@ STEPS = {  # of the shortest plan
     8: "let go of the tool",
     11: "reach the food",
 }
+ROWS = (  # of the figure of Table 2
+    "preset best",
+    "PPO + ICM, ours",
+    "PPO + ICM, published",
+    "PPO, ours",
+    "PPO, published",
+)
 SHOWN = slice(2 * CELL, 11 * CELL), slice(0, 10 * CELL)  # of the board, in the six steps
 
 
@@ -69,7 +77,7 @@ def draw_board() -> Figure:
     axis = large.subplots()
     _show(axis, frames[2])
     for name, (cell, text) in NAMES.items():
-        at, to = ((np.array(place)[::-1] + 0.5) * CELL for place in (cell, text))
+        at, to = ((np.array(cells)[::-1] + 0.5) * CELL for cells in (cell, text))
         arrow = {"arrowstyle": "-", "color": "black", "linewidth": 1.2}
         box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "black"}
         axis.annotate(name, at, to, ha="center", arrowprops=arrow, bbox=box)
@@ -97,11 +105,62 @@ def draw_symbolic() -> Figure:
 
 
 def draw_table_2() -> Figure:
-    """Draws success on the sets of Table 2: presets `best` and `paper`, and the paper's agents."""
-    rows = [pd.read_csv(RESULTS / name / "results.csv") for name in ("exp2_best", "exp2_paper")]
-    names = {"ppo": "PPO, ours", "ppo+icm": "PPO + ICM, ours"}
-    tested = tables.reported(pd.concat(rows)).replace(names)
-    return figures.draw_success(tested, {"title": "Trained on {P, St, Sy}", "train_set": "pstsy"})
+    """Draws success on the sets of Table 2: presets `best` and `paper`, and the paper's agents.
+
+    A filled bar is a mean of five seeds, with points or a standard deviation. An open bar is one
+    seed.
+    """
+    best, ours = (_percent_by_set(name) for name in ("exp2_best", "exp2_paper"))
+    seeds = {
+        "preset best": best.loc["best"],
+        "PPO + ICM, ours": ours.loc["ppo+icm"],
+        "PPO, ours": ours.loc["ppo"],
+    }
+    published = {
+        "PPO + ICM, published": tables.PAPER_SUCCESS["PPO + ICM, paper"],
+        "PPO, published": tables.PAPER_SUCCESS["PPO, paper"],
+    }
+    titles = [label(name) for name in tables.PAPER_SETS]
+    figure, axes = figures.make_panels(titles, 4, 1.75, "Trained on {P, St, Sy}")
+    for index, (axis, name) in enumerate(zip(axes, tables.PAPER_SETS, strict=True)):
+        for agent, table in seeds.items():
+            _draw_seeds(axis, ROWS.index(agent), table[name].to_numpy())
+        for agent, (means, deviations) in published.items():
+            _draw_mean(axis, ROWS.index(agent), means[index], deviations[index])
+        axis.set(xlim=(0, 125), xticks=[0, 50, 100], ylim=(len(ROWS) - 0.5, -0.5))
+    axes[0].set_yticks(range(len(ROWS)), ROWS)
+    figure.supxlabel(
+        "test tasks solved, %: mean and five seeds (blue), one seed (open), mean ± SD (grey)",
+        fontsize=10,
+    )
+    return figure
+
+
+def _percent_by_set(record: str) -> Any:
+    """Returns percent solved by algorithm and seed, a column per set."""
+    return tables.by_set(tables.reported(pd.read_csv(RESULTS / record / "results.csv")))
+
+
+def _draw_seeds(axis: Any, row: int, percent: np.ndarray) -> None:
+    """Draws a bar for the mean of several seeds with a point per seed, or an open bar for one."""
+    if len(percent) > 1:
+        axis.barh(row, percent.mean(), color=figures.COLORS[5], height=0.7)
+        points = {"color": figures.COLORS[0], "alpha": 0.7, "markersize": 3}
+        axis.plot(percent, [row] * len(percent), "o", **points)
+    else:
+        axis.barh(row, percent[0], fill=False, edgecolor=figures.COLORS[0], height=0.7)
+    _name_value(axis, row, percent.mean(), percent.max())
+
+
+def _draw_mean(axis: Any, row: int, mean: float, deviation: float) -> None:
+    axis.barh(row, mean, color="#BBBBBB", height=0.7)
+    if mean:
+        axis.errorbar(mean, row, xerr=deviation, color="black", lw=1)
+    _name_value(axis, row, mean, mean + deviation)
+
+
+def _name_value(axis: Any, row: int, percent: float, end: float) -> None:
+    axis.text(end + 3, row, f"{percent:.0f}", va="center", fontsize="x-small")
 
 
 def _show(axis: Any, picture: np.ndarray) -> None:

@@ -5,6 +5,7 @@ import doctest
 import functools
 import importlib.util
 import io
+import json
 import re
 import runpy
 import shlex
@@ -156,6 +157,16 @@ def means(percent: Any) -> str:
     return " | ".join(texts)
 
 
+def icm_base() -> Any:
+    table = pd.read_csv(RESULTS / "leaderboard" / "icm-base.csv").set_index("task_set")
+    return (100 * table["solved"] / table["tasks"])[list(ALL_SETS)]
+
+
+def random_actions() -> list[float]:
+    scores = json.loads((RESULTS / "leaderboard" / "random.json").read_text())
+    return [score["percent"] for score in scores["sets"]]
+
+
 def test_stated_results_are_those_of_the_records():
     """Each number of a table of solved tasks that has a record."""
     best, fast = (percent_solved(name) for name in ("exp2_best", "fast_base"))
@@ -178,6 +189,8 @@ def test_stated_results_are_those_of_the_records():
     repeats = repeats.set_index("task_set")
     shipped = 100 * (repeats["solved"] / repeats["tasks"])[list(ALL_SETS)]
     rows[PROTOCOL].append(f"| {cells(shipped)} | {steps('exp2_motion')[0]:,.0f} |")
+    for row in (icm_base(), random_actions()):
+        rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])
     rows[BEST] += [f"| {seed} | {cells(own)} |" for seed, own in table.iterrows()]
     rows[BEST].append(f"| mean | {cells(table.mean())} |")

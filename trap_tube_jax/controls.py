@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from trap_tube_jax.geometry import bar_cells
 from trap_tube_jax.objects import BOARD_SIZE, GROUND, OBJECT_CHARS
 from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import State, check_state
@@ -110,6 +111,25 @@ def food_outside() -> tuple[State, ...]:
     """
     empty = ("....1111....", "....x..e....", "....x..e....", "....2222....")
     return (_layout(*empty, food=(5, 10)), _layout(*empty, food=(5, 2)))
+
+
+def with_every_start(layout: State) -> State:
+    """Returns a layout once for every cell that the agent can reach by walking, B states.
+
+    The walk leaves the tool where it is. Cells are in reading order. So success on a control is a
+    share of many episodes, not the verdict of one.
+    """
+    from scipy import ndimage  # noqa: PLC0415  importing the environment must stay light
+
+    layout = jax.device_get(layout)
+    is_tool = bar_cells(layout.tool, layout.tool_extent)
+    is_free = (layout.board == GROUND) & ~np.asarray(is_tool)
+    is_free[tuple(layout.food)] = False
+    is_start = np.zeros_like(is_free)
+    is_start[tuple(layout.agent)] = True
+    starts = np.argwhere(ndimage.binary_propagation(is_start, mask=is_free))
+    batch = jax.tree.map(lambda x: np.broadcast_to(x, (len(starts), *np.shape(x))), layout)
+    return batch.replace(agent=starts.astype(np.int32))
 
 
 @dataclasses.dataclass(frozen=True)

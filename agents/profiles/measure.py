@@ -1,27 +1,32 @@
 """Greedy play on the tasks of a profile, as a tidy table, and smaller tables made from it."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import numpy as np
 import pandas as pd
 
+from agents.acting.evaluation import Evaluation
 from agents.acting.policy import Policy
-from agents.profiles.subgoals import SUBGOALS, last_subgoals
-from agents.profiles.tasks import PARTS, STRENGTHS, Part, Sampling
+from agents.profiles.subgoals import SUBGOALS, Cells, last_subgoals, replay, tool_moves
+from agents.profiles.tasks import FIRST_PUSH_PARTS, FIRST_PUSHES, PARTS, STRENGTHS, Part, Sampling
 from agents.runs.evaluator import Evaluator
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
-from trap_tube_jax.solver import solve_batch
+from trap_tube_jax.scoring.knowledge import choice_of_exit, first_push
+from trap_tube_jax.scoring.scores import wilson_interval
+from trap_tube_jax.solver import Plan, solve_batch
+from trap_tube_jax.state import State, take
 
-BIN = 5  # steps, the width of the groups by plan length
+LONG = 100  # steps, twice the paper's limit
+Table = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
 FAILED = [f"failed: {name}" for name in SUBGOALS]
-AGGREGATES = (
-    dict.fromkeys(("tasks", "solved"), "sum")
-    | dict.fromkeys(("steps", "plan", "optimality"), "mean")
-    | dict.fromkeys(FAILED, "sum")
-)
+COUNTS = ["tasks", "solved", "solved_100", "direct", *FAILED]
+MEANS = ["steps", "plan", "optimality"]
+
+_first_push = jax.jit(jax.vmap(first_push))
+_choice_of_exit = jax.jit(jax.vmap(choice_of_exit))
 
 
 def profile(
@@ -29,8 +34,8 @@ def profile(
     parts: Sequence[str] = tuple(PARTS),
     strengths: Sequence[float] = STRENGTHS,
     num_tasks: int = 200,
-) -> pd.DataFrame:
-    """Plays each task of a profile once with each policy, greedily.
+) -> Table:
+    """Plays the tasks of a profile once with each policy, greedily.
 
     Args:
       policies: policies by display name, all with the same number of feature channels.
@@ -39,10 +44,11 @@ def profile(
       num_tasks: tasks of each strength and symbolic swap, and of the other draws from {P}.
 
     Returns:
-      One row per policy, part and level. Columns: the number of tasks and of solved tasks; mean
-      steps and mean optimality (shortest plan / steps) of the solved tasks; mean length of the
-      shortest plan of the solvable tasks; and, for each of `FAILED`, the number of failed episodes
-      that reached this subgoal last.
+      One row per policy, part and level. Columns: the number of tasks, of tasks solved within 50
+      and within 100 steps (`solved`, `solved_100`), and of controls solved directly (`direct`, see
+      `episodes`); mean steps and mean optimality (shortest plan / steps) of the tasks solved
+      within 50; mean length of the shortest plan of the solvable tasks; and, for each of
+      `FAILED`, the number of failed episodes that reached this subgoal last.
 
     Raises:
       ValueError: a setting is not allowed, or the policies differ in feature channels.
@@ -50,59 +56,141 @@ def profile(
     unknown = [part for part in parts if part not in PARTS]
     if unknown or not parts:
         raise ValueError(f"unknown parts {unknown}; allowed: one or more of {', '.join(PARTS)}")
+    if not strengths:
+        raise ValueError(f"no strengths; allowed: one or more from 0 to 1, as in {STRENGTHS}")
     channels = {policy.config.num_features for policy in policies.values()}
     if len(channels) != 1:
         raise ValueError(f"profile policies of one num_features together, got {sorted(channels)}")
     sampling = Sampling(strengths, num_tasks, channels.pop())
     drawn = {part: PARTS[part](sampling) for part in parts}
-    # One call, since parts share tasks and each task is solved once.
-    together = jax.tree.map(lambda *x: np.concatenate(x), *(part.tasks for part in drawn.values()))
-    ends = np.cumsum([len(part.tasks.time) for part in drawn.values()])
-    plans = dict(zip(drawn, np.split(solve_batch(together).length, ends[:-1]), strict=True))
-    episodes = pd.concat([_play(name, policy, drawn, plans) for name, policy in policies.items()])
-    groups = episodes.groupby(["policy", "part", "level"], sort=False)
-    return pd.DataFrame(groups.agg(AGGREGATES)).reset_index()
+    plans = _solve({name: part.tasks for name, part in drawn.items()})
+    played = [_play(policy, drawn, plans).assign(policy=name) for name, policy in policies.items()]
+    groups: Any = pd.concat(played).groupby(["policy", "part", "level"], sort=False)
+    counts = groups[COUNTS].sum(min_count=1)  # a sum without numbers is unknown, not 0
+    return counts.join(groups[MEANS].mean()).reset_index()
 
 
-def success_table(profile: pd.DataFrame) -> pd.DataFrame:
-    """Returns the percentage of tasks solved, a row for each part and level."""
-    shares = profile.assign(percent=100 * profile["solved"] / profile["tasks"])
+def episodes(tasks: State, played: Evaluation, plan: Plan) -> Table:
+    """Describes B episodes of at most 100 steps, a row per episode.
+
+    An episode counts up to its 50th step; the column `solved_100` alone tells what comes later.
+    `choice` is the `choice_of_exit` of the first push. `direct` holds if the task is solved and
+    every push of the food has the direction in which a shortest plan pushes it first. Where this
+    plan pushes nothing, the tool must stay in its initial cell, too.
+    """
+    solved_100 = np.asarray(played.solved)
+    solved = solved_100 & (np.asarray(played.length) <= MAX_STEPS)
+    actions = np.asarray(played.action)[:, :MAX_STEPS]
+    cells = replay(tasks, actions)
+    planned = np.asarray(_first_push(tasks, plan.actions))
+    steps = np.where(solved, played.length, np.nan)
+    subgoals = last_subgoals(tasks, actions, cells)
+    columns = {
+        "tasks": 1,
+        "solved": solved,
+        "solved_100": solved_100,
+        "direct": (solved & is_direct(cells, planned)).astype(float),
+        "choice": _choice_of_exit(tasks, _first_push(tasks, actions)),
+        "steps": steps,
+        "plan": np.where(plan.solvable, plan.length, np.nan),
+        "optimality": plan.length / steps,
+    }
+    failed = {name: ~solved & (subgoals == index) for index, name in enumerate(FAILED)}
+    return pd.DataFrame(columns | failed)
+
+
+def success_table(profile: Table) -> Table:
+    """Returns the percentages of tasks solved, a row for each part and level.
+
+    Has two columns per policy: within 50 steps, with a 95 % interval, and within 100 steps.
+    """
+    rows = profile[~profile["part"].isin(FIRST_PUSH_PARTS)]
+    within_50 = [percent(*row) for row in zip(rows["solved"], rows["tasks"], strict=True)]
+    within_100 = [f"{share:.1f}" for share in 100 * rows["solved_100"] / rows["tasks"]]
+    rows = rows.assign(**{"50 steps": within_50, "100 steps": within_100})
     index = ["part", "level", "tasks"]
-    return shares.pivot_table("percent", index, "policy", sort=False).round(1)
+    table = rows.pivot(index=index, columns="policy", values=["50 steps", "100 steps"])
+    table = table.swaplevel(axis="columns").reindex(rows["policy"].unique(), level=0, axis=1)
+    return table.loc[pd.MultiIndex.from_frame(rows[index].drop_duplicates())]
 
 
-def failure_table(profile: pd.DataFrame) -> pd.DataFrame:
+def control_table(profile: Table) -> Table:
+    """Returns the percentages of controls solved directly, with 95 % intervals."""
+    rows = profile[profile["part"] == "control"]
+    shown = [percent(*row) for row in zip(rows["direct"], rows["tasks"], strict=True)]
+    table = rows.assign(shown=shown).pivot(index="level", columns="policy", values="shown")
+    return table.loc[rows["level"].unique(), rows["policy"].unique()]
+
+
+def knowledge_table(profile: Table) -> Table:
+    """Returns first-push accuracy, a row for each policy and task set.
+
+    Counts the episodes whose first push is a choice between the exit and the other way. Their
+    success within 50 steps stands beside it, for right and for wrong choices.
+    """
+    rows = profile[profile["part"].isin(FIRST_PUSH_PARTS)]
+    found = {}
+    for name, groups in rows.groupby(["policy", "part"], sort=False):
+        counts = groups.set_index("level")[["tasks", "solved"]]
+        counts = counts.reindex([FIRST_PUSHES[1], FIRST_PUSHES[-1]], fill_value=0)
+        (right, right_solved), (wrong, wrong_solved) = counts.to_numpy()
+        found[name] = {
+            "choices": f"{right + wrong:.0f}",
+            "to the exit, %": percent(right, right + wrong),
+            "then solved, %": percent(right_solved, right),
+            "else solved, %": percent(wrong_solved, wrong),
+        }
+    return pd.DataFrame(found).T.rename_axis(["policy", "part"])
+
+
+def failure_table(profile: Table) -> Table:
     """Returns the number of failed episodes of each part, by the last subgoal reached."""
     table = profile.pivot_table(FAILED, ["policy", "part"], aggfunc="sum", sort=False)
     return table.set_axis(list(SUBGOALS), axis="columns")
 
 
-def _play(
-    name: str, policy: Policy, parts: Mapping[str, Part], plans: Mapping[str, np.ndarray]
-) -> pd.DataFrame:
-    """Plays all parts with a policy; returns a row for each episode."""
-    config = dataclasses.replace(policy.config, max_steps=MAX_STEPS)
-    tasks = {part: drawn.tasks for part, drawn in parts.items()}
-    evaluator = Evaluator(config, Suite(tasks, dict.fromkeys(tasks, MAX_STEPS)))
-    frames = []
-    for part, played in evaluator(policy.params).items():
-        tasks, levels = parts[part]
-        solved, plan = np.asarray(played.solved), plans[part]
-        steps = np.where(solved, played.length, np.nan)
-        subgoals = last_subgoals(tasks, np.asarray(played.action))
-        starts = plan // BIN * BIN
-        frame = pd.DataFrame(
-            {
-                "policy": name,
-                "part": part,
-                "level": levels or [f"{start}-{start + BIN - 1}" for start in starts],
-                "tasks": 1,
-                "solved": solved,
-                "steps": steps,
-                "plan": np.where(plan >= 0, plan, np.nan),
-                "optimality": plan / steps,
-                **{column: ~solved & (subgoals == i) for i, column in enumerate(FAILED)},
-            }
-        )
-        frames.append(frame if levels else frame.sort_values("plan"))
-    return pd.concat(frames)
+def percent(successes: float, trials: float) -> str:
+    """Formats a percentage with its 95 % Wilson interval; a single trial has no interval."""
+    if trials < 2:
+        return f"{100 * successes / trials:.0f}" if trials else "-"
+    low, high = wilson_interval(int(successes), int(trials))
+    return f"{100 * successes / trials:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def is_direct(cells: Cells, planned: np.ndarray) -> np.ndarray:
+    """Tests whether B episodes push the food in the direction `planned` i32[B, 2] alone, bool[B].
+
+    Where it is zero, the tool must not move either.
+    """
+    push = np.diff(cells.food, axis=1)
+    has_direction = np.all(push == planned[:, None], axis=-1) | ~np.any(push, axis=-1)
+    is_needed = np.any(planned, axis=1)
+    return np.all(has_direction, axis=1) & (is_needed | ~tool_moves(cells))
+
+
+def _solve(tasks: Mapping[str, State]) -> dict[str, Plan]:
+    """Solves the tasks of all parts in one call, since parts share tasks."""
+    plans = solve_batch(jax.tree.map(lambda *x: np.concatenate(x), *tasks.values()))
+    ends = np.cumsum([len(states.time) for states in tasks.values()])
+    return {
+        name: take(plans, slice(end - len(states.time), end))
+        for (name, states), end in zip(tasks.items(), ends, strict=True)
+    }
+
+
+def _play(policy: Policy, parts: Mapping[str, Part], plans: Mapping[str, Plan]) -> Table:
+    """Plays all parts with a policy; returns a row for each episode, level by level."""
+    suite = Suite({name: part.tasks for name, part in parts.items()}, dict.fromkeys(parts, LONG))
+    evaluator = Evaluator(policy.config, suite)
+    tables = []
+    for name, played in evaluator(policy.params).items():
+        tasks, levels = parts[name]
+        table = episodes(tasks, played, plans[name]).assign(part=name)
+        if name != "control":
+            table["direct"] = np.nan
+        if callable(levels):
+            table = table.assign(level=levels(table)).sort_values("level", kind="stable")
+            tables.append(table.astype({"level": str}))
+        else:
+            tables.append(table.assign(level=levels))
+    return pd.concat(tables)

@@ -1,78 +1,111 @@
 """Figures of a profile, 830 pixels wide as pages show them."""
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 
-from agents.profiles.tasks import PARTS, Sampling
+from agents.profiles.measure import Table
+from agents.profiles.tasks import control_layouts
 from agents.sweeps.figures import COLORS, WIDTH, make_panels
+from trap_tube_jax.objects import GROUND
 from trap_tube_jax.rendering import render
 from trap_tube_jax.scoring.scores import wilson_interval
-from trap_tube_jax.state import take
+from trap_tube_jax.state import State
 
 MARKERS = "osD^vPX"
-PANELS = {  # part, and the label of its x axis
-    "structural": "strength of the structural transfer",
-    "perceptual": "strength of the perceptual transfer",
-    "both": "strength of both transfers",
-    "plan-length": "shortest plan of the task in {P}, steps",
+PANELS = {  # title and label of the x axis, by part
+    "structural": ("Colours: structural transfer", "strength"),
+    "perceptual": ("Layouts: perceptual transfer", "strength"),
+    "both": ("Layouts and colours", "strength of both transfers"),
+    "plan-length": ("{P}, by shortest plan", "steps of the shortest plan"),
 }
-COLUMNS = 7  # in the sheet of controls
+DODGE = 0.012  # of the x axis, between the points of two policies
+COLUMNS = 5  # in the sheet of controls
+CELL = 16  # pixels
 
 
-def save_success(profile: pd.DataFrame, path: Path) -> None:
+def save_success(profile: Table, path: Path) -> None:
     """Draws success by strength of transfer and by plan length as PNG, with 95 % intervals.
 
-    `profile` is that of `measure.profile`, with at least one part of `PANELS`.
+    `profile` is the result of `measure.profile`, with at least one part of `PANELS`.
     """
     parts = [part for part in PANELS if part in set(profile["part"])]
-    figure, axes = make_panels(parts, min(len(parts), 2), 2.9, sharex=False)
-    for axis, part in zip(axes, parts, strict=True):
-        for index, (policy, own) in enumerate(profile.groupby("policy", sort=False)):
-            groups = own.query("part == @part")
-            x = groups["plan"] if part == "plan-length" else groups["level"].astype(float)
-            percent = 100 * groups["solved"] / groups["tasks"]
-            style = {"color": COLORS[index % 7], "marker": MARKERS[index % 7], "label": policy}
-            axis.errorbar(x, percent, _margins(groups), capsize=2, clip_on=False, **style)
-        axis.set(xlabel=PANELS[part], ylim=(0, 100))
-    figure.supylabel("solved, %", fontsize=10)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    figure.savefig(path, format="png")
+    policies = list(profile["policy"].unique())
+    with _plain_style():
+        titles = [PANELS[part][0] for part in parts]
+        figure, axes = make_panels(titles, min(len(parts), 2), 2.9, sharex=False)
+        for axis, part in zip(axes, parts, strict=True):
+            rows = profile[profile["part"] == part]
+            x = rows["plan"] if part == "plan-length" else rows["level"].astype(float)
+            # Policies with equal success would hide each other.
+            shift = np.arange(len(policies)) - (len(policies) - 1) / 2
+            shift = dict(zip(policies, DODGE * np.ptp(x) * shift, strict=True))
+            for index, (name, groups) in enumerate(rows.groupby("policy", sort=False)):
+                percent = 100 * groups["solved"] / groups["tasks"]
+                at = x[groups.index] + shift[name]
+                style = {"color": COLORS[index % 7], "marker": MARKERS[index % 7], "label": name}
+                axis.errorbar(at, percent, _margins(groups), capsize=2, clip_on=False, **style)
+            axis.set(xlabel=PANELS[part][1], ylim=(0, 100))
+        figure.supylabel("solved, %", fontsize=10)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.savefig(path, format="png")
 
 
-def save_controls(profile: pd.DataFrame, path: Path) -> None:
-    """Draws the board of each control as PNG, and below it a heat map of success by policy.
+def save_controls(profile: Table, path: Path) -> None:
+    """Draws the board of each control as PNG, and below it the percentages of each policy.
 
-    `profile` is that of `measure.profile`, with the part "control".
+    `profile` is the result of `measure.profile`, with the part "control".
     """
-    tasks, levels = PARTS["control"](Sampling((), 1, 3))
-    policies = list(dict.fromkeys(profile["policy"]))
-    rows = -(-len(tasks.time) // COLUMNS)
-    height = 0.25 * len(policies)
-    figure = Figure(figsize=(WIDTH, rows * (height + 1.9)), layout="constrained")
-    axes = figure.subplots(2 * rows, COLUMNS, height_ratios=rows * [1.2, height])
-    boards, cells = axes[::2].flatten(), axes[1::2].flatten()
-    for index, level in enumerate(levels or ()):
-        boards[index].imshow(np.asarray(render(take(tasks, index), 16)))
-        boards[index].set_title(level.replace(", ", ",\n"), fontsize="small")
-        groups = profile.query("part == 'control' and level == @level")
-        share = (groups["solved"] / groups["tasks"]).to_numpy()
-        cells[index].imshow(share[:, None], vmin=0, vmax=1, cmap="cividis", aspect="auto")
-        for row, (steps, plan) in enumerate(zip(groups["steps"], groups["plan"], strict=True)):
-            failed = "no plan" if np.isnan(plan) else "fails"
-            text, color = (failed, "white") if np.isnan(steps) else (f"{steps:.0f} steps", "black")
-            cells[index].text(0, row, text, color=color, ha="center", va="center", fontsize="small")
-        names = policies if index % COLUMNS == 0 else [""] * len(policies)
-        cells[index].set_yticks(range(len(policies)), names, fontsize="small")
-        cells[index].tick_params(length=0, labelbottom=False)
-    for axis in boards:
-        axis.set_axis_off()
-    figure.savefig(path, format="png")
+    rows = profile[profile["part"] == "control"]
+    layouts = control_layouts()
+    policies = list(rows["policy"].unique())
+    lines = -(-len(layouts) // COLUMNS)
+    height = 0.22 * len(policies) + 0.1
+    with _plain_style():
+        figure = Figure(figsize=(WIDTH, lines * (height + 1.75)), layout="constrained")
+        axes = figure.subplots(2 * lines, COLUMNS, height_ratios=lines * [1.4, height])
+        boards, cells = axes[::2].flatten(), axes[1::2].flatten()
+        for axis in axes.flat:
+            axis.set_axis_off()
+        for index, (level, state) in enumerate(layouts.items()):
+            boards[index].imshow(_cropped(state))
+            boards[index].set_title(level.replace(", ", ",\n"), fontsize="small")
+            names = policies if index % COLUMNS == 0 else []
+            _draw_percentages(cells[index], rows[rows["level"] == level], names)
+        figure.savefig(path, format="png")
 
 
-def _margins(groups: pd.DataFrame) -> np.ndarray:
+def _draw_percentages(axis: Any, groups: Table, names: list[str]) -> None:
+    """Draws percent solved and direct, a row for each policy; names the rows."""
+    percent = groups[["solved", "direct"]].div(groups["tasks"], axis="index").to_numpy() * 100
+    axis.imshow(percent, vmin=0, vmax=100, cmap="cividis", aspect="auto")
+    for (row, column), value in np.ndenumerate(percent):
+        color = "black" if value > 50 else "white"
+        text = {"color": color, "ha": "center", "va": "center", "fontsize": "small"}
+        axis.text(column, row, f"{value:.0f}", **text)
+    axis.set_axis_on()
+    axis.set_yticks(range(len(names)), names, fontsize="small")
+    axis.set_xticks([0, 1], ["solved", "direct"], fontsize="x-small")
+    axis.tick_params(length=0, pad=1)
+
+
+def _cropped(state: State) -> np.ndarray:
+    """Renders the rows and columns that hold objects, with a margin of one cell."""
+    is_used = np.asarray(state.board) != GROUND
+    for cell in (state.agent, state.food, state.tool, state.tool + state.tool_extent - 1):
+        is_used[tuple(np.asarray(cell))] = True
+    rows, columns = np.nonzero(is_used)
+    top, left = max(rows.min() - 1, 0), max(columns.min() - 1, 0)
+    picture = np.asarray(render(state, CELL))
+    return picture[top * CELL : (rows.max() + 2) * CELL, left * CELL : (columns.max() + 2) * CELL]
+
+
+def _margins(groups: Table) -> np.ndarray:
     """Returns f64[2, G], from percent solved to the ends of their 95 % Wilson intervals.
 
     Groups of a single task have no interval.
@@ -82,3 +115,10 @@ def _margins(groups: pd.DataFrame) -> np.ndarray:
         for solved, tasks in zip(groups["solved"], groups["tasks"], strict=True)
     ]
     return 100 * np.abs(np.transpose(ends) - (groups["solved"] / groups["tasks"]).to_numpy())
+
+
+@contextlib.contextmanager
+def _plain_style() -> Iterator[None]:
+    """Draws under Matplotlib's defaults, and takes names of files with `$` for plain text."""
+    with mpl.rc_context({**mpl.rcParamsDefault, "text.parse_math": False}):
+        yield

@@ -1,5 +1,7 @@
 """The last subgoal that an episode reached."""
 
+from typing import NamedTuple
+
 import jax
 import numpy as np
 from scipy import ndimage
@@ -8,33 +10,54 @@ from trap_tube_jax import dynamics
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
 from trap_tube_jax.state import State
 
-# In the order of a plan. Tool touched: the agent has grasped the tool. Tool moved, food moved: the
-# object has left its initial cell. Food out: the agent could walk to the food without moving the
+# In the order of a plan. Tool touched: the agent has grasped the tool. Tool moved and food moved:
+# the object has left its initial cell. Food out: the agent can walk to the food without moving the
 # tool.
 SUBGOALS = ("none", "tool touched", "tool moved", "food moved", "food out")
 
 _step = jax.jit(jax.vmap(dynamics.step))
 
 
-def last_subgoals(tasks: State, actions: np.ndarray) -> np.ndarray:
-    """Returns i32[B], the index in `SUBGOALS` of the last subgoal that each episode reached.
+class Cells(NamedTuple):
+    """Cells of agent, tool and food in B episodes, i32[B, T + 1, 2] each."""
+
+    agent: np.ndarray
+    tool: np.ndarray
+    food: np.ndarray
+
+
+def replay(tasks: State, actions: np.ndarray) -> Cells:
+    """Replays B episodes.
 
     Args:
       tasks: B states at time 0.
-      actions: i32[B, T, 2], (grasp, move); actions after the end of an episode change nothing.
+      actions: i32[B, T, 2], (grasp, move). Actions after a solution change nothing.
     """
     states = [tasks]
     for action in np.moveaxis(actions, 1, 0):
         states.append(_step(states[-1], action))
-    cells = [np.stack([each.agent, each.tool, each.food]) for each in states]
-    agent, tool, food = np.stack(cells, axis=2)  # i32[B, T + 1, 2] each
+    cells = [np.stack([state.agent, state.tool, state.food]) for state in states]
+    return Cells(*np.stack(cells, axis=2))
+
+
+def tool_moves(cells: Cells) -> np.ndarray:
+    """Tests whether the tool leaves its initial cell, bool[B]."""
+    return (cells.tool != cells.tool[:, :1]).any(axis=(1, 2))
+
+
+def last_subgoals(tasks: State, actions: np.ndarray, cells: Cells) -> np.ndarray:
+    """Returns i32[B], the index in `SUBGOALS` of the last subgoal of B episodes.
+
+    The arguments are those of `replay` and its result.
+    """
+    agent, tool, food = cells
     extent = np.asarray(tasks.tool_extent)[:, None]
     at_hand = _covers(tool[:, :-1], extent, agent[:, :-1] + DIRECTIONS[actions[..., 0]])
     is_inside = _covers(tool[:, :-1], extent, agent[:, :-1])
     reached = [
         np.ones(len(agent), bool),
         (at_hand & ~is_inside).any(axis=1),
-        (tool != tool[:, :1]).any(axis=(1, 2)),
+        tool_moves(cells),
         (food != food[:, :1]).any(axis=(1, 2)),
         _walks_to_food(np.asarray(tasks.board), extent, agent, tool, food).any(axis=1),
     ]
@@ -42,21 +65,21 @@ def last_subgoals(tasks: State, actions: np.ndarray) -> np.ndarray:
 
 
 def _walks_to_food(board: np.ndarray, extent: np.ndarray, *cells: np.ndarray) -> np.ndarray:
-    """Returns bool[B, T]: the agent can walk to the food with the tool left in its place.
+    """Tests whether the agent can walk to the food without moving the tool, bool[B, T].
 
     `board` is u8[B, 12, 12], the tool's `extent` i32[B, 1, 2], and the `cells` of agent, tool and
     food i32[B, T, 2].
     """
-    every = np.moveaxis(np.indices((BOARD_SIZE, BOARD_SIZE)), 0, -1)
+    cell = np.moveaxis(np.indices((BOARD_SIZE, BOARD_SIZE)), 0, -1)
     agent, tool, food = (x[:, :, None, None] for x in cells)
-    is_tool = _covers(tool, extent[:, :, None, None], every)
-    is_food = (every == food).all(axis=-1) & ~is_tool
+    is_tool = _covers(tool, extent[:, :, None, None], cell)
+    is_food = (cell == food).all(axis=-1) & ~is_tool
     is_free = ((board == GROUND)[:, None] & ~is_tool) | is_food
-    start = (every == agent).all(axis=-1)
+    start = (cell == agent).all(axis=-1)
     steps = ndimage.generate_binary_structure(2, 1)[None, None]
     return (ndimage.binary_propagation(start, steps, mask=is_free) & is_food).any(axis=(2, 3))
 
 
 def _covers(corner: np.ndarray, extent: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Returns bool[...]: the tool at `corner` covers `cell`."""
+    """Tests whether the tool at `corner` covers `cell`, bool[...]."""
     return np.all((cell >= corner) & (cell < corner + extent), axis=-1)

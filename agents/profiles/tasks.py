@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
 import trap_tube_jax as tt
-from trap_tube_jax.controls import CONTROLS
+from trap_tube_jax.controls import CONTROLS, with_every_start
 from trap_tube_jax.objects import EXIT, OBJECT_NAMES, TRAP
 from trap_tube_jax.scoring.tasks import fixed_tasks
 from trap_tube_jax.state import State
@@ -20,18 +21,21 @@ from trap_tube_jax.transfers import SYMBOLIC_OBJECTS, Transfer, swap_with_tool
 KEYS = "profile"
 STRENGTHS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 SECOND_LAYOUTS = {"no-trap": "two exits", "two-traps": "other exit", "food-outside": "near"}
+BIN = 5  # steps, the width of the groups by plan length
+FIRST_PUSHES = {1: "to the exit", -1: "away from it", 0: "no choice"}
 
 
 class Part(NamedTuple):
-    """Tasks of a profile, and the group that each is counted in.
+    """Tasks of a profile, and the groups in which their episodes are counted.
 
     Attributes:
       tasks: B states at time 0, as NumPy arrays.
-      levels: B names of groups; None to group by the length of the shortest plan.
+      levels: names of B groups, or a function that names the groups of B episodes, with columns as
+        in `measure.episodes`, in the order of its categories.
     """
 
     tasks: State
-    levels: Sequence[str] | None
+    levels: Sequence[str] | Callable[[Any], pd.Categorical]
 
 
 class Sampling(NamedTuple):
@@ -42,8 +46,20 @@ class Sampling(NamedTuple):
     num_features: int
 
 
+def plan_lengths(episodes: Any) -> pd.Categorical:
+    """Groups B episodes by the length of the task's shortest plan."""
+    starts = (episodes["plan"] // BIN * BIN).astype(int)
+    names = {start: f"{start}-{start + BIN - 1}" for start in sorted(set(starts))}
+    return pd.Categorical(starts.map(names), list(names.values()))
+
+
+def first_pushes(episodes: Any) -> pd.Categorical:
+    """Groups B episodes by the choice of their first push."""
+    return pd.Categorical(episodes["choice"].map(FIRST_PUSHES), list(FIRST_PUSHES.values()))
+
+
 def layout_kinds(tasks: State) -> list[str]:
-    """Names how food and tool are placed in each of B tasks of {P}.
+    """Names the arrangement of food and tool in B tasks of {P}.
 
     The food leaves the tube "away" from the agent, "towards" the agent or "sideways"; the tool
     points "along" this direction or "across" it.
@@ -77,20 +93,32 @@ def _symbolic(sampling: Sampling) -> Part:
     return _join({OBJECT_NAMES[code]: swap(tasks, jnp.asarray(code)) for code in SYMBOLIC_OBJECTS})
 
 
-def _perceptual(levels: Callable[[State], Sequence[str] | None], sampling: Sampling) -> Part:
+def _kind(sampling: Sampling) -> Part:
     tasks = _draw((tt.perceptual,), sampling)
-    return Part(tasks, levels(tasks))
+    return Part(tasks, layout_kinds(tasks))
 
 
-def _control(sampling: Sampling) -> Part:
-    palette = jnp.asarray(tt.base_palette(sampling.num_features))
-    made = {"base": _draw((), sampling)}
+def _grouped(
+    transfers: Sequence[Transfer], levels: Callable[[Any], pd.Categorical], sampling: Sampling
+) -> Part:
+    return Part(_draw(transfers, sampling), levels)
+
+
+def control_layouts(num_features: int = 3) -> dict[str, State]:
+    """Returns the base task and the layouts of all controls, by name and in base colours."""
+    base = tt.base_state(num_features)
+    made = {"base": base}
     for layouts in CONTROLS:
         short = layouts.__name__.replace("_", "-")
         names = (short, f"{short}, {SECOND_LAYOUTS.get(short)}")
         for name, state in zip(names, layouts(), strict=False):
-            made[name] = jax.tree.map(lambda x: x[None], state.replace(palette=palette))
-    return _join(made)
+            made[name] = state.replace(palette=base.palette)
+    return made
+
+
+def _control(sampling: Sampling) -> Part:
+    layouts = control_layouts(sampling.num_features)
+    return _join({name: with_every_start(state) for name, state in layouts.items()})
 
 
 PARTS: dict[str, Callable[[Sampling], Part]] = {
@@ -98,10 +126,13 @@ PARTS: dict[str, Callable[[Sampling], Part]] = {
     "perceptual": partial(_graded, (tt.graded_perceptual,)),
     "both": partial(_graded, (tt.graded_perceptual, tt.graded_structural)),
     "symbolic": _symbolic,
-    "kind": partial(_perceptual, layout_kinds),
-    "plan-length": partial(_perceptual, lambda tasks: None),
+    "kind": _kind,
+    "plan-length": partial(_grouped, (tt.perceptual,), plan_lengths),
+    "first-push-p": partial(_grouped, (tt.perceptual,), first_pushes),
+    "first-push-pst": partial(_grouped, (tt.perceptual, tt.structural), first_pushes),
     "control": _control,
 }
+FIRST_PUSH_PARTS = ("first-push-p", "first-push-pst")
 
 
 def _draw(transfers: Sequence[Transfer], sampling: Sampling) -> State:

@@ -2,32 +2,52 @@
 
 import json
 
+import jax
 import pandas as pd
 import pytest
 from PIL import Image
 
 from agents import profile
 from agents.pretrained import FOLDER
+from agents.profiles import plots, tasks
 
 
-def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
-    source = str(FOLDER / "fast-base.safetensors")
-    out = tmp_path / "out"
-    options = f"--parts structural control --strengths 0 1 --tasks 2 --output {out}"
+@pytest.fixture
+def one_start(monkeypatch):
+    """Plays controls from one cell, since solving them from all takes long."""
+    monkeypatch.setattr(
+        tasks, "with_every_start", lambda state: jax.tree.map(lambda x: x[None], state)
+    )
+
+
+@pytest.mark.usefixtures("one_start")
+def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monkeypatch, capsys):
+    # A name that Matplotlib would take for mathematics.
+    source = tmp_path / r"$\frac{$.safetensors"
+    source.write_bytes((FOLDER / "fast-base.safetensors").read_bytes())
+    monkeypatch.chdir(tmp_path)
+    options = "--parts structural first-push-p control --strengths 0 1 --tasks 2"
+    arguments = ["fast-base", str(source), *options.split()]
+    out = tmp_path / "runs" / f"profile-fast-base+{source.stem}"
+    out.mkdir(parents=True)
+    (out / "success.png").write_text("of an earlier profile")
 
     def refuse(*values):
-        assert len(list(out.iterdir())) == 4
-        raise RuntimeError("the terminal is gone")
+        raise OSError("no drawing today")
 
-    monkeypatch.setattr("builtins.print", refuse)
-    with pytest.raises(RuntimeError, match="terminal"):
-        profile.main(["fast-base", source, *options.split()])
+    with monkeypatch.context() as patch:
+        patch.setattr(plots, "save_success", refuse)
+        with pytest.raises(SystemExit):
+            profile.main(arguments)
+    assert {path.name for path in out.iterdir()} == {"profile.csv", "provenance.json"}
+    assert "Controls solved directly" in capsys.readouterr().out
+    profile.main(arguments)
     table = pd.read_csv(out / "profile.csv")
     one, two = (group.drop(columns="policy") for _, group in table.groupby("policy", sort=False))
     pd.testing.assert_frame_equal(one.reset_index(drop=True), two.reset_index(drop=True))
-    assert list(table["policy"].unique()) == ["fast-base", source]
+    assert list(table["policy"].unique()) == ["fast-base", str(source)]
     assert json.loads((out / "provenance.json").read_text())["command"].endswith(options)
-    for name in ("success.png", "controls.png"):
+    for name in profile.FIGURES:
         with Image.open(out / name) as picture:
             assert picture.width == 830
 
@@ -39,7 +59,9 @@ def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
         (["fast-base", "--import", "no.such"], "no.such"),
         (["fast-base", "--tasks", "0"], "evaluation tasks must be"),
         (["fast-base", "--parts", "swaps"], "allowed: one or more of structural, perceptual"),
+        (["fast-base", "--parts"], "allowed: one or more of structural, perceptual"),
         (["fast-base", "--strengths", "1.5"], "strength must be a number from 0 to 1"),
+        (["fast-base", "--strengths"], "allowed: one or more from 0 to 1"),
     ],
 )
 def test_the_command_line_refuses(arguments, message, capsys, tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 
 import trap_tube_jax as tt
 from easy import rows
-from trap_tube_jax.controls import CONTROLS, LayoutDraw
+from trap_tube_jax.controls import CONTROLS, LayoutDraw, food_outside, with_every_start
 from trap_tube_jax.solver.search import replay
 
 PAGE = pathlib.Path(tt.__file__).parent / "controls.md"
@@ -50,6 +50,20 @@ def test_the_turned_trap_makes_the_other_way_longer():
     board = np.asarray(state.board).copy()
     board[5:7, 7] = tt.base_state().board[4, 4]
     assert tt.solve(state.replace(board=jax.numpy.asarray(board))).length == 16
+
+
+def test_agents_start_from_every_cell_that_they_can_walk_to():
+    """Ground without tool and food, outside the tube, which no agent can enter."""
+    for state in (tt.base_state(), *food_outside()):
+        batch = with_every_start(state)
+        starts = set(map(tuple, np.asarray(batch.agent).tolist()))
+        cells = set(itertools.product(range(12), repeat=2))
+        tube = set(itertools.product(range(4, 8), repeat=2))
+        tool = set(itertools.product(range(4, 8), [1]))
+        assert starts == cells - tube - tool - {tuple(np.asarray(state.food).tolist())}
+        assert all(
+            tt.validate(rows(batch, i)).replace(agent=state.agent) == state for i in range(3)
+        )
 
 
 def test_ids_and_labels_are_those_of_the_functions():

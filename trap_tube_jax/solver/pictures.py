@@ -81,8 +81,8 @@ def _draw_distances(axis: Axes, state: State, steps: np.ndarray, scale: Normaliz
     axis.imshow(np.asarray(render(state, CELL_SIZE)), extent=extent)
     shown = np.ma.masked_less(steps, 0)
     shown[tuple(np.asarray(state.agent))] = np.ma.masked  # keeps the agent visible
-    axis.imshow(shown, norm=scale, cmap="viridis_r", extent=extent, alpha=0.8)
+    axis.imshow(shown, norm=scale, cmap="viridis_r", extent=extent)
     for row, column in np.argwhere(~np.ma.getmaskarray(shown)):
         value = steps[row, column]
-        color = "white" if scale(value) > 0.5 else "black"
-        axis.text(column, row, str(value), color=color, ha="center", va="center", fontsize=7)
+        text = axis.text(column, row, str(value), ha="center", va="center", fontsize=8)
+        text.set(color="white" if scale(value) > 0.5 else "black", fontweight="bold")

@@ -2,11 +2,31 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pandas as pd
 import pytest
 
+import trap_tube_jax as tt
 from agents import load
-from agents.profiles.measure import FAILED, failure_table, profile, success_table
+from agents.acting.evaluation import Evaluation
+from agents.profiles import tasks
+from agents.profiles.measure import (
+    FAILED,
+    control_table,
+    episodes,
+    failure_table,
+    is_direct,
+    knowledge_table,
+    profile,
+    success_table,
+)
+from agents.profiles.subgoals import Cells
+from agents.profiles.tasks import first_pushes, plan_lengths
+from trap_tube_jax.controls import food_outside, trap_turned
+
+UP, DOWN, LEFT, RIGHT = range(4)
 
 
 @pytest.fixture(scope="module")
@@ -14,10 +34,16 @@ def policy():
     return load("fast-base")
 
 
+def batch_of_one(state):
+    return jax.tree.map(lambda x: np.asarray(x)[None], state)
+
+
 @pytest.fixture(scope="module")
 def measured(policy):
-    parts = ("structural", "kind", "plan-length", "control")
-    return profile({"mine": policy}, parts, (0.0, 1.0), 6)
+    parts = ("structural", "kind", "plan-length", "first-push-p", "control")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tasks, "with_every_start", batch_of_one)  # solving all starts takes long
+        return profile({"mine": policy}, parts, (0.0, 1.0), 6)
 
 
 def row(table, part, level):
@@ -26,7 +52,10 @@ def row(table, part, level):
 
 def test_each_episode_is_solved_or_failed_after_one_last_subgoal(measured):
     assert (measured["solved"] + measured[FAILED].sum(axis=1) == measured["tasks"]).all()
-    assert measured.groupby("part", sort=False)["tasks"].sum().tolist() == [7, 6, 6, 14]
+    assert measured.groupby("part", sort=False)["tasks"].sum().tolist() == [7, 6, 6, 6, 14]
+    is_control = measured["part"] == "control"
+    assert (measured["direct"].notna() == is_control).all()
+    assert (measured["solved"] <= measured["solved_100"]).all()
 
 
 def test_means_are_of_the_solved_tasks(measured):
@@ -46,6 +75,49 @@ def test_groups_by_plan_length_rise_and_hold_their_lengths(measured):
         assert low <= plan <= high == low + 4
 
 
+RIGHTWARD = [(UP, UP), *[(UP, RIGHT)] * 6, (DOWN, RIGHT), *[(UP, UP)] * 3]
+
+
+@pytest.mark.parametrize(
+    ("state", "actions", "length", "expected"),
+    [
+        # The shortest plan pushes to the right.
+        (trap_turned()[0], RIGHTWARD, 11, (1, 1, 1)),
+        (trap_turned()[0], RIGHTWARD, 51, (0, 1, 0)),
+        # Food in reach: a plan that leaves the tool where it is, and one that moves it first.
+        (food_outside()[1], [(UP, DOWN), (UP, UP)], 2, (1, 1, 1)),
+        (food_outside()[1], [(UP, UP), (UP, UP)], 2, (1, 1, 0)),
+    ],
+)
+def test_solutions_within_50_and_100_steps_and_direct_ones(state, actions, length, expected):
+    task = batch_of_one(state)
+    played = Evaluation(
+        solved=jnp.array([True]),
+        length=jnp.array([length]),
+        action=jnp.array([actions + [(DOWN, DOWN)] * (100 - len(actions))]),
+        value=jnp.zeros((1, 100)),
+    )
+    row = episodes(task, played, tt.solve_batch(task)).iloc[0]
+    assert tuple(row[["solved", "solved_100", "direct"]]) == expected
+
+
+def test_a_push_against_the_planned_direction_is_not_direct():
+    food = np.array([[[5, 5], [5, 5], [5, 6]], [[5, 5], [5, 4], [5, 5]], [[5, 5]] * 3])
+    tool = np.array([[[4, 1], [4, 2], [4, 2]]] * 2 + [[[4, 1]] * 3])
+    cells = Cells(agent=food, tool=tool, food=food)
+    planned = np.array([(0, 1)] * 3)
+    assert is_direct(cells, planned).tolist() == [True, False, True]
+    assert is_direct(cells, 0 * planned).tolist() == [False, False, True]
+
+
+def test_episodes_are_grouped_by_plan_length_and_by_first_push():
+    table = pd.DataFrame({"plan": [11.0, 9.0, 10.0], "choice": [0, -1, 1]})
+    lengths, pushes = plan_lengths(table), first_pushes(table)
+    assert list(lengths) == ["10-14", "5-9", "10-14"]
+    assert list(lengths.categories) == ["5-9", "10-14"]
+    assert list(pushes) == ["no choice", "away from it", "to the exit"]
+
+
 def test_policies_that_see_different_features_are_refused(policy):
     other = policy.replace(config=dataclasses.replace(policy.config, num_features=1))
     with pytest.raises(ValueError, match=r"one num_features together, got \[1, 3\]"):
@@ -54,16 +126,32 @@ def test_policies_that_see_different_features_are_refused(policy):
 
 def test_tables_have_a_column_for_each_policy_and_subgoal():
     rows = [
-        {"policy": policy, "part": "kind", "level": level, "tasks": 4, "solved": solved}
+        {"policy": policy, "part": "control", "level": level, "tasks": 4, "solved": solved}
         | dict.fromkeys(FAILED, 0)
-        | {"failed: none": 4 - solved}
+        | {"solved_100": 4, "direct": 1.0, "failed: none": 4 - solved}
         for policy, counts in {"b": (1, 2), "a": (3, 4)}.items()
         for level, solved in zip(("y", "x"), counts, strict=True)
     ]
-    success = success_table(pd.DataFrame(rows))
+    table = pd.DataFrame(rows)
+    success = success_table(table)
+    assert list(success.columns) == [(p, f"{n} steps") for p in "ba" for n in (50, 100)]
     assert success.reset_index().to_numpy().tolist() == [
-        ["kind", "y", 4, 25.0, 75.0],
-        ["kind", "x", 4, 50.0, 100.0],
+        ["control", "y", 4, "25.0 [5, 70]", "100.0", "75.0 [30, 95]", "100.0"],
+        ["control", "x", 4, "50.0 [15, 85]", "100.0", "100.0 [51, 100]", "100.0"],
     ]
-    assert list(success.columns) == ["b", "a"]
-    assert failure_table(pd.DataFrame(rows))["none"].tolist() == [5, 1]
+    assert control_table(table).to_numpy().tolist() == [["25.0 [5, 70]"] * 2] * 2
+    assert failure_table(table)["none"].tolist() == [5, 1]
+
+
+def test_knowledge_is_the_share_of_choices_that_were_right():
+    counts = {"to the exit": (110, 109), "away from it": (123, 100), "no choice": (767, 700)}
+    rows = [
+        {"policy": "a", "part": "first-push-p", "level": level, "tasks": tasks, "solved": solved}
+        for level, (tasks, solved) in counts.items()
+    ]
+    rows.append(rows[-1] | {"policy": "b"})
+    table = knowledge_table(pd.DataFrame(rows))
+    assert table.to_numpy().tolist() == [
+        ["233", "47.2 [41, 54]", "99.1 [95, 100]", "81.3 [74, 87]"],
+        ["0", "-", "-", "-"],
+    ]

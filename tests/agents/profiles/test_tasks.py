@@ -34,16 +34,18 @@ def test_transfers_change_layout_or_colours_and_draw_alike_in_all_parts():
     assert same(perceptual, both, *LAYOUT)
     assert same(level("symbolic", "tool"), both, *LAYOUT, "palette")
     assert not same(level("symbolic", "trap"), both, *LAYOUT)
-    for part in ("kind", "plan-length"):
-        assert same(PARTS[part](SAMPLING).tasks, perceptual, *LAYOUT)
+    for part in ("kind", "plan-length", "first-push-p"):
+        assert same(PARTS[part](SAMPLING).tasks, perceptual, *LAYOUT, "palette")
+    assert same(PARTS["first-push-pst"](SAMPLING).tasks, both, *LAYOUT, "palette")
 
 
 def test_controls_have_the_layouts_of_the_registered_sets_in_base_colours():
     tasks, levels = PARTS["control"](SAMPLING)
-    assert len(tasks.time) == len(set(levels or ())) == 14
+    names = set(np.asarray(levels).tolist())
+    assert len(names) == 14
     sets = {"base", *(entry.short for entry in tt.CONTROL_TASK_SETS)}
-    assert {level.split(",")[0] for level in levels or ()} == sets
-    assert all(np.array_equal(each, tt.base_palette()) for each in tasks.palette)
+    assert {name.split(",")[0] for name in names} == sets
+    assert all(np.array_equal(palette, tt.base_palette()) for palette in tasks.palette)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,69 @@
+"""First pushes on hand-made boards."""
+
+import jax
+import numpy as np
+import pytest
+
+import trap_tube_jax as tt
+from trap_tube_jax.scoring.knowledge import choice_of_exit, first_push
+
+UP, DOWN, LEFT, RIGHT = range(4)
+# The tool is above the food's column. The agent is above the tool and carries it by grasping down.
+DOWNWARD, LEFTWARD, RIGHTWARD = (DOWN, DOWN), (DOWN, LEFT), (DOWN, RIGHT)
+NONE = (0, 0)
+
+
+def task(line, food=6):
+    """Builds a tube whose inside and ends are `line`, with a tool above it."""
+    rows = ["." * 12] * 5 + ["..11111111..", line, "..22222222..", *["." * 12] * 4]
+    return tt.State.from_ascii(
+        rows, agent=(1, food), tool=(2, food), tool_extent=(3, 1), food=(6, food)
+    )
+
+
+LEFT_OF_FOOD = [LEFTWARD, DOWNWARD, DOWNWARD]
+RIGHT_OF_FOOD = [RIGHTWARD, DOWNWARD, DOWNWARD]
+
+
+@pytest.mark.parametrize(
+    ("line", "actions", "push", "choice"),
+    [
+        ("..x......e..", [*LEFT_OF_FOOD, RIGHTWARD], (0, 1), 1),
+        ("..x......e..", [*RIGHT_OF_FOOD, LEFTWARD], (0, -1), -1),
+        ("..e......x..", [*RIGHT_OF_FOOD, LEFTWARD], (0, -1), 1),
+        # Later pushes do not count.
+        ("..x......e..", [*RIGHT_OF_FOOD, LEFTWARD, *[RIGHTWARD] * 2], (0, -1), -1),
+        ("..x......e..", LEFT_OF_FOOD, NONE, 0),  # the tool is beside the food
+        ("..x......e..", [DOWNWARD], NONE, 0),  # the wall is below the food
+        # The trap is next to the food, so that the tool can push it one way only.
+        (".....x...e..", [*LEFT_OF_FOOD, RIGHTWARD], (0, 1), 0),
+        (".....e...x..", [*RIGHT_OF_FOOD, LEFTWARD], (0, -1), 1),  # the exit lets it pass
+        ("..e......e..", [*LEFT_OF_FOOD, RIGHTWARD], (0, 1), 0),  # both ways are right
+        ("..x......x..", [*LEFT_OF_FOOD, RIGHTWARD], (0, 1), 0),  # neither is
+        ("..x.....xe..", [*LEFT_OF_FOOD, RIGHTWARD], (0, 1), 0),  # a trap is before the exit
+        ("..........e.", [*LEFT_OF_FOOD, RIGHTWARD], (0, 1), 1),  # the other way ends nowhere
+    ],
+)
+def test_first_push_and_whether_it_chose_the_exit(line, actions, push, choice):
+    found = first_push(task(line), np.array(actions))
+    assert tuple(found.tolist()) == push
+    assert choice_of_exit(task(line), found) == choice
+
+
+def test_a_push_towards_a_side_of_the_tube_is_no_choice():
+    tube = ["....1111....", "....x..e....", "....xF.e....", "....2222...."]
+    rows = [*["." * 12] * 4, *tube, *["." * 12] * 4]
+    state = tt.State.from_ascii(rows, agent=(10, 5), tool=(7, 5), tool_extent=(3, 1))
+    push = first_push(state, np.array([(UP, UP)]))
+    assert push.tolist() == [-1, 0]
+    assert choice_of_exit(state, push) == 0
+
+
+def test_an_episode_of_the_base_task_may_be_batched():
+    """The trap is next to the food, so the shortest plan makes no choice."""
+    state = tt.base_state()
+    plan = tt.solve(state)
+    batch = jax.tree.map(lambda x: x[None], state)
+    push = jax.vmap(first_push)(batch, plan.actions[None])
+    assert push.tolist() == [[0, 1]]
+    assert jax.vmap(choice_of_exit)(batch, push).tolist() == [0]

@@ -1,0 +1,63 @@
+"""First pushes of the food, which show whether an agent tells the exit from the trap.
+
+Source: protocol.md, "Knowledge of the trap".
+"""
+
+import jax
+import jax.numpy as jnp
+
+from trap_tube_jax import dynamics
+from trap_tube_jax.dynamics import static_object
+from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND
+from trap_tube_jax.state import State
+
+
+def first_push(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
+    """Returns the first displacement of the food in an episode, i32[2]; zeros without a push.
+
+    Unbatched; vmap it.
+
+    Args:
+      task: the state at time 0.
+      actions: integer[T, 2], (grasp, move). Actions after a solution change nothing.
+    """
+
+    def step(state: State, action: jax.Array) -> tuple[State, jax.Array]:
+        state = dynamics.step(state, action)
+        return state, state.food - task.food
+
+    start = jax.tree.map(jnp.asarray, task)
+    _, displacement = jax.lax.scan(step, start, jnp.asarray(actions))
+    return displacement[jnp.argmax(jnp.any(displacement != 0, axis=-1))]
+
+
+def choice_of_exit(task: State, push: jax.typing.ArrayLike) -> jax.Array:
+    """Tests whether a first push chose the exit, where the food could have gone the other way.
+
+    A push is a choice if static objects let the food move one cell forward or one cell backward,
+    and exactly one of these ways leads straight to an exit. Unbatched; vmap it.
+
+    Args:
+      task: the state at time 0.
+      push: i32[2], as `first_push` returns it.
+
+    Returns:
+      i32[]: 1 for a choice towards the exit, -1 for a choice away from it, and 0 if the push is
+      no choice or there is none.
+    """
+    push = jnp.asarray(push)
+    can_move = _can_move(task, push) & _can_move(task, -push)
+    forward, backward = _leads_to_exit(task, push), _leads_to_exit(task, -push)
+    return jnp.where(can_move, forward.astype(jnp.int32) - backward.astype(jnp.int32), 0)
+
+
+def _can_move(task: State, way: jax.Array) -> jax.Array:
+    code = static_object(task.board, task.food + way)
+    return (code == GROUND) | (code == EXIT)
+
+
+def _leads_to_exit(task: State, way: jax.Array) -> jax.Array:
+    """Tests whether the first object other than ground from the food on is an exit."""
+    cells = task.food[None] + jnp.arange(1, BOARD_SIZE)[:, None] * way[None]
+    codes = jax.vmap(static_object, in_axes=(None, 0))(task.board, cells)
+    return codes[jnp.argmax(codes != GROUND)] == EXIT
