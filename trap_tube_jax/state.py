@@ -3,7 +3,7 @@
 Source: environment.md, "Board and objects" and "Base task".
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Self, TypeVar
 
 import jax
@@ -200,6 +200,11 @@ def base_state(num_features: int = 3) -> State:
 def take(batch: Record, index: Any) -> Record:
     """Indexes the first axis of a tree of arrays with an integer, a slice or integers."""
     return jax.tree.map(lambda field: field[index], batch)
+
+
+def concatenated(batches: Iterable[Record]) -> Record:
+    """Joins trees of arrays along the first axis; returns NumPy arrays."""
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *batches)
 
 
 def validate(state: State) -> State:

@@ -183,7 +183,8 @@ def test_batches_reset_again_under_any_kind_of_key_and_use_none_twice():
     def observations():
         envs = TrapTubeVectorEnv("p", 2)
         envs.reset(seed=3)
-        again, mask = envs.reset()[0], np.array([True, False])
+        again = envs.reset()[0]
+        mask = np.array([True, False])
         return [again, envs.reset(seed=[None, 5])[0], envs.reset(options={"reset_mask": mask})[0]]
 
     expected = observations()
@@ -296,7 +297,8 @@ def test_refused_arguments(options, message):
 
 
 def test_refused_actions(easy_env):
-    flat, pairs = TrapTubeEnv(easy_env, flat_actions=True), TrapTubeVectorEnv(easy_env, 2)
+    flat = TrapTubeEnv(easy_env, flat_actions=True)
+    pairs = TrapTubeVectorEnv(easy_env, 2)
     for env, allowed, refused in (
         (flat, 0, [(action, "actions must") for action in (16, -1, 1.5, [0, 1], "up")]),
         (

@@ -65,7 +65,8 @@ def test_five_values_are_those_of_the_environment_below(easy, easy_env):
 
 def test_the_limit_changes_without_compiling_again(easy):
     env, params = easy
-    key, ends = jax.random.key(0), []
+    key = jax.random.key(0)
+    ends = []
     for limit in (2, 3):
         params = params.replace(max_steps_in_episode=limit)
         _, state = env.reset(key, params)

@@ -29,7 +29,8 @@ ACTIONS = np.random.default_rng(0).integers(0, 4, (6, SIZE, 2), np.int32)
 def test_next_step_spends_a_step_on_the_reset():
     # Fewer at a time than end together, so that the resets take more than one round.
     batch = NextStepVectorEnvironment(tt.Environment((wander,), max_steps=4), chunk_size=8)
-    reset, step = jax.jit(batch.reset), jax.jit(batch.step)
+    reset = jax.jit(batch.reset)
+    step = jax.jit(batch.step)
     state, _ = reset(jax.random.split(jax.random.key(0), SIZE))
     old = slice(1, None, 2)
     inner = state.episodes.inner

@@ -29,10 +29,12 @@ def _outcome_code(start: tt.State, agent, tool, food, action) -> jax.Array:
     state = start.replace(agent=agent, tool=tool, food=food)
     after, timestep = ENV.step(state, action)
     by = jnp.asarray(spec.DIRECTIONS, jnp.int32)[action[1]]
-    code, possible = timestep.terminated.astype(jnp.uint8), ~timestep.truncated
+    code = timestep.terminated.astype(jnp.uint8)
+    possible = ~timestep.truncated
     for name in ("agent", "tool", "food"):
         moved, explained = _moved(getattr(state, name), getattr(after, name), by)
-        code, possible = 2 * code + moved, possible & explained
+        code = 2 * code + moved
+        possible = possible & explained
     possible &= (timestep.reward == timestep.terminated) & (after.time == 1)
     for name in ("board", "palette", "tool_extent"):
         possible &= jnp.all(getattr(after, name) == getattr(start, name))

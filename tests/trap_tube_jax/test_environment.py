@@ -17,7 +17,9 @@ from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 OPTIMISED = False  # few steps
 SETS = ("base", "sy", "pstsy")  # the first draws one task, the second five
-BATCH, STEPS, LIMIT = 4096, 4, 3
+BATCH = 4096
+STEPS = 4
+LIMIT = 3
 
 
 class Pace(NamedTuple):
@@ -108,7 +110,8 @@ def test_reset_starts_an_episode(modes):
 
 
 def test_episodes_end_at_the_limit_and_stay_ended(modes):
-    timestep, state = modes.vmapped.timestep, modes.vmapped.state
+    timestep = modes.vmapped.timestep
+    state = modes.vmapped.state
     solved = np.asarray(timestep.terminated)
     at_limit = np.arange(STEPS + 1) >= LIMIT
     np.testing.assert_array_equal(timestep.truncated, at_limit & ~solved)
@@ -138,7 +141,8 @@ OVER = EASY.replace(time=jnp.int32(1), truncated=jnp.array(True))
 def test_an_episode_ends_by_success_or_at_its_limit_and_stays_ended(state, actions, expected):
     step = jax.jit(tt.Environment(base=EASY, max_steps=2).step)
     for action, numbers in zip(actions, expected, strict=True):
-        before, (state, timestep) = state, step(state, action)
+        before = state
+        (state, timestep) = step(state, action)
         flags = (timestep.terminated, timestep.truncated)
         assert (timestep.reward, *flags, timestep.discount) == numbers
         if before.terminated | before.truncated:
@@ -177,8 +181,10 @@ def test_an_environment_keeps_its_base_when_the_callers_changes():
 
 
 def test_states_of_numpy_arrays_serve_under_vmap_and_jit():
-    env, state = tt.make("base"), tt.base_state()
-    host, actions = jax.device_get(state), jnp.array([[0, 3], [0, 1]])
+    env = tt.make("base")
+    state = tt.base_state()
+    host = jax.device_get(state)
+    actions = jnp.array([[0, 3], [0, 1]])
     keys = jax.random.split(jax.random.key(0), 2)
     for function, batch in ((env.step, actions), (lambda s, key: tt.symbolic(key, s), keys)):
         expected = jax.vmap(function, (None, 0))(state, batch)
@@ -342,7 +348,8 @@ def test_step_refuses(action, words):
         assert_refused(words, vector.step, state, np.stack([np.zeros_like(action), action]))
 
 
-KEY, ACTION = jax.random.key(0), np.zeros(2, np.int32)
+KEY = jax.random.key(0)
+ACTION = np.zeros(2, np.int32)
 STYLES: dict[str, Any] = {
     "Gymnasium's reset": lambda env, state: env.reset(),
     "Gymnasium's reset with a seed": lambda env, state: env.reset(seed=3),

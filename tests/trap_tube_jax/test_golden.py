@@ -13,7 +13,8 @@ import trap_tube_jax as tt
 from paths import DATA
 
 RECORDING = DATA / "reference_traces.npz"
-EPISODES, TRANSITIONS = 1960, 89_894
+EPISODES = 1960
+TRANSITIONS = 89_894
 
 
 class Replay(NamedTuple):
@@ -72,7 +73,8 @@ def test_positions_rewards_and_flags(recorded, replay):
     for thing in ("agent", "tool", "food"):
         replayed = getattr(replay.state, thing)[within]
         np.testing.assert_array_equal(replayed, recorded[thing][:, 1:][within], err_msg=thing)
-    timestep, reward = replay.timestep, recorded["reward"][within]
+    timestep = replay.timestep
+    reward = recorded["reward"][within]
     np.testing.assert_array_equal(timestep.reward[within], reward)
     assert reward.sum() == 271
     np.testing.assert_array_equal(timestep.done[within], recorded["done"][within])

@@ -24,7 +24,8 @@ POINTS_OF = (spec.TOOL, spec.TUBE1, spec.TRAP, spec.EXIT, spec.GROUND)
 
 def near(distances: list[int], strength: float) -> np.ndarray:
     """bool[n]: the outcomes no farther than the strength allows."""
-    low, high = min(distances), max(distances)
+    low = min(distances)
+    high = max(distances)
     return np.array([distance - low <= strength * (high - low) + 1e-9 for distance in distances])
 
 
@@ -37,7 +38,8 @@ def near_cells(cells: list[tuple[int, int]], target: Any, strength: float) -> li
 def layout_chances(strength: float) -> np.ndarray:
     """[outline, variant, vertical]: the chances of board and direction of the tool."""
     own_shape = {(row, 0) for row in range(4)}
-    distances, chances = [], []
+    distances = []
+    chances = []
     for (outline, chance), boards in zip(spec.outlines().items(), BOARDS, strict=True):
         for board in boards:
             for vertical in (False, True):
@@ -85,10 +87,12 @@ def test_boards_and_food(strength):
 
 @pytest.mark.parametrize("strength", STRENGTHS)
 def test_tool_and_agent(strength):
-    drawn, chances = layouts(strength), placements(strength)
+    drawn = layouts(strength)
+    chances = placements(strength)
     where = (drawn.outline, drawn.vertical, drawn.tool, drawn.agent)
     assert np.all(chances[where] > 0), "an agent outside the support"
-    by_tool, by_agent = chances.sum(axis=3), chances.sum(axis=2)
+    by_tool = chances.sum(axis=3)
+    by_agent = chances.sum(axis=2)
     counts = tally(by_tool.shape, *where[:3])
     assert np.all(counts[by_tool * DRAWS > 20] > 0)
     assert_fits(counts, by_tool)
@@ -201,7 +205,8 @@ def test_structural_goes_straight_from_the_centre():
 
 @pytest.mark.parametrize("transfer", [tt.graded_perceptual(0.3), tt.graded_structural(0.3)])
 def test_the_same_alone_in_a_batch_and_in_an_environment(transfer):
-    env, keys = tt.Environment((transfer,)), jax.random.split(jax.random.key(6), 64)
+    env = tt.Environment((transfer,))
+    keys = jax.random.split(jax.random.key(6), 64)
     last = jax.random.split(jax.random.key(6), 64)[63]
     assert transfer.__name__.endswith(" 0.3")
     assert repr(env).startswith(f"Environment(transfers=({transfer.__name__})")

@@ -20,7 +20,8 @@ def layouts() -> tuple[np.ndarray, np.ndarray]:
     looks = np.where(tables.board == TUBE2, TUBE1, tables.board)
     outlines = np.concatenate([looks.reshape(NUM_OUTLINES, -1), tables.extent], axis=1)
     _, first, times = np.unique(outlines, axis=0, return_index=True, return_counts=True)
-    chances, counts = [], []
+    chances = []
+    counts = []
     for outline, share in zip(first, times / NUM_OUTLINES, strict=True):
         _, boards = np.unique(looks[outline], axis=0, return_counts=True)
         foods = np.full(tables.num_food[outline], 1 / tables.num_food[outline])
@@ -47,9 +48,11 @@ def test_layouts_that_a_run_meets(layouts):
         shares = (1, 1 / len(SYMBOLIC_OBJECTS))
         return [100 * np.sum(chance * count * (1 - (1 - x * chance) ** tasks)) for x in shares]
 
-    best, paper = Config.preset("best"), Config.preset("paper")
+    best = Config.preset("best")
+    paper = Config.preset("paper")
     few, many = best.num_new * best.iterations, paper.num_new * 500  # of `exp2`
-    (any_tool, bar), (of_many, bar_of_many) = met(few), met(many)
+    (any_tool, bar) = met(few)
+    (of_many, bar_of_many) = met(many)
     page = " ".join((ROOT / "trap_tube_jax" / "protocol.md").read_text().split())
     assert (
         f"The {few:,} new tasks of a `best` run include {any_tool:.1f} % of the scored {{P}} "

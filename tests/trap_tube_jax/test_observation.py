@@ -38,11 +38,13 @@ def expected_objects(state: tt.State) -> np.ndarray:
 
 
 def test_later_objects_hide_earlier_ones(scattered):
-    visible_objects, observe = jax.jit(tt.visible_objects), jax.jit(tt.observe)
+    visible_objects = jax.jit(tt.visible_objects)
+    observe = jax.jit(tt.observe)
     hidden = 0
     for state in scattered:
         expected = expected_objects(state)
-        objects, observation = visible_objects(state), observe(state)
+        objects = visible_objects(state)
+        observation = observe(state)
         np.testing.assert_array_equal(objects, expected)
         np.testing.assert_array_equal(observation, np.asarray(state.palette)[expected])
         assert (objects.dtype, observation.dtype) == (np.uint8, np.uint8)

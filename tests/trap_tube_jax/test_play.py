@@ -17,7 +17,9 @@ import trap_tube_jax as tt
 from refusal import refused
 from trap_tube_jax import play
 
-UP, LEFT, RIGHT = "\x1b[A", "\x1b[D", "\x1bOC"
+UP = "\x1b[A"
+LEFT = "\x1b[D"
+RIGHT = "\x1bOC"
 
 
 def press_all(game, keys):
@@ -116,7 +118,8 @@ def test_the_screen_shows_the_hand_and_a_horizontal_tool(game):
     assert "hand right: empty" in drawn(turned)[2]
     assert drawn(turned)[10][:26] == "|  ->                    |"
     assert sum("-> agent" in line for line in drawn(turned)) == 1
-    tool, extent = jnp.array([0, 0], jnp.int32), game.state.tool_extent[::-1]
+    tool = jnp.array([0, 0], jnp.int32)
+    extent = game.state.tool_extent[::-1]
     lying = drawn(having(game, tool=tool, tool_extent=extent))
     assert lying[2][:11] == "|========  "
     assert sum("== tool" in line for line in lying) == 1

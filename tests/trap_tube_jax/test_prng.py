@@ -30,7 +30,8 @@ def test_tasks_of_rbg_keys_do_not_depend_on_the_batch(impl):
     keys = jax.random.split(jax.random.key(5, impl=impl), 4)
     own = tt.Environment((own_transfer, tt.compose(tt.structural, own_transfer)))
     for env in (tt.make("pstsy"), tt.AutoReset(tt.make("pstsy")), own):
-        batch, reset = jax.jit(jax.vmap(env.reset))(keys), jax.jit(env.reset)
+        batch = jax.jit(jax.vmap(env.reset))(keys)
+        reset = jax.jit(env.reset)
         for index, key in enumerate(keys):
             assert_same(rows(batch, index), reset(key))
 
@@ -38,7 +39,8 @@ def test_tasks_of_rbg_keys_do_not_depend_on_the_batch(impl):
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
 def test_raw_keys_serve_as_well_as_typed_ones(impl):
     with jax.default_prng_impl(impl):
-        typed, raw = jax.random.key(5), jax.random.PRNGKey(5)
+        typed = jax.random.key(5)
+        raw = jax.random.PRNGKey(5)
         for key in (raw, np.asarray(raw), typed):
             assert typed_key(key) == typed
         assert tt.make("st").reset(raw)[0] == tt.make("st").reset(typed)[0]

@@ -96,7 +96,8 @@ def test_a_loop_may_donate_its_state(name):
     reset, step = functions_of(name)
     kept, _ = reset(jax.random.split(jax.random.key(0), BATCH))
     given = jax.tree.map(copied, kept)
-    donating, keeping = jax.jit(step, donate_argnums=0), jax.jit(step)
+    donating = jax.jit(step, donate_argnums=0)
+    keeping = jax.jit(step)
     for _ in range(3):
         given, donated_timestep = donating(given, ACTIONS)
         kept, timestep = keeping(kept, ACTIONS)

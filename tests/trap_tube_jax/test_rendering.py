@@ -81,7 +81,8 @@ def test_a_horizontal_tool_is_the_vertical_one_turned():
         state = tt.base_state().replace(tool=tool, tool_extent=extent)
         return cells(tt.render(state, CELL, grid=False))
 
-    lying, standing = draw([2, 3], [1, 4])[2, 3:7], draw([3, 2], [4, 1])[3:7, 2]
+    lying = draw([2, 3], [1, 4])[2, 3:7]
+    standing = draw([3, 2], [4, 1])[3:7, 2]
     np.testing.assert_array_equal(lying, standing.swapaxes(1, 2))
     assert (lying != objects.BASE_COLORS[objects.TOOL]).any()
 

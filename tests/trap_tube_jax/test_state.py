@@ -51,8 +51,10 @@ def board_with(value: int) -> np.ndarray:
 def test_base_task_is_the_specified_one():
     state = tt.base_state()
     board = np.zeros((12, 12), np.uint8)
-    board[4, 4:8], board[7, 4:8] = spec.TUBE1, spec.TUBE2
-    board[5:7, 4], board[5:7, 7] = spec.TRAP, spec.EXIT
+    board[4, 4:8] = spec.TUBE1
+    board[7, 4:8] = spec.TUBE2
+    board[5:7, 4] = spec.TRAP
+    board[5:7, 7] = spec.EXIT
     cells = {name: np.array(good_arrays()[name], np.int32) for name in CELLS}
     flags = {"time": np.int32(0), "terminated": np.bool_(False), "truncated": np.bool_(False)}
     fields: dict[str, Any] = {"board": board, "palette": spec.BASE_COLORS, **cells, **flags}

@@ -136,7 +136,8 @@ def test_structural_features_are_exactly_those_of_the_sphere(num_features):
 def test_structural_points_lie_on_the_sphere(num_features):
     """Some point of length 1 has the features of every sample."""
     features = palettes(num_features)[:, POINTS_OF].astype(float)
-    low, high = features / 255 * 2 - 1, ((features + 1) / 255 * 2 - 1).clip(max=1)
+    low = features / 255 * 2 - 1
+    high = ((features + 1) / 255 * 2 - 1).clip(max=1)
     nearest = np.where((low < 0) & (high > 0), 0, np.minimum(abs(low), abs(high)))
     farthest = np.maximum(abs(low), abs(high))
     assert np.all(np.linalg.norm(nearest, axis=-1) < 1 + 1e-6)
@@ -211,7 +212,8 @@ def test_symbolic_on_the_base_task(palette):
 
 def test_symbolic_on_perceptual_tasks(drawn):
     """256 layouts, 512 draws each: nothing but the five specified outcomes."""
-    layouts, draws = 256, SAMPLES // 256
+    layouts = 256
+    draws = SAMPLES // 256
     starts = jax.tree.map(lambda leaf: leaf[:layouts], drawn)
     starts = starts.replace(palette=np.broadcast_to(DISTINCT_PALETTE, (layouts, 8, 3)))
     keys = jax.random.split(jax.random.key(6), (layouts, draws))
@@ -271,7 +273,8 @@ def test_compose_applies_from_left_to_right():
     def increment(key, state):
         return state.replace(time=state.time + 1)
 
-    start, key = tt.base_state(), jax.random.key(0)
+    start = tt.base_state()
+    key = jax.random.key(0)
     assert tt.compose(double, increment)(key, start).time == 1
     assert tt.compose(increment, double)(key, start).time == 2
     assert tt.compose(increment, double, increment)(key, start).time == 3

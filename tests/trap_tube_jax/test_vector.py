@@ -66,7 +66,8 @@ ENVIRONMENTS = [
 @pytest.mark.parametrize(("env", "chunk_size", "impl"), ENVIRONMENTS)
 def test_equals_the_plain_reference_in_every_bit(env, chunk_size, impl):
     with jax.default_prng_impl(impl):
-        fast, plain = run_fast(env, chunk_size), run_plain(env)
+        fast = run_fast(env, chunk_size)
+        plain = run_plain(env)
     ends = plain[2].done.sum(axis=1)
     assert 0 < ends.min(), "every step must end some episode"
     assert ends.max() < NUM_ENVS, "no step may end all"
@@ -106,7 +107,8 @@ def test_refuses_what_it_cannot_batch():
 
 
 def test_refuses_one_key_and_what_is_not_its_state():
-    vector, keys = tt.VectorEnvironment(tt.make("base")), jax.random.split(jax.random.key(0), 3)
+    vector = tt.VectorEnvironment(tt.make("base"))
+    keys = jax.random.split(jax.random.key(0), 3)
     for key in (keys[0], jax.random.PRNGKey(0), 0, None, "keys", keys[:0], list(keys)):
         assert_refused(["PRNG keys [B]", "jax.random.split"], vector.reset, key)
     state, timestep = jax.eval_shape(vector.reset, keys)

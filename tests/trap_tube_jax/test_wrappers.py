@@ -12,7 +12,9 @@ from easy import DOWN, EASY, RIGHT, assert_same, rows
 from refusal import assert_refused
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
-LIMIT, TURNS, ROWS = 6, 40, 256
+LIMIT = 6
+TURNS = 40
+ROWS = 256
 
 
 class Turns(NamedTuple):
@@ -64,7 +66,8 @@ def test_auto_reset_takes_the_plain_step_first(auto_reset):
 
 
 def test_auto_reset_shows_the_next_episode_where_one_ended(auto_reset):
-    after, timestep = auto_reset.after, auto_reset.timestep
+    after = auto_reset.after
+    timestep = auto_reset.timestep
     shown = jax.jit(jax.vmap(jax.vmap(tt.observe)))(after)
     np.testing.assert_array_equal(timestep.observation, shown)
     done = np.asarray(timestep.done)
@@ -77,13 +80,21 @@ def test_auto_reset_shows_the_next_episode_where_one_ended(auto_reset):
 
 
 def test_episode_statistics_count_what_happened(auto_reset):
-    done, reward = auto_reset.timestep.done, auto_reset.timestep.reward
+    done = auto_reset.timestep.done
+    reward = auto_reset.timestep.reward
     for row in range(ROWS):
-        length, total, episodes, last = 0, 0.0, 0, (0, 0.0)
+        length = 0
+        total = 0.0
+        episodes = 0
+        last = (0, 0.0)
         for time in range(TURNS):
-            length, total = length + 1, total + reward[time, row]
+            length = length + 1
+            total = total + reward[time, row]
             if done[time, row]:
-                episodes, last, length, total = episodes + 1, (length, total), 0, 0.0
+                episodes = episodes + 1
+                last = (length, total)
+                length = 0
+                total = 0.0
             counted = rows(auto_reset.statistics, (time, row))
             assert (counted.last_length, counted.last_return) == last
             assert (counted.running_length, counted.running_return) == (length, total)

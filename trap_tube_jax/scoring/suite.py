@@ -7,7 +7,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, Self, TypeVar
 
-import jax
 import numpy as np
 
 from trap_tube_jax._version import __version__
@@ -20,7 +19,7 @@ from trap_tube_jax.scoring.tasks import (
     label,
     layout_numbers,
 )
-from trap_tube_jax.state import State, take
+from trap_tube_jax.state import State, concatenated, take
 
 BLOCK = 1024  # tasks played at once, which bounds the memory
 
@@ -100,7 +99,7 @@ class Suite:
           program: maps b states at time 0 to an `Outcome` of b episodes of at most `longest` steps.
             b is the same in all calls, so that a jitted program compiles once.
         """
-        together = jax.tree.map(lambda *parts: np.concatenate(parts), *self.tasks.values())
+        together = concatenated(self.tasks.values())
         whole = play_blocks(lambda states, _: program(states), together)
         outcomes = {}
         start = 0
@@ -142,7 +141,7 @@ def play_blocks(program: Callable[[State, int], Record], tasks: State) -> Record
     """
     total = len(tasks.time)
     played = [program(take(tasks, block), int(block[0])) for block in blocks(total)]
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:total], *played)
+    return take(concatenated(played), slice(total))
 
 
 def blocks(total: int) -> list[np.ndarray]:

@@ -31,7 +31,9 @@ DIGESTS = {
         "pst": 1365254835, "psy": 246488204, "stsy": 327823811, "pstsy": 3988046806,
     },
 }  # fmt: skip
-UP, DOWN, RIGHT = 0, 1, 3
+UP = 0
+DOWN = 1
+RIGHT = 3
 
 
 class Rightward:
@@ -62,7 +64,9 @@ class Single:
     """`Rightward` for one observation at a time; says how it was called."""
 
     def __init__(self, action):
-        self.action, self.resets, self.seen = action, 0, []
+        self.action = action
+        self.resets = 0
+        self.seen = []
 
     def reset(self):
         self.resets += 1
@@ -352,7 +356,8 @@ class Constant:
     """Takes one action i32[2] three times, then others, i32[2] or i32[B, 2]."""
 
     def __init__(self, action, later=None):
-        self.action, self.later = jnp.array(action), jnp.array(action if later is None else later)
+        self.action = jnp.array(action)
+        self.later = jnp.array(action if later is None else later)
 
     def initial(self, batch):
         return jnp.int32(0)
@@ -386,7 +391,8 @@ def test_act_must_return_a_carry(near, tasks):
 
 def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     over = rightward_food(evaluation_tasks("near", 20))[:, None]
-    first, later = [UP, RIGHT], np.where(over, 9, RIGHT)
+    first = [UP, RIGHT]
+    later = np.where(over, 9, RIGHT)
     assert tt.score(Constant(first, later), ["near"], 20)["near"].solved == over.sum()
     words = ["an invalid action", "(grasp, move)", "0 to 3"]
     for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):

@@ -142,7 +142,8 @@ def test_random_actions_solve_the_base_task_as_rarely_as_environment_md_says():
     place = np.zeros(NUM_POSITIONS, np.int32)
     place[nodes] = np.arange(len(nodes))
     following = place[successors][~solved]
-    probability, total = np.eye(1, len(nodes))[0], 0.0
+    probability = np.eye(1, len(nodes))[0]
+    total = 0.0
     for _ in range(MAX_STEPS):
         share = np.broadcast_to(probability[:, None] / NUM_ACTIONS, successors.shape)
         total += share[solved].sum()
@@ -223,7 +224,8 @@ def test_plans_are_not_bound_by_the_step_limit():
 
 
 def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
-    env, state = tt.make("base"), tt.base_state()
+    env = tt.make("base")
+    state = tt.base_state()
     for action in base_plan.actions[:4]:
         state, _ = env.step(state, action)
     np.testing.assert_array_equal(tt.solve(state).actions, base_plan.actions[4:])
@@ -232,7 +234,8 @@ def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
 def test_distances_are_those_of_brute_force_and_count_down_along_the_plan(
     workshop, workshop_distances
 ):
-    found, expected = workshop_distances, brute_force.graph(workshop)
+    found = workshop_distances
+    expected = brute_force.graph(workshop)
     assert found.num_reachable == len(expected.places)
     assert found.from_start.dtype == found.to_goal.dtype == np.int16
     place = np.stack(np.divmod(expected.places[:, [2, 1, 0]], 12), axis=-1).reshape(-1, 6).T
@@ -272,11 +275,13 @@ def test_pictures_of_distances_count_the_steps_that_are_left(
     pictures_draw = pictures._draw_distances
     monkeypatch.setattr(pictures, "_draw_distances", draw)
     monkeypatch.setattr(pictures.Figure, "savefig", lambda *_, **__: None)
-    plan, found = tt.solve(workshop), workshop_distances
+    plan = tt.solve(workshop)
+    found = workshop_distances
     pictures.save_distances(workshop, plan, found, tmp_path / "none.png")
     assert len(drawn) == pictures.MOMENTS
     for axis, state, steps in drawn:
-        left, agent = found.lookup(state), tuple(np.asarray(state.agent).tolist())
+        left = found.lookup(state)
+        agent = tuple(np.asarray(state.agent).tolist())
         assert axis.get_title() == f"steps left: {left}"
         assert steps[agent] == left
         numbers = {text.get_position()[::-1]: int(text.get_text()) for text in axis.texts}

@@ -77,7 +77,8 @@ def test_command_line_shows_a_plan_without_matplotlib(tmp_path, capsys, monkeypa
     with Image.open(animation) as image:
         assert image.format == "GIF"
     state, _ = tt.make("sy").reset(jax.random.key(3))
-    plan, text = tt.solve(state), capsys.readouterr().out
+    plan = tt.solve(state)
+    text = capsys.readouterr().out
     assert text.startswith(f"start ({plan.length} steps)\n{tt.render_ascii(state)}\n")
     for time, action in enumerate(plan.actions, start=1):
         grasp, move = (("up", "down", "left", "right")[code] for code in action)
