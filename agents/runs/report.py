@@ -104,7 +104,7 @@ def _score_rows(scores: Scores) -> str:
             score.label,
             f"{score.tasks:,}",
             f"{score.percent:.1f}",
-            "" if score.interval is None else "{:.1f} to {:.1f}".format(*score.interval),
+            "" if score.interval is None else "{:.1f} – {:.1f}".format(*score.interval),
             "" if score.mean_steps is None else f"{score.mean_steps:.1f}",
             "" if score.layouts is None else str(score.layouts),
         ]
@@ -137,9 +137,9 @@ def draw_curves(rows: Table, title: str) -> bytes:
 
 
 def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: str) -> str | None:
-    """Writes a GIF of the first solved episode.
+    """Writes a GIF of the first solved episode, if possible on the task set `prefer`.
 
-    Returns the episode's task set, `prefer` if possible; None, and no file, if none is solved.
+    Returns the episode's task set, or None without writing a file if no episode is solved.
     """
     for name in sorted(played, key=lambda name: name != prefer):
         outcome = played[name]
