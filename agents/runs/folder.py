@@ -43,7 +43,7 @@ class RunFolder:
         self.metrics = path / "metrics.csv"  # a row per iteration
         self.evaluations = path / "evaluations.csv"  # a row per evaluated iteration and task set
         self.best = path / "best.safetensors"  # the best evaluation's, with `evaluate_every`
-        self.checkpoints = path / "checkpoints"  # a file each, named by its iteration
+        self.checkpoints = path / "checkpoints"  # files named by their iteration
         self.tensorboard = path / "tensorboard"
         self.curves = path / "curves.png"
         self.page = path / "report.html"

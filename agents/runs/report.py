@@ -154,7 +154,7 @@ def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: 
 
 
 def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
-    """Returns the first solved and the first unsolved episode of each set.
+    """Returns the first solved and the first unsolved episode of every set.
 
     An episode holds `title`, `solved`, the replays `agent` and `plan` (see `_replay`), and
     `values`, the network's value of every board.
@@ -170,7 +170,8 @@ def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
     episodes = []
     for state, shortest, (name, index) in zip(states, plans, shown, strict=True):
         outcome = played[name]
-        solved, length = bool(outcome.solved[index]), int(outcome.length[index])
+        solved = bool(outcome.solved[index])
+        length = int(outcome.length[index])
         # Padded to one length, so that all replays share a compiled program.
         longest = max(outcome.action.shape[1], len(shortest))
         actions, plan = np.full((2, longest, 2), NO_DIRECTION)
