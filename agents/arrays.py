@@ -32,7 +32,7 @@ def from_arrays(arrays: Arrays, template: Tree) -> Tree:
     """Inverts `to_arrays`.
 
     Args:
-      arrays: one array for each leaf of the template.
+      arrays: one array per leaf of the template.
       template: a pytree of arrays or of `jax.ShapeDtypeStruct`; its keys are of JAX's default kind.
 
     Raises:

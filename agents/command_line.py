@@ -22,7 +22,7 @@ def option(default: Any, group: str | None = None, **metadata: Any) -> Any:
     Args:
       default: its default.
       group: title under which help lists it.
-      metadata: `append=True` collects one value in a tuple each time the option is given; `flags`
+      metadata: `append=True` collects the values of a repeated option in a tuple; `flags`
         lists alternative spellings.
     """
     return dataclasses.field(default=default, metadata={"group": group, **metadata})
@@ -43,7 +43,7 @@ def parse_all(
     Args:
       declared: dataclasses, or instances whose values are the defaults. The docstring of the first
         describes the command.
-      arguments: those of the process if None.
+      arguments: the command line after the program, by default the arguments of the process.
       prog: the command.
       partly: ignores unknown options and --help, and imports nothing.
 
@@ -51,7 +51,7 @@ def parse_all(
       SystemExit: the command line is invalid, or asks for help.
       ValueError: a value is not allowed.
     """
-    positional = [f.name for each in declared for f in dataclasses.fields(each) if _is_required(f)]
+    positional = [f.name for cls in declared for f in dataclasses.fields(cls) if _is_required(f)]
     parser = argparse.ArgumentParser(
         prog=prog,
         usage=" ".join([prog, *map(str.upper, positional), "[options]"]),
@@ -63,19 +63,20 @@ def parse_all(
         add_help=not partly,
     )
     groups: dict[Any, Any] = {None: parser}
-    for each in declared:
-        documents, kinds = _documents(_class(each)), get_type_hints(_class(each))
-        for field in dataclasses.fields(each):
+    for options in declared:
+        documents = _documents(_class(options))
+        kinds = get_type_hints(_class(options))
+        for field in dataclasses.fields(options):
             group = field.metadata.get("group")
             if group not in groups:
                 groups[group] = parser.add_argument_group(group)
             text = documents[field.name].replace("%", "%%")
-            _add(groups[group], field, getattr(each, field.name, None), text, kinds[field.name])
+            _add(groups[group], field, getattr(options, field.name, None), text, kinds[field.name])
     found = vars(parser.parse_known_args(arguments)[0] if partly else parser.parse_args(arguments))
     values = {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
     if not partly:
         import_modules(values.get("imports", ()))  # they register names that the classes check
-    return [_replaced(each, values) for each in declared]
+    return [_replaced(options, values) for options in declared]
 
 
 def _replaced(declared: Any, values: dict[str, Any]) -> Any:
@@ -120,7 +121,7 @@ def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: An
 def _values(kind: Any) -> dict[str, Any]:
     """Returns the `add_argument` options for values of an annotated type."""
     if get_origin(kind) in (Union, types.UnionType):
-        return _values(next(each for each in get_args(kind) if each is not types.NoneType))
+        return _values(next(part for part in get_args(kind) if part is not types.NoneType))
     if get_origin(kind) is Literal:
         return {"choices": get_args(kind)}
     if get_origin(kind) is tuple:
@@ -134,8 +135,8 @@ def _values(kind: Any) -> dict[str, Any]:
 
 
 def _documents(cls: type) -> dict[str, str]:
-    """Returns the first sentence about each attribute in the docstrings of `cls` and its bases."""
-    text = "\n".join(inspect.getdoc(each) or "" for each in reversed(cls.__mro__[:-1]))
+    """Returns the first sentence about every attribute in the docstrings of `cls` and its bases."""
+    text = "\n".join(inspect.getdoc(base) or "" for base in reversed(cls.__mro__[:-1]))
     entries = re.findall(r"^ {2}(\w+): (.+(?:\n {4}.+)*)", text, re.M)
     sentences = {name: re.sub(r"\s+", " ", entry) for name, entry in entries}
     return {

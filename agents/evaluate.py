@@ -8,6 +8,7 @@ import pandas as pd
 
 import trap_tube_jax as tt
 from agents.command_line import option, parse
+from agents.files import write_bytes
 from agents.runs import compilation
 from agents.runs.evaluator import Evaluator, own_and_paper_sets
 from agents.runs.loading import load
@@ -52,23 +53,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks
     evaluator = Evaluator.of_sets(config, options.sets or own_and_paper_sets(config), tasks)
-    own = tt.task_set(config.env_id).short if options.gif else ""  # refused before it is played
+    # An unknown training set is refused before anything is played.
+    train_set = tt.task_set(config.env_id).short if options.gif else ""
     shortest = None
     if options.optimality:
         shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
     played = evaluator(policy.params)
     scores = evaluator.scores(played, shortest)
-    notes = []
     if options.output is not None:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        rows = pd.DataFrame(evaluation_rows(scores, policy, "test"))
-        rows.to_csv(options.output, index=False)
-        notes.append(f"results: {options.output}")
+        table = pd.DataFrame(evaluation_rows(scores, policy, "test"))
+        write_bytes(options.output, table.to_csv(index=False).encode())
+    print(f"{policy.name}, iteration {policy.iteration}", scores, sep="\n\n")
+    if options.output is not None:
+        print(f"\nresults: {options.output}")
     if options.gif is not None:
         options.gif.parent.mkdir(parents=True, exist_ok=True)
-        shown = save_first_solved(options.gif, evaluator, played, own)
-        notes.append(f"solved episode of {shown}: {options.gif}" if shown else "nothing is solved")
-    print(f"{policy.name}, iteration {policy.iteration}", scores, *notes, sep="\n\n")
+        shown = save_first_solved(options.gif, evaluator, played, train_set)
+        print(f"\nsolved episode of {shown}: {options.gif}" if shown else "\nnothing is solved")
 
 
 if __name__ == "__main__":

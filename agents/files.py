@@ -115,7 +115,8 @@ def parse_json(text: str, kind: Any) -> Any:
 
 def _check_kind(value: Any, kind: Any, name: str) -> None:
     """Raises ValueError, which names the part, unless a JSON value is of a type."""
-    form, arguments = get_origin(kind) or kind, get_args(kind)
+    form = get_origin(kind) or kind
+    arguments = get_args(kind)
     if form is Any:
         return
     if form in (Union, types.UnionType):
@@ -163,7 +164,7 @@ def _check_keys(value: dict[str, Any], form: Any, name: str) -> None:
 
 @contextlib.contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
-    """Yields a path to write to, whose file takes the place of `path` at the end of the block.
+    """Yields a path to write to; its file replaces `path` at the end of the block.
 
     A link at `path` is replaced, and the file that it names stays as it is.
     """

@@ -1,4 +1,4 @@
-"""Trained agents that are shipped with the code, one safetensors file each.
+"""Trained agents that are shipped with the code, as files of safetensors.
 
 fast-base   the preset `fast` on base: the median of ten seeds
 icm-base    the preset `paper` on base, PPO + ICM

@@ -1,6 +1,6 @@
-"""Checkpoints of the whole training state, a file each that is named by its iteration.
+"""Checkpoints of the whole training state, in files named by their iteration.
 
-A file holds the state's arrays and a record of plain values. Each file is written atomically, so a
+A file holds the state's arrays and a record of plain values. Files are written atomically, so a
 killed process leaves earlier checkpoints intact.
 """
 

@@ -44,14 +44,16 @@ class ProgressLine(Progress):
 
 
 def summary(folder: RunFolder, run: Run) -> list[str]:
-    """Returns the facts that a run ends with, one a line."""
-    own, config, lines = tt.task_set(run.config.env_id), run.config, []
+    """Summarises a finished run, one fact per line."""
+    lines = []
+    config = run.config
+    train_set = tt.task_set(config.env_id).label
     threshold = config.stop_when_solved or 1.0
     solving = read_rows(folder.metrics).query("validation_success >= @threshold")["episodes"]
     if len(solving):
         share = "" if threshold == 1 else f"{100 * threshold:g} % of "
         more = "; --stop-when-solved 0 trains on" if config.stop_when_solved else ""
-        lines.append(f"First solved {share}{own.label} after {solving.min():,} episodes{more}.")
+        lines.append(f"First solved {share}{train_set} after {solving.min():,} episodes{more}.")
     if folder.page.exists():
         lines.append(f"Report with curves and episodes to step through: {folder.page}")
     has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init
@@ -64,13 +66,13 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
 
 
 def resume_hint(folder: RunFolder, run: Run) -> str:
-    """Says how an interrupted run goes on."""
+    """Returns the command that resumes an interrupted run, in a sentence."""
     if not folder.config.is_file():
         return f"{folder.path} holds no run to continue."
     return f"Continue with: {resume_command(folder, run)}"
 
 
 def resume_command(folder: RunFolder, run: Run) -> str:
-    """Returns the command that continues a run."""
+    """Returns the command that resumes a run."""
     imports = [word for name in run.imports for word in ("--import", name)]
     return shlex.join(["python", "-m", "agents.train", "--resume", str(folder.path), *imports])

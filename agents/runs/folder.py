@@ -43,7 +43,7 @@ class RunFolder:
         self.metrics = path / "metrics.csv"  # a row per iteration
         self.evaluations = path / "evaluations.csv"  # a row per evaluated iteration and task set
         self.best = path / "best.safetensors"  # the best evaluation's, with `evaluate_every`
-        self.checkpoints = path / "checkpoints"  # a file each, named by its iteration
+        self.checkpoints = path / "checkpoints"  # files named by their iteration
         self.tensorboard = path / "tensorboard"
         self.curves = path / "curves.png"
         self.page = path / "report.html"
@@ -139,7 +139,7 @@ def runs_near(path: Path) -> str:
         return f"give one of its runs: {_listed(inside)}"
     known = [*_runs_in(path.parent), *_runs_in(RUNS)]
     names = [run.name for run in known]
-    for name in difflib.get_close_matches(path.name, names, n=1, cutoff=0.8):
+    for name in difflib.get_close_matches(path.name, names, n=1):
         return f"did you mean {known[names.index(name)]}?"
     return f"runs in {path.parent}: {_listed(_runs_in(path.parent)) or 'none'}"
 
@@ -158,6 +158,6 @@ def check_name(name: str) -> None:
     """Raises ValueError unless a name is a plain folder name; tables and shells take it as text."""
     if Path(name).name != name or name[:1] in ("", *".-=+@") or not name.isprintable():
         raise ValueError(
-            "name must be a folder's name without a path, and begin with none of .-=+@; "
-            f"got {name!r}"
+            f"name must be a folder's name without a path, got {name!r}; it cannot begin with any "
+            "of .-=+@"
         )

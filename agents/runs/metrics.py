@@ -20,7 +20,7 @@ from trap_tube_jax.scoring.tasks import Purpose
 
 Row = Mapping[str, Any]
 Table = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
-Frame = Table
+Frame = Table  # the former name
 
 
 def _text(value: str) -> str:
@@ -135,7 +135,7 @@ def _records(path: Path) -> list[list[str]]:
         if rows and not text.endswith("\n") and len(rows[-1]) < len(header):
             rows.pop()
         if len(set(header)) < len(header) or "" in header:
-            raise ValueError("its columns need a name each")
+            raise ValueError("its columns must have different names")
         for number, row in enumerate(rows, 1):
             if len(row) != len(header):
                 raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
@@ -167,7 +167,7 @@ def rewind_rows(path: Path, iteration: int) -> None:
 
 
 def evaluation_rows(scores: Scores, policy: Policy, purpose: Purpose) -> list[Row]:
-    """Returns a row of `evaluations.csv` for each score of a policy.
+    """Returns the rows of `evaluations.csv` for the scores of a policy.
 
     `solved` counts tasks. Where a set has few layouts, `layouts` of `layouts_total` are solved in
     more than half of their draws. `length` is the mean number of steps of solved episodes.

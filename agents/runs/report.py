@@ -105,7 +105,7 @@ def _score_rows(scores: Scores) -> str:
             score.label,
             f"{score.tasks:,}",
             f"{score.percent:.1f}",
-            "" if score.interval is None else "{:.1f} to {:.1f}".format(*score.interval),
+            "" if score.interval is None else "{:.1f} – {:.1f}".format(*score.interval),
             "" if score.mean_steps is None else f"{score.mean_steps:.1f}",
             "" if score.layouts is None else str(score.layouts),
         ]
@@ -138,9 +138,9 @@ def draw_curves(rows: Table, title: str) -> bytes:
 
 
 def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: str) -> str | None:
-    """Writes a GIF of the first solved episode.
+    """Writes a GIF of the first solved episode, if possible on the task set `prefer`.
 
-    Returns the episode's task set, `prefer` if possible; None, and no file, if none is solved.
+    Returns the episode's task set, or None without writing a file if no episode is solved.
     """
     for name in sorted(played, key=lambda name: name != prefer):
         outcome = played[name]
@@ -155,7 +155,7 @@ def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: 
 
 
 def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
-    """Returns the first solved and the first unsolved episode of each set.
+    """Returns the first solved and the first unsolved episode of every set.
 
     An episode holds `title`, `solved`, the replays `agent` and `plan` (see `_replay`), and
     `values`, the network's value of every board.
@@ -171,7 +171,8 @@ def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
     episodes = []
     for state, shortest, (name, index) in zip(states, plans, shown, strict=True):
         outcome = played[name]
-        solved, length = bool(outcome.solved[index]), int(outcome.length[index])
+        solved = bool(outcome.solved[index])
+        length = int(outcome.length[index])
         # Padded to one length, so that all replays share a compiled program.
         longest = max(outcome.action.shape[1], len(shortest))
         actions, plan = np.full((2, longest, 2), NO_DIRECTION)

@@ -16,7 +16,7 @@ Paths = str | Path | Iterable[str | Path]
 
 
 def results(paths: Paths) -> pd.DataFrame:
-    """Returns the evaluations of all runs in folders, one row each.
+    """Returns the evaluations of all runs in folders as a tidy table.
 
     Args:
       paths: one or several folders: of a run, or of runs at any depth; `~` is the home folder.
@@ -44,7 +44,8 @@ def results(paths: Paths) -> pd.DataFrame:
 def metrics(paths: Paths) -> pd.DataFrame:
     """Returns the training metrics of all runs in folders, one row per run and iteration.
 
-    Columns: run, algorithm, seed, and those of `metrics.csv`. Arguments and errors as in `results`.
+    Columns: run, algorithm, seed, and the columns of `metrics.csv`. Arguments and errors as in
+    `results`.
     """
     return _join([_table(folder, folder.metrics) for folder in find_runs(paths)])
 

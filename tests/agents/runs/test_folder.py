@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from agents.config import Config
-from agents.files import read_json, write_json
+from agents.files import read_json, write_bytes, write_json
 from agents.runs.folder import RunFolder, check_name
 from agents.runs.run import Run, RunOptions
 from refusal import assert_refused
@@ -29,9 +29,11 @@ def test_a_run_is_the_same_after_json():
         (RunOptions, {"evaluate_every": -1}, ["evaluate_every must be an integer >= 0, got -1"]),
         (RunOptions, {"test_tasks": 10**9}, ["test_tasks must be", "<= 1000000, got 1000000000"]),
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
+        (RunOptions, {"devices": 100_000}, ["devices must be an integer >= 1 and <= 1024"]),
+        (partial(Run, Config()), {"algorithm": "=1+1"}, ["algorithm must begin with a letter"]),
         *(
             (check_name, {"name": name}, ["a folder's name without a path", repr(name)])
-            for name in ("", ".", "..", "a/b", ".hidden", "a\nb", "\udcff")
+            for name in ("", ".", "..", "a/b", ".hidden", "-x", "=1+1", "a\nb", "\udcff")
         ),
     ],
 )
@@ -73,6 +75,31 @@ def test_a_second_writer_is_refused(tmp_path):
         assert_refused(words, RunFolder(tmp_path / "x").lock().__enter__)
     with RunFolder(tmp_path / "x").lock():
         pass
+
+
+@pytest.mark.parametrize("name", ["curves.png", "metrics.csv", ".lock", "checkpoints"])
+def test_a_link_among_the_files_is_refused_before_it_is_written_through(tmp_path, name):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / name).symlink_to(victim)
+    assert_refused([f"{name} is a link"], RunFolder(tmp_path / "x").lock().__enter__)
+    write_bytes(tmp_path / "x" / name, b"new")
+    assert victim.read_text() == "mine"
+
+
+def test_a_run_that_is_not_found_is_answered_with_those_near(tmp_path, monkeypatch):
+    for name in ("mine", "yours"):
+        RunFolder(tmp_path / "runs" / name).path.mkdir(parents=True)
+        RunFolder(tmp_path / "runs" / name).note(Run(Config()))
+    monkeypatch.chdir(tmp_path)
+    for path, words in (
+        ("mine", "did you mean runs/mine?"),
+        ("runs/yuors", "did you mean runs/yours?"),
+        ("runs", "give one of its runs: mine, yours"),
+        ("runs/quite-another", "runs in runs: mine, yours"),
+    ):
+        assert_refused([f"{path} holds no run; {words}"], RunFolder(Path(path)).read)
 
 
 def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):

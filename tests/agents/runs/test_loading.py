@@ -18,6 +18,7 @@ from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy, save
 from agents.runs.run import Run, RunOptions
 from easy import assert_same, enable_x64
+from refusal import assert_refused
 from tiny_policy import CONFIG, random_params, random_policy
 
 POLICY = random_policy()
@@ -67,6 +68,22 @@ def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path
 def test_unknown_sources_and_iterations_are_refused(run_path, source, message):
     with pytest.raises(ValueError, match=message):
         agents.load(source or run_path, iteration=5)
+
+
+def test_sources_that_are_nearly_right_are_answered_with_what_to_give(run_path):
+    for source, words in (
+        (run_path / "checkpoints" / "6.safetensors", f"give its run, {run_path}, and iteration 6"),
+        (run_path.parent, "give one of its runs: mine"),
+        (run_path.parent / "mien", f"did you mean {run_path}?"),
+    ):
+        assert_refused([words], agents.load, source)
+
+
+def test_a_leading_tilde_is_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    agents.save("~/x.safetensors", POLICY)
+    assert (tmp_path / "x.safetensors").is_file()
+    assert agents.load("~/x.safetensors").config == POLICY.config
 
 
 def test_a_stored_policy_is_the_same(tmp_path):

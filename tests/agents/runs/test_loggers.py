@@ -1,12 +1,30 @@
 """Metrics in TensorBoard and Weights & Biases, by their own readers."""
 
 import sys
+from types import SimpleNamespace
 
 import pytest
 
+from agents.runs.folder import RunFolder
+from agents.runs.loggers import check_loggers, open_loggers
+from agents.runs.metrics import append_rows, read_rows, rewind_rows
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run
 from small_runs import small_config
+
+
+def row(iteration, loss=0.5):
+    counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 0.5}
+    return {"iteration": iteration, "validation_success": 0.5, **counts, "loss": loss}
+
+
+def log(folder, iterations, loss, **chosen):
+    """Trains as a process does that is killed: it closes nothing."""
+    chosen = {"tensorboard": False, "wandb": False, **chosen}
+    with open_loggers(folder.path, Run(small_config()), **chosen) as log_row:
+        for iteration in iterations:
+            append_rows(folder.metrics, [row(iteration, loss)])
+            log_row(row(iteration, loss))
 
 
 @pytest.mark.parametrize("options", [RunOptions(tensorboard=True), RunOptions(wandb=True)])
@@ -18,25 +36,42 @@ def test_a_missing_library_is_named_before_anything_is_written(options, monkeypa
     assert not (tmp_path / "run").exists()
 
 
+def test_a_missing_key_is_named(monkeypatch):
+    class Error(Exception):
+        pass
+
+    def login():
+        raise Error("No API key configured.\nUse `wandb login`.")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(login=login, Error=Error))
+    with pytest.raises(ValueError, match=r"--wandb cannot log: No API key.*WANDB_MODE=offline"):
+        check_loggers(RunOptions(wandb=True))
+    check_loggers(RunOptions())
+
+
 @pytest.mark.interop
-def test_tensorboard_gets_the_metrics(tmp_path):
+def test_tensorboard_shows_metrics_of_a_killed_and_resumed_run_once(tmp_path):
     reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    options = RunOptions(tensorboard=True, report=False)
-    train_run(tmp_path / "run", Run(small_config(iterations=2)), options)
-    events = reader.EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
-    lines = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
-    rows = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
-    for row in rows:
-        (event,) = [e for e in events.Tensors("loss") if e.step == int(row["iteration"])]
-        assert event.tensor_proto.float_val[0] == pytest.approx(float(row["loss"]))
+    folder = RunFolder(tmp_path)
+    log(folder, [1, 2, 3, 4], loss=0.25, tensorboard=True)
+    rewind_rows(folder.metrics, 2)
+    log(folder, [3, 4, 5], loss=0.75, tensorboard=True)
+    events = reader.EventAccumulator(str(folder.tensorboard)).Reload()
+    logged = [(e.step, e.tensor_proto.float_val[0]) for e in events.Tensors("loss")]
+    rows = read_rows(folder.metrics)
+    assert logged == list(zip(rows["iteration"], rows["loss"], strict=True))
 
 
 @pytest.mark.interop
-def test_wandb_logs_offline(tmp_path, monkeypatch):
+def test_a_resumed_run_is_the_same_run_of_wandb(tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    options = RunOptions(wandb=True, report=False)
-    train_run(tmp_path / "run", Run(small_config(iterations=2)), options)
-    (log,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
-    assert b"intrinsic_reward" in log.read_bytes()
+    folder = RunFolder(tmp_path)
+    check_loggers(RunOptions(wandb=True))
+    log(folder, [1, 2], loss=0.25, wandb=True)
+    log(folder, [3], loss=0.25, wandb=True)
+    names = [path.name for path in (tmp_path / "wandb").glob("offline-run-*")]
+    assert len({name.rpartition("-")[2] for name in names}) == 1
+    logs = (tmp_path / "wandb").glob("offline-run-*/*.wandb")
+    assert any(b"validation_success" in path.read_bytes() for path in logs)

@@ -34,6 +34,25 @@ def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
     assert read_rows(path).to_dict("records") == [row(1)], "begun again with its header"
 
 
+def test_a_complete_last_row_counts_without_its_newline(tmp_path):
+    """As editors may leave it."""
+    path = tmp_path / "metrics.csv"
+    append_rows(path, [row(1), row(2)])
+    before = path.read_text()
+    path.write_text(before.removesuffix("\n"))
+    assert list(read_rows(path)["iteration"]) == [1, 2]
+    rewind_rows(path, 2)
+    assert path.read_text() == before
+
+
+def test_names_that_pandas_takes_for_missing_are_names(tmp_path):
+    path = tmp_path / "evaluations.csv"
+    names = ["NA", "null", "nan", "None"]
+    values = {"iteration": 1, "purpose": "test", "tasks": 2, "solved": 1}
+    append_rows(path, [{**values, "task_set": name} for name in names])
+    assert list(read_rows(path)["task_set"]) == names
+
+
 def test_a_missing_folder_is_an_error_of_the_file_system(tmp_path):
     with pytest.raises(OSError, match="none"):
         append_rows(tmp_path / "none" / "metrics.csv", [row(1)])

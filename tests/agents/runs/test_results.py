@@ -1,0 +1,64 @@
+"""Results are found in folders: every run once, whatever links, and no folder in silence."""
+
+from pathlib import Path
+
+import pytest
+
+import agents
+from agents.runs import results as module
+from agents.runs.folder import RunFolder
+from agents.runs.metrics import append_rows
+from agents.runs.run import Run
+from refusal import assert_refused
+from tiny_policy import CONFIG
+
+EVALUATION = {"iteration": 4, "purpose": "test", "task_set": "NA", "tasks": 2, "solved": 1}
+
+
+@pytest.fixture
+def runs(tmp_path) -> Path:
+    """A folder of the runs a and deep/b, with one evaluation each."""
+    for name in ("a", "deep/b"):
+        folder = RunFolder(tmp_path / "runs" / name)
+        folder.path.mkdir(parents=True)
+        folder.note(Run(CONFIG))
+        append_rows(folder.evaluations, [EVALUATION])
+    return tmp_path / "runs"
+
+
+def test_a_run_counts_once_whatever_links_lead_to_it(runs):
+    (runs / "0-latest").symlink_to("a")
+    (runs / "deep" / "up").symlink_to("..")
+    (runs / "deep" / "self").symlink_to("self")
+    expected = [str(runs / "a"), str(runs / "deep" / "b")]
+    assert agents.results(runs)["run"].tolist() == expected
+    assert agents.results([runs, runs / "a", runs / "0-latest"])["run"].tolist() == expected
+    assert agents.results(runs / "0-latest")["task_set"].tolist() == ["NA"]
+
+
+def test_a_folder_that_cannot_be_read_is_an_error(runs, monkeypatch):
+    listed = Path.iterdir
+
+    def denied(path):
+        if path.name == "deep":
+            raise PermissionError(f"Permission denied: {path}")
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(PermissionError, match="deep"):
+        agents.results(runs)
+
+
+def test_a_folder_without_runs_is_refused_and_near_ones_are_named(runs, monkeypatch):
+    monkeypatch.chdir(runs.parent)
+    assert_refused(["none holds no run; runs in .: none"], agents.results, "none")
+    assert_refused(["a holds no run; did you mean runs/a?"], agents.results, "a")
+
+
+def test_a_leading_tilde_is_the_home_folder_for_every_path(runs, monkeypatch):
+    monkeypatch.setenv("HOME", str(runs.parent))
+    assert len(agents.results("~/runs")) == 2
+    assert module.find_runs(["~/runs/a"])[0].path == runs / "a"
+    assert RunFolder("~/runs/a").read()[0].config == CONFIG
+    with pytest.raises(ValueError, match="cannot be expanded"):
+        RunFolder("~nobody-has-this-name/x")
