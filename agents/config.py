@@ -98,7 +98,7 @@ class Config:
       embedding: units of each embedding of actions and reward.
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.
-      previous_inputs: feeds the previous action and reward to the GRU.
+      previous_inputs: also reads the previous action and reward.
     """
 
     env_id: str = _task("TrapTube-v0", flags=("--env",))

@@ -46,9 +46,10 @@ def end(path):
     """Makes a run's files those of a run that has ended."""
     folder = RunFolder(path)
     folder.path.mkdir(exist_ok=True)
-    row = {"iteration": 250, "validation_success": 0.0, "transitions": 5}
-    append_rows(folder.metrics, [row])
-    append_rows(folder.evaluations, [{"iteration": 250, "purpose": "test"}])
+    costs = {"iteration": 250, "episodes": 9, "transitions": 5, "seconds": 1.0}
+    append_rows(folder.metrics, [{**costs, "validation_success": 0.0}])
+    tested = {"purpose": "test", "task_set": "base", "tasks": 1, "solved": 0}
+    append_rows(folder.evaluations, [{"iteration": 250, **tested}])
 
 
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):

@@ -218,7 +218,7 @@ def make_a_file(path):
         ("metrics.csv", cut, "metrics.csv ends before the checkpoint of iteration 6"),
         ("evaluations.csv", remove, "evaluations.csv lacks the evaluation of iteration"),
         ("best.safetensors", remove, "best.safetensors is missing"),
-        ("best.safetensors", make_a_file, "best.safetensors is not a file of arrays"),
+        ("best.safetensors", make_a_file, "best.safetensors cannot be read"),
     ],
 )
 @pytest.mark.parametrize("more", [0, 1])
