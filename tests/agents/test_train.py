@@ -134,7 +134,7 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
     ("arguments", "message"),
     [
         ("--preset slow", f"unknown preset 'slow'; allowed: {', '.join(PRESETS)}"),
-        ("--env q", "unknown task set 'q'; allowed: TrapTube-v0 (base), "),
+        ("--env q", "unknown task set 'q'; allowed: base, p, "),
         ("--env q", "as by --import MODULE"),
         ("--minibatch-size 3", "minibatch_size must divide episodes_per_iteration=256, got 3"),
         ("--episodess 8", "--episodess"),

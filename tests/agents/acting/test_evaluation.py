@@ -14,7 +14,7 @@ from agents.ppo.learner import Learner
 from easy import assert_same
 from tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
 from trap_tube_jax.registry import PAPER_TASK_SETS
-from trap_tube_jax.scoring import benchmark
+from trap_tube_jax.scoring import suite
 from trap_tube_jax.scoring.scores import Optimality
 from trap_tube_jax.scoring.tasks import evaluation_tasks, fixed_tasks
 
@@ -41,7 +41,7 @@ def test_tasks_of_your_own_are_scored(played):
 
 def test_playing_in_blocks_changes_nothing(played, monkeypatch):
     evaluator, params, outcomes = played
-    monkeypatch.setattr(benchmark, "BLOCK", 3)
+    monkeypatch.setattr(suite, "BLOCK", 3)
     assert_same(Evaluator(CONFIG, evaluator.tasks)(params), outcomes)
 
 
