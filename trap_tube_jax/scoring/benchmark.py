@@ -21,7 +21,6 @@ from trap_tube_jax.registry import TaskSet, make, task_set
 from trap_tube_jax.scoring.python_agent import PythonAgent
 from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.suite import (
-    blocks,  # noqa: F401  `agents` imports it from here
     play_blocks,
     score_of,
 )
