@@ -80,7 +80,8 @@ OF_A_RUN = {"algorithm": _text, "seed": _count}
 SCHEMAS = {  # by the name of the file
     "metrics.csv": Schema(METRICS),
     "evaluations.csv": Schema(EVALUATIONS),
-    "curves.csv": Schema({**OF_A_RUN, **METRICS, "success": _number}),
+    # Older records do not count transitions.
+    "curves.csv": Schema({**OF_A_RUN, **METRICS, "transitions": _number, "success": _number}),
     "results.csv": Schema({**OF_A_RUN, **EVALUATIONS, **LAYOUTS}, _text),
 }
 
