@@ -361,17 +361,6 @@ def test_a_lost_scheduler_is_a_failure(tmp_path, cluster):
 
 
 @pytest.mark.slow
-def test_ctrl_c_does_not_wait_for_queued_runs(tmp_path, cluster):
-    sweep_process = start_endless(tmp_path, "--cluster", cluster[1])
-    sweep_process.send_signal(signal.SIGINT)
-    output, errors = sweep_process.communicate()
-    assert sweep_process.returncode == 130, errors
-    assert [f"fast-seed{seed}: stopped" in output for seed in range(2)] == [True, True]
-    assert "Stopped. The same command continues." in errors
-    assert small_runs.final_state(tmp_path / "x" / "fast-seed0")[0] > 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("signals", [1, 2])
 def test_ctrl_c_ends_a_sweep_on_this_machine(tmp_path, signals):
     process = start_endless(tmp_path, "--processes", 1)
