@@ -36,12 +36,12 @@ def options():
     return given
 
 
-def start(module, *arguments, **environment):
+def start(module, *arguments, cwd=ROOT, **environment):
     """Starts a process of a command line, warnings being errors."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-m", module, *map(str, arguments)],
-        cwd=ROOT,
+        cwd=cwd,
         env={**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu", **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

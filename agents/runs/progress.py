@@ -141,7 +141,8 @@ class Progress:
 
         Returns the scores; None if all are in the files.
         """
-        policy, options = self._policy(), self.program.options
+        options = self.program.options
+        policy = self._policy()
         if self.program.validation and self.stored.best.is_file():
             policy = read_policy(self.stored.best)
         tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
@@ -191,9 +192,9 @@ class Progress:
 
     def _keep_best(self) -> None:
         """Saves the present policy if its evaluation is better than the best policy's."""
-        rows = read_rows(self.folder.evaluations)
-        own = tt.task_set(self.run.config.env_id).short
-        if is_better(rows, self.iteration, best_iteration(self.folder), own):
+        rows = validation_rows(self.folder)
+        train_set = tt.task_set(self.run.config.env_id).short
+        if is_better(rows, self.iteration, best_iteration(self.folder), train_set):
             self.save()  # first, or a resume could start before the best policy
             save(self.folder.best, self._policy())
 
@@ -294,11 +295,11 @@ def best_iteration(folder: RunFolder) -> int | None:
     return read_arrays(folder.best)[1]["iteration"] if folder.best.is_file() else None
 
 
-def is_better(rows: Frame, iteration: int, best: int | None, own: str) -> bool:
+def is_better(rows: Frame, iteration: int, best: int | None, train_set: str) -> bool:
     """Returns whether an evaluation is better than that of the best iteration so far.
 
     Compares the mean fractions of validation tasks solved, over the task sets that both have. Base,
-    a single task, counts only if it is the training set `own` or the only set.
+    a single task, counts only if it is the training set or the only set.
     """
     solved = rows.assign(share=rows["solved"] / rows["tasks"]).pivot_table(
         index="task_set", columns="iteration", values="share", aggfunc="last"
@@ -306,6 +307,6 @@ def is_better(rows: Frame, iteration: int, best: int | None, own: str) -> bool:
     if iteration not in solved or best not in solved or iteration == best:
         return iteration in solved and iteration != best
     both = solved[[best, iteration]].dropna()
-    ranked = both if own == "base" else both.drop(index="base", errors="ignore")
+    ranked = both if train_set == "base" else both.drop(index="base", errors="ignore")
     means = (ranked if len(ranked) else both).mean()
     return bool(means[iteration] > means[best])

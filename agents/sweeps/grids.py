@@ -16,7 +16,7 @@ from agents.runs.folder import RunFolder, check_name
 from agents.runs.run import Run, RunOptions
 from trap_tube_jax.checks import check_integer
 
-COMMA = re.compile(r",(?![^\[]*\])")  # but not those of a list
+COMMA = re.compile(r",(?![^\[]*\])")  # but not within a list
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,8 @@ class Grid:
         if (options.preset, short) != (self.options.preset, self.options.env):
             name = f"{name}-{options.preset}-{short}"
         check_name(options.name or name)
-        root, runs = options.out / (options.name or name), {}
+        root = options.out / (options.name or name)
+        runs = {}
         for seed in range(options.seed, options.seed + options.seeds):
             for point, config in configs.items():
                 run = Run(config, seed, point, options.imports)
@@ -102,13 +103,13 @@ class Grid:
         given = dict(map(_parse, options.settings))
         if len(given) < len(options.settings):
             raise ValueError(f"give a setting only once, got {' '.join(options.settings)}")
-        fixed = sorted({name for own in self.points.values() for name in own} & given.keys())
+        fixed = sorted({name for point in self.points.values() for name in point} & given.keys())
         if fixed:
             raise ValueError(f"the grid's points decide {', '.join(fixed)}; use --only")
         common = {**self.settings, **({} if options.env is None else {"env_id": options.env})}
         configs = {}
         for name, *labels in itertools.product(self.points, *given.values()):
-            chosen = {k: given[k][each] for k, each in zip(given, labels, strict=True)}
+            chosen = {k: given[k][label] for k, label in zip(given, labels, strict=True)}
             point = ",".join(filter(None, [name, *labels])) or options.preset
             settings = {**common, **chosen, **self.points[name]}
             configs[point] = Config.preset(options.preset, **settings)
@@ -128,7 +129,7 @@ def _parse(text: str) -> tuple[str, dict[str, Any]]:
         raise ValueError(f"give settings as NAME=VALUE,VALUE, got {text!r}")
     if len(texts := COMMA.split(values)) == 1:
         return name, {"": _value(values)}
-    return name, {f"{name}={each.strip('[]').replace(',', 'x')}": _value(each) for each in texts}
+    return name, {f"{name}={text.strip('[]').replace(',', 'x')}": _value(text) for text in texts}
 
 
 def _value(text: str) -> Any:

@@ -88,6 +88,8 @@ def launch(
                 if request():
                     present.end()
                     _cancel_waiting({call: calls[call] for call in pending})
+                    ended |= {call for call in pending if call.cancelled()}  # Dask does not tell
+                    pending -= ended
                 for call in (call for call in calls if call in ended):
                     for path, outcome in _outcomes(call, calls[call], bool(request())).items():
                         count += 1

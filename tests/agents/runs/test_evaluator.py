@@ -52,7 +52,7 @@ def test_each_sets_limit_holds(played):
     evaluator, params, outcomes = played
     mine = outcomes["mine"]
     limits = {"one": 1, "twelve": STEPS}
-    tasks = dict.fromkeys(limits, evaluator.tasks["mine"])
+    tasks: dict[str, tt.State] = dict.fromkeys(limits, evaluator.tasks["mine"])
     found = Evaluator(CONFIG, Suite(tasks, limits))(params)
     np.testing.assert_array_equal(found["twelve"].solved, mine.solved)
     np.testing.assert_array_equal(found["twelve"].length, mine.length)

@@ -8,8 +8,8 @@ import subprocess
 
 import pytest
 
-from agents.acting.evaluation import Evaluator
 from agents.runs import report
+from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
 from agents.runs.run import Run
