@@ -20,7 +20,6 @@ from trap_tube_jax.scoring.tasks import Purpose
 
 Row = Mapping[str, Any]
 Table = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
-Frame = Table  # the former name
 
 
 def _text(value: str) -> str:

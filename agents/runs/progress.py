@@ -18,8 +18,8 @@ from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy, save
 from agents.runs.loggers import open_loggers
 from agents.runs.metrics import (
-    Frame,
     Row,
+    Table,
     append_rows,
     evaluation_rows,
     is_last,
@@ -285,7 +285,7 @@ def check_best(folder: RunFolder, iteration: int, sets: Sequence[str]) -> None:
         )
 
 
-def validation_rows(folder: RunFolder) -> Frame:
+def validation_rows(folder: RunFolder) -> Table:
     """Returns the evaluations that select the best policy."""
     return read_rows(folder.evaluations).query("purpose == 'validation'")
 
@@ -295,7 +295,7 @@ def best_iteration(folder: RunFolder) -> int | None:
     return read_arrays(folder.best)[1]["iteration"] if folder.best.is_file() else None
 
 
-def is_better(rows: Frame, iteration: int, best: int | None, train_set: str) -> bool:
+def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:
     """Returns whether an evaluation is better than that of the best iteration so far.
 
     Compares the mean fractions of validation tasks solved, over the task sets that both have. Base,

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from agents.runs.metrics import Frame as Table
+from agents.runs.metrics import Table
 from agents.sweeps import tables
 
 WIDTH = 8.3  # inches, as in a page 830 pixels wide

@@ -17,7 +17,7 @@ import pandas as pd
 import agents
 from agents.files import read_json, write_bytes, write_json
 from agents.runs.folder import RunFolder
-from agents.runs.metrics import Frame as Table
+from agents.runs.metrics import Table
 from agents.runs.progress import has_ended
 from agents.runs.results import find_runs, metrics
 from agents.sweeps import figures, tables

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from agents.runs.metrics import Frame as Table
+from agents.runs.metrics import Table
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 from trap_tube_jax.tables import markdown_table
 

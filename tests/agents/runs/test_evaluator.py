@@ -52,8 +52,8 @@ def test_each_sets_limit_holds(played):
     evaluator, params, outcomes = played
     mine = outcomes["mine"]
     limits = {"one": 1, "twelve": STEPS}
-    tasks: dict[str, tt.State] = dict.fromkeys(limits, evaluator.tasks["mine"])
-    found = Evaluator(CONFIG, Suite(tasks, limits))(params)
+    mine_twice: Any = dict.fromkeys(limits, evaluator.tasks["mine"])
+    found = Evaluator(CONFIG, Suite(mine_twice, limits))(params)
     np.testing.assert_array_equal(found["twelve"].solved, mine.solved)
     np.testing.assert_array_equal(found["twelve"].length, mine.length)
     at_once = mine.solved & (mine.length == 1)
