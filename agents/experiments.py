@@ -1,4 +1,4 @@
-"""The named grids: python -m agents.experiments exp1|exp2|fast|best|curiosities --help."""
+"""The named grids, such as exp1 and best: python -m agents.experiments NAME --help."""
 
 import sys
 from collections.abc import Sequence

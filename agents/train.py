@@ -103,8 +103,8 @@ def train(options: Options, run: Run, run_options: RunOptions) -> None:
     compilation.enable_cache()
     try:
         with stopping(lambda: display.resume_hint(folder, run) if is_first else ""):
-            scores = train_run(folder.path, run, run_options, console=console)
-            for line in ([scores] if scores else []) + display.summary(folder, run):
+            train_run(folder.path, run, run_options, console=console)
+            for line in display.summary(folder, run):
                 console.out(line)
     except OSError as error:
         raise OSError(f"{error}. {display.resume_hint(folder, run)}") from error

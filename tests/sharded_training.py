@@ -88,9 +88,7 @@ def gradient_gap():
     def gradient(params, batch):
         return placement.axis.mean(jax.grad(learner.loss, has_aux=True)(params, batch)[0])
 
-    halves: Any = jax.tree.map(lambda _: PartitionSpec(None, EPISODES), batch)
-    layout = jax.tree.map(lambda _: PartitionSpec(EPISODES), batch.episodes.layout)
-    halves = halves._replace(episodes=halves.episodes._replace(layout=layout))
+    halves: Any = jax.tree.map(lambda _: PartitionSpec(EPISODES), batch)
     whole = PartitionSpec()
     shared = jax.shard_map(
         gradient,

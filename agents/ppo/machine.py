@@ -33,3 +33,12 @@ def make_encoding(agent: Agent, encode_for_curiosity: EncodeFn = no_features) ->
 
         return FastEncoding(agent, encode_for_curiosity)
     return Encoding(agent, encode_for_curiosity)
+
+
+def seeds_share_programs(config: Config, backend: str) -> bool:
+    """Returns whether seeds of these settings train faster in one program than one by one.
+
+    On a CPU seeds train faster on a core each. If the network convolves, as every encoder but
+    `objects` may, the kernels differ between seeds, for which GPUs have no fast program.
+    """
+    return backend != "cpu" and config.encoder == "objects"

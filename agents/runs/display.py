@@ -21,8 +21,8 @@ class ProgressLine(Progress):
         super().__init__(
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
-            TextColumn("{task.description}", markup=False),
             TimeRemainingColumn(compact=True),
+            TextColumn("{task.description}", markup=False),  # cut off on a narrow terminal
             console=console,
             auto_refresh=False,
             disable=not console.is_terminal,

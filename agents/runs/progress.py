@@ -103,7 +103,8 @@ class Progress:
         self.console.out(
             f"{self.folder.path}: {tt.task_set(config.env_id).id}, curiosity {config.curiosity}, "
             f"seed {self.run.seed}, {self.program.num_parameters:,} parameters, on "
-            f"{self.program.placement}{together}. Compiling, which takes up to a minute ..."
+            f"{self.program.placement}, {self.program.learner.path} path{together}. "
+            "Compiling, which takes up to a minute ..."
         )
 
     def record(self, metrics: Metrics, seconds: float) -> None:
@@ -157,7 +158,8 @@ class Progress:
         scores = evaluator.scores(played)
         rows = evaluation_rows(scores, policy, "test")
         append_rows(self.folder.evaluations, [row for row in rows if row["task_set"] not in tested])
-        if options.report:
+        self.console.out(scores)
+        if options.report:  # last, since a figure may fail
             report.write(self.folder, self.run, evaluator, played)
         return scores
 
@@ -167,11 +169,18 @@ class Progress:
         `transitions_per_second` counts the run's steps, over the time of all seeds together.
         """
         iteration = self.iteration + 1
+        config = self.run.config
+        # Computed before the first gradient step, with parameters that were finite.
+        if not np.isfinite(metrics["intrinsic_reward"]):
+            raise ValueError(
+                f"curiosity {config.curiosity!r} returned a reward that is not finite in "
+                f"iteration {iteration}"
+            )
         # A parameter is infinite or NaN only if the norm of a gradient is.
         if not all(np.isfinite(metric).all() for metric in metrics.values()):
             raise ValueError(
                 f"training diverged in iteration {iteration}: a loss or a gradient is not "
-                f"finite; try a learning_rate below {self.run.config.learning_rate:g}"
+                f"finite; try a learning_rate below {config.learning_rate:g}"
             )
         shares = {name: metric.mean() for name, metric in metrics.items() if metric.ndim}
         numbers = {**metrics, **shares}  # means in float64, to compare with thresholds

@@ -7,7 +7,6 @@ in the background.
 import contextlib
 import dataclasses
 import functools
-import importlib
 import signal
 import tempfile
 import time
@@ -19,10 +18,10 @@ from rich.console import Console
 
 from agents.parallel import processes
 from agents.runs.folder import RunFolder
+from agents.runs.loggers import check_loggers
 from agents.runs.program import Cohort, Program
 from agents.runs.progress import Progress
 from agents.runs.run import Run, RunOptions
-from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import Stopped, deferring
 from trap_tube_jax.scoring.scores import Scores
 
@@ -104,7 +103,7 @@ def train_runs(
         for path, run in runs.items():
             console = (consoles or {}).get(path) or Console(quiet=True)
             with recording(outcomes, path):
-                stored = RunFolder(path.expanduser())
+                stored = RunFolder(path)
                 folder = stack.enter_context(writing(stored))
                 opened[path] = Progress(run, program, stored, folder, console)
                 opened[path].begin()
@@ -152,14 +151,6 @@ def train(
                     if number:
                         progress.save()
                         raise Stopped(number)
-
-
-def check_loggers(options: RunOptions) -> None:
-    """Raises ImportError if a logger is missing, before anything is compiled or written."""
-    with needs_extra("logging"):
-        for name in ("tensorboard", "wandb"):
-            if getattr(options, name):
-                importlib.import_module(name)
 
 
 @contextlib.contextmanager

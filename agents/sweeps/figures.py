@@ -9,9 +9,11 @@ from matplotlib.figure import Figure
 
 from agents.runs.metrics import Table
 from agents.sweeps import tables
+from trap_tube_jax.scoring.tasks import label
 
 WIDTH = 8.3  # inches, as in a page 830 pixels wide
 DPI = 150
+UNITS = {"transitions": "environment steps", "episodes": "episodes"}
 # Okabe and Ito's palette, which is colour-blind safe.
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 
@@ -36,25 +38,29 @@ def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) ->
 
 
 def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
-    """Draws percent solved over iterations: in training, and greedily on each set."""
+    """Draws percent solved over environment steps: in training, and greedily on every set."""
     train_set = about["train_set"]
     greedy = results[results["purpose"] == "validation"]
     greedy = greedy.assign(value=greedy["solved"] / greedy["tasks"])
-    titles = tables.set_titles([train_set, *greedy["task_set"].unique()])
+    # Records of the first versions count no environment steps.
+    unit = "transitions" if curves["transitions"].notna().all() else "episodes"
+    curves = curves.assign(progress=curves[unit] / 1e6)
+    progress = curves[["algorithm", "seed", "iteration", "progress"]]
+    greedy = greedy.merge(progress, on=["algorithm", "seed", "iteration"], how="left")
     panels = {
         "training": curves.assign(value=curves["success"]),
-        f"greedy, {titles[train_set]}": curves.assign(value=curves["validation_success"]),
+        f"greedy, {label(train_set)}": curves.assign(value=curves["validation_success"]),
     }
     for name, rows in greedy.groupby("task_set", sort=False):
         if name != train_set and rows.groupby(["algorithm", "seed"]).size().min() > 1:
-            panels[f"greedy, {titles[str(name)]}"] = rows
+            panels[f"greedy, {label(str(name))}"] = rows
     figure, axes = make_panels(list(panels), min(3, len(panels)), 2.1, about["title"])
     for axis, rows in zip(axes, panels.values(), strict=True):
         for color, name in zip(COLORS, curves["algorithm"].unique(), strict=False):
             _draw_seeds(axis, rows[rows["algorithm"] == name], color, str(name))
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
-        axis.set_xlabel("iterations")
+        axis.set_xlabel(f"{UNITS[unit]}, millions")
     figure.supylabel("solved, %", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
@@ -66,7 +72,7 @@ def draw_success(tested: Table, about: Mapping[str, Any]) -> Any:
     paper = tables.PAPER_SUCCESS if about["train_set"] == "pstsy" else {}
     algorithms = list(tested["algorithm"].unique())
     names = [*algorithms, *paper]
-    titles = list(tables.set_titles(table).values())
+    titles = list(map(label, table))
     figure, axes = make_panels(titles, 5, 0.25 * len(names) + 0.4, about["title"])
     for axis, column in zip(axes, table, strict=True):
         for row, name in enumerate(algorithms):
@@ -110,14 +116,18 @@ def make_panels(
 
 
 def _draw_seeds(axis: Any, rows: Table, color: str, name: str) -> None:
-    """Plots a line per seed, and the mean of several seeds if all end at the same iteration."""
+    """Plots a line per seed, or the mean and range of seeds that end at the same iteration."""
     values = 100 * rows.pivot_table(index="iteration", columns="seed", values="value")
-    with_mean = values.shape[1] > 1 and bool(values.iloc[-1].notna().all())
+    progress = rows.pivot_table(index="iteration", columns="seed", values="progress")
+    if values.shape[1] > 1 and bool(values.iloc[-1].notna().all()):
+        together = values.dropna()
+        x = progress.loc[together.index].mean(axis=1)
+        axis.fill_between(x, together.min(axis=1), together.max(axis=1), color=color, alpha=0.15)
+        axis.plot(x, together.mean(axis=1), color=color, label=f"{name}, mean and range of seeds")
+        return
     for count, seed in enumerate(values):
         curve = values[seed].dropna()
-        style = {"linewidth": 0.7, "alpha": 0.45} if with_mean else {"linewidth": 1.2}
-        name_once = "" if with_mean or count else name
-        axis.plot(curve.index, curve, color=color, label=name_once, **style)
-    if with_mean:
-        mean = values.dropna().mean(axis=1)
-        axis.plot(mean.index, mean, color=color, linewidth=1.8, label=f"{name}, mean of seeds")
+        name_once = "" if count else name
+        axis.plot(
+            progress.loc[curve.index, seed], curve, color=color, label=name_once, linewidth=1.2
+        )

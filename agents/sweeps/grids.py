@@ -142,6 +142,14 @@ def _value(text: str) -> Any:
 
 # Source of `exp1` and `exp2`: the paper's section "Results".
 PAPER_POINTS = {"ppo": {"curiosity": "none"}, "ppo+icm": {"curiosity": "icm"}}
+# What the published code may have run under these names. Its flag for PPO without ICM switches off
+# only the losses, so the error of an untrained forward model stays a bonus (`ppo+bonus`). It reads
+# the previous action and reward only if asked to (`ppo+icm-blind` does not).
+CODE_POINTS = {
+    **PAPER_POINTS,
+    "ppo+bonus": {"curiosity": "icm", "curiosity_coef": 0.0},
+    "ppo+icm-blind": {"curiosity": "icm", "previous_inputs": False},
+}
 PAPER_RUN = RunOptions(evaluate_every=1, test_tasks=1000)
 BEST_RUN = RunOptions(evaluate_every=20, test_tasks=1000)
 CURIOSITIES = ("icm", "rnd", "noveld", "effects")
@@ -152,6 +160,12 @@ GRIDS = {
     ),
     "exp2": Grid(
         Options(preset="paper", env="pstsy", seeds=5), PAPER_RUN, {"iterations": 500}, PAPER_POINTS
+    ),
+    "exp1-code": Grid(
+        Options(preset="paper", env="base", seeds=5), PAPER_RUN, {"iterations": 250}, CODE_POINTS
+    ),
+    "exp2-code": Grid(
+        Options(preset="paper", env="pstsy", seeds=5), PAPER_RUN, {"iterations": 500}, CODE_POINTS
     ),
     "fast": Grid(
         Options(preset="fast", env="base", seeds=10),

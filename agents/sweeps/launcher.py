@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from agents.ppo import machine
 from agents.runs.folder import RunFolder
 from agents.runs.progress import has_ended
 from agents.runs.run import Run, RunOptions
@@ -44,22 +45,16 @@ def group_runs(runs: Group, sizes: Mapping[Path, int]) -> list[dict[Path, Run]]:
 def program_sizes(
     runs: Group, options: RunOptions, executor: Executor, size: int | None
 ) -> dict[Path, int]:
-    """Returns the largest number of seeds in the program of every run, by default what pays.
-
-    On a CPU seeds train faster on a core each. The kernels of convolutions differ between seeds,
-    for which GPUs have no fast program.
-    """
+    """Returns the largest number of seeds in the program of every run, by default what pays."""
     if len({run.seed for run in runs.values()}) == 1 or (options.devices or 1) > 1:
         return dict.fromkeys(runs, 1)
     if size is not None:
         return dict.fromkeys(runs, size)
-    alone = backend_of(executor) == "cpu"
-    return {path: 1 if alone or convolves(run) else len(runs) for path, run in runs.items()}
-
-
-def convolves(run: Run) -> bool:
-    """Returns whether the run's network convolves, as every encoder but `objects` may."""
-    return run.config.encoder != "objects"
+    backend = backend_of(executor)
+    return {
+        path: len(runs) if machine.seeds_share_programs(run.config, backend) else 1
+        for path, run in runs.items()
+    }
 
 
 def launch(

@@ -4,7 +4,7 @@ Source: the paper's Tables 1 and 2; Student's t for the interval of a mean of fe
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -57,13 +57,6 @@ def unfinished_note(about: Mapping[str, Any]) -> list[str]:
     """Names the runs that have not reached their end, in one sentence; none if all have."""
     runs = [f"{algorithm} seed {seed}" for algorithm, seed in about.get("unfinished", ())]
     return [f"Unfinished, so the table may change: {', '.join(runs)}."] if runs else []
-
-
-def set_titles(names: Iterable[str]) -> dict[str, str]:
-    """Returns the titles of task sets by their short names; equal labels are told apart."""
-    labels = {name: label(name) for name in names}
-    count = Counter(labels.values())
-    return {name: text if count[text] == 1 else f"{text} ({name})" for name, text in labels.items()}
 
 
 def reported(results: Table) -> Table:
@@ -124,7 +117,7 @@ def success_table(tested: Table, with_paper: bool) -> Table:
             for short, mean, sd in zip(PAPER_SETS, *paper, strict=True)
         }
     table = pd.DataFrame(columns).fillna(NOTHING)
-    return table.rename(index=set_titles(table.index))
+    return table.rename(index=label)
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:

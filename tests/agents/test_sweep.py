@@ -232,8 +232,12 @@ def test_a_grid_that_is_being_written_is_refused(capsys, tmp_path):
 
 
 def test_named_grids_are_known_and_their_points_are_fixed(capsys):
-    assert "exp1,exp2,fast,best,curiosities" in refused(capsys, experiments.main, "exp3")
-    assert "exp1,exp2,fast,best,curiosities" in refused(capsys, experiments.main)
+    assert "exp1,exp2,exp1-code,exp2-code,fast,best,curiosities" in refused(
+        capsys, experiments.main, "exp3"
+    )
+    assert "exp1,exp2,exp1-code,exp2-code,fast,best,curiosities" in refused(
+        capsys, experiments.main
+    )
     message = refused(capsys, experiments.main, "exp1", "--settings", "curiosity=rnd")
     assert "the grid's points decide curiosity; use --only" in message
 

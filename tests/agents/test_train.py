@@ -119,6 +119,7 @@ def test_training_ends_without_a_traceback_where(vanishes, code, says, tmp_path)
     assert says in errors
 
 
+@pytest.mark.slow
 def test_training_runs_in_a_thread(tmp_path):
     arguments = [*options(), "--iterations", "1", "--out", str(tmp_path), "--name", "x"]
     with futures.ThreadPoolExecutor(1) as pool:

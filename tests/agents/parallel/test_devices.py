@@ -44,6 +44,7 @@ def test_one_device_computes_as_it_is_told():
     assert str(alone) == "cpu"
 
 
+@pytest.mark.slow
 def test_two_devices_train_as_one():
     """By what `sharded_training` finds on two simulated devices."""
     environment = {k: v for k, v in os.environ.items() if k != "JAX_NUM_CPU_DEVICES"}

@@ -64,7 +64,7 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
     ("arguments", "message"),
     [
         ("--devices 2", "2 of 1 cpu devices in 1 process(es) cannot share"),
-        ("--devices 0", "allowed: 1"),
+        ("--devices 0", "devices must be an integer >= 1"),
         ("--distributed", "cannot join the other processes"),
         ("--distributed a:1", "else --distributed HOST:PORT PROCESSES NUMBER"),
     ],

@@ -382,6 +382,7 @@ def test_seeds_of_one_program_equal_seeds_alone(alone, tmp_path):
         assert final_state(path)[0] == read_policy(RunFolder(path).best).iteration + 1 == 3
 
 
+@pytest.mark.slow
 def test_seeds_of_one_program_stop_together_and_go_on_from_where_they_stand(alone, tmp_path):
     """The first is one iteration ahead."""
     runs = {tmp_path / f"{seed}": small_run(3, seed=seed) for seed in SEEDS}
@@ -408,7 +409,8 @@ def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
     config = small_config(iterations=3, stop_when_solved=1.0)
     runs = {tmp_path / f"{seed}": Run(config, seed) for seed in range(4)}
     RunFolder(tmp_path / "0").checkpoints.mkdir(parents=True)
-    append_rows(tmp_path / "0" / "metrics.csv", [{"iteration": 1}])
+    costs = {"iteration": 1, "episodes": 8, "transitions": 48, "seconds": 1.0}
+    append_rows(tmp_path / "0" / "metrics.csv", [{**costs, "validation_success": 0.0}])
     failed, diverged, solved, other = train_runs(runs, PLAIN).values()
     assert "no checkpoint" in str(failed)
     assert "diverged in iteration 2" in str(diverged)

@@ -94,3 +94,12 @@ def test_a_stored_run_with_other_settings_is_refused(tmp_path):
     RunFolder(path).note(run)
     longer = dataclasses.replace(given, settings=("clip_eps=0.3", "iterations=200"))
     assert Grid().make_runs("sweep", longer)[path].config.iterations == 200
+
+
+def test_the_arms_of_the_published_code_hold_the_papers_two():
+    for number in ("1", "2"):
+        paper, code = (GRIDS[name].points for name in (f"exp{number}", f"exp{number}-code"))
+        assert paper.items() <= code.items()
+    found = configs(grid=GRIDS["exp2-code"], preset="paper")
+    assert found["ppo+bonus"].curiosity_coef == 0 < found["ppo+bonus"].intrinsic_coef
+    assert not found["ppo+icm-blind"].previous_inputs
