@@ -46,7 +46,7 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
     unit = "transitions" if curves["transitions"].notna().all() else "episodes"
     curves = curves.assign(progress=curves[unit] / 1e6)
     progress = curves[["algorithm", "seed", "iteration", "progress"]]
-    greedy = greedy.merge(progress, on=["algorithm", "seed", "iteration"], how="left")
+    greedy = greedy.merge(progress, on=["algorithm", "seed", "iteration"])
     panels = {
         "training": curves.assign(value=curves["success"]),
         f"greedy, {label(train_set)}": curves.assign(value=curves["validation_success"]),
@@ -61,7 +61,7 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
         axis.set_xlabel(f"{UNITS[unit]}, millions")
-    figure.supylabel("solved, %", fontsize=10)
+    figure.supylabel("solved, %: mean and range of seeds", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -122,8 +122,8 @@ def _draw_seeds(axis: Any, rows: Table, color: str, name: str) -> None:
     if values.shape[1] > 1 and bool(values.iloc[-1].notna().all()):
         together = values.dropna()
         x = progress.loc[together.index].mean(axis=1)
-        axis.fill_between(x, together.min(axis=1), together.max(axis=1), color=color, alpha=0.15)
-        axis.plot(x, together.mean(axis=1), color=color, label=f"{name}, mean and range of seeds")
+        axis.fill_between(x, together.min(axis=1), together.max(axis=1), color=color, alpha=0.1)
+        axis.plot(x, together.mean(axis=1), color=color, label=name)
         return
     for count, seed in enumerate(values):
         curve = values[seed].dropna()
