@@ -329,19 +329,23 @@ def _check_value(field: dataclasses.Field, value: Any) -> None:
     """Raises ValueError for a value that the field's type or limits do not allow."""
     kind = field.type
     if get_origin(kind) is Literal:
-        wanted, valid = f"one of {', '.join(get_args(kind))}", value in get_args(kind)
+        wanted = f"one of {', '.join(get_args(kind))}"
+        valid = value in get_args(kind)
     elif kind in (bool, str):
-        wanted, valid = "True or False" if kind is bool else "a name", type(value) is kind
+        wanted = "True or False" if kind is bool else "a name"
+        valid = type(value) is kind
     else:
         low, high = field.metadata["limits"]
         is_whole = "int" in str(kind)
         wanted = f"{'an integer' if is_whole else 'a finite number'} from {low:,}"
         wanted += f" to {high:,}" if high < MAX_INT32 else ""
-        numbers, valid = (value,), True
+        numbers = (value,)
+        valid = True
         if get_origin(kind) is tuple:
             length = 2 if field.name == "filters" else None
             wanted = f"{length or 'a tuple of'} numbers, each {wanted}"
-            numbers, valid = value, type(value) is tuple and len(value) == (length or len(value))
+            numbers = value
+            valid = type(value) is tuple and len(value) == (length or len(value))
         types = (int,) if is_whole else (int, float)  # `type` tells a bool from an int
         valid = valid and all(type(x) in types and low <= x <= high for x in numbers)
     if not valid and not (value is None and field.default is None):

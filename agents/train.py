@@ -69,7 +69,8 @@ def start_devices(first: Options, devices: DeviceOptions) -> None:
 def parse(first: Options, arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
     """Reads a command line; the preset of `first`, or its stored run, has the defaults."""
     if first.resume is None:
-        run, run_options = Run(Config.preset(first.preset)), RunOptions()
+        run = Run(Config.preset(first.preset))
+        run_options = RunOptions()
         defaults = Options()
     else:
         new = Options()

@@ -173,10 +173,12 @@ def task_set_subject(task_set: str, *, plain: bool = False) -> Subject:
     env = tt.make(task_set)
     if plain:
         auto_reset = tt.AutoReset(env)
-        reset, step = jax.vmap(auto_reset.reset), jax.vmap(auto_reset.step)
+        reset = jax.vmap(auto_reset.reset)
+        step = jax.vmap(auto_reset.step)
     else:
         vector = VectorEnvironment(env)
-        reset, step = vector.reset, vector.step
+        reset = vector.reset
+        step = vector.step
     return Subject(task_set, reset, step, sample_actions, lambda timestep: timestep.observation)
 
 
@@ -193,7 +195,8 @@ def measure_throughput(
     Each call continues from the states of the one before. Devices step their shares of the
     environments and exchange nothing.
     """
-    devices, use = options.devices, PATTERNS[pattern]
+    devices = options.devices
+    use = PATTERNS[pattern]
 
     def reset(keys: jax.Array) -> Any:
         state, timestep = subject.reset(keys)

@@ -181,9 +181,11 @@ def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
 def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed]:
     """Times our program and the plain ones in alternating calls, after a warm-up round."""
     config = options.config(task_set, network)
-    env, encoder = None, None
+    env = None
+    encoder = None
     if network == "dense":
-        env, encoder = ThroughGymnax(config), DenseEncoder()
+        env = ThroughGymnax(config)
+        encoder = DenseEncoder()
     plain = plain_ppo.PlainPPO(config, env, encoder)
     compile_program: dict[ProgramName, Callable[[], Program]] = {
         "ours": lambda: our_program(config),

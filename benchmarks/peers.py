@@ -61,7 +61,8 @@ def pgx_breakout() -> Subject:
 def navix_doorkey() -> Subject:
     """Returns Navix's DoorKey-8x8, which resets automatically."""
     env = importlib.import_module("navix").make("Navix-DoorKey-8x8-v0")
-    reset, step = jax.vmap(env.reset), jax.vmap(env.step)
+    reset = jax.vmap(env.reset)
+    step = jax.vmap(env.step)
     return _stateless("Navix DoorKey-8x8", reset, step, len(env.action_set))
 
 
@@ -83,7 +84,8 @@ def jumanji_snake() -> Subject:
     """Returns Snake of Jumanji under its own auto-reset."""
     env = importlib.import_module("jumanji").make("Snake-v1")
     env = importlib.import_module("jumanji.wrappers").AutoResetWrapper(env)
-    reset, step = jax.vmap(env.reset), jax.vmap(env.step)
+    reset = jax.vmap(env.reset)
+    step = jax.vmap(env.step)
     return Subject(
         "Jumanji Snake", reset, step, _actions(4), lambda timestep: timestep.observation.grid
     )

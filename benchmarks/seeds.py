@@ -67,7 +67,8 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
     """Times calls of several iterations of `seeds` seeds."""
     learner = make_learner(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
-    init, iterate = learner.init, learner.iterate
+    init = learner.init
+    iterate = learner.iterate
     if seeds > 1:
         init, iterate = jax.vmap(init), jax.vmap(iterate)
     else:

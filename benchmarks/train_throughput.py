@@ -128,7 +128,9 @@ def core_gradients(learner: Learner, params: Params, batch: Batch, features: jax
 
 def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batch) -> jax.Array:
     """Returns the sum of squares of what all loss terms but motion's are computed from."""
-    agent, curiosity, episodes = learner.agent, learner.curiosity, part.episodes
+    agent = learner.agent
+    curiosity = learner.curiosity
+    episodes = part.episodes
     embedding, following = agent.unroll(
         params,
         features,

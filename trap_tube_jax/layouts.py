@@ -15,7 +15,8 @@ import numpy as np
 from trap_tube_jax.geometry import COLUMNS, ROWS
 from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND, TRAP, TUBE1, TUBE2
 
-CENTER_FIRST, CENTER_LAST = 4, 8  # rows and columns of the central block, both included
+CENTER_FIRST = 4
+CENTER_LAST = 8
 NUM_OUTLINES = 32
 NUM_ASSIGNMENTS = 8
 

@@ -1,4 +1,4 @@
-"""Encodes observations as episodes are played, and those of finished episodes.
+"""Encodes the observations of episodes, while they are played and afterwards.
 
 `Encoding` applies the encoder to every observation. `rollout` and the learner take an encoding as
 an argument, so a faster one can replace it; `agents.ppo.machine` chooses.

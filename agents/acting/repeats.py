@@ -8,7 +8,7 @@ effect. A policy that always takes the most probable action may therefore walk i
 
 where n counts how many of the episode's last 64 steps took this action at this observation.
 
-Source: own.
+Source: this project.
 """
 
 from typing import NamedTuple

@@ -4,7 +4,7 @@ The rules are invariant under the eight symmetries of the board, so an agent may
 board and act in that image. Choosing the image by the direction of the food at the first
 observation leaves an eighth of the situations to learn. The symmetry holds for the whole episode.
 
-Source: own; Puny et al. (2022) average over frames, and choose them.
+Source: this project; Puny et al. (2022) average over frames, and choose them.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
 """Effects: the reward of an episode's first changes to food and tool, and of its first grasps.
 
-Source: own. Relatives: visits counted within an episode, in NGU (Badia et al., 2020) and NovelD
-(Zhang et al., 2021); change as a reward, in C-BET (Parisi et al., 2021); the impact of actions,
-in RIDE (Raileanu and Rocktaeschel, 2020).
+Source: this project. Relatives: visits counted within an episode, in NGU (Badia et al., 2020) and
+NovelD (Zhang et al., 2021); change as a reward, in C-BET (Parisi et al., 2021); the impact of
+actions, in RIDE (Raileanu and Rocktaeschel, 2020).
 """
 
 import jax

@@ -18,7 +18,7 @@ ALPHA = 0.5  # as in the paper
 class NovelD(RND):
     """reward_t = max(n(o_{t+1}) - 0.5 n(o_t), 0), if o_{t+1} is new in its episode, else 0.
 
-    n is the Euclidean norm of the prediction error of `rnd`; the loss is that of `rnd`.
+    n is the Euclidean norm of the prediction error of `rnd`; the loss is `rnd`'s.
     """
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:

@@ -79,12 +79,16 @@ class Network(nn.Module):
     def setup(self) -> None:
         """Declares the layers."""
         embed = functools.partial(nn.Embed, 4, self.embedding, embedding_init=he_normal)
-        self.grasp, self.move, self.reward = embed(), embed(), dense(self.embedding)
+        self.grasp = embed()
+        self.move = embed()
+        self.reward = dense(self.embedding)
         self.initial = self.param("initial", nn.initializers.zeros, (self.hidden,))
         self.gru = nn.GRUCell(self.hidden, kernel_init=he_normal, recurrent_kernel_init=he_normal)
         self.unroll: Any = nn.RNN(self.gru)
-        self.policy, self.critic = nn.DenseGeneral((2, 4)), nn.Dense(1)
-        self.mix, self.forward = dense(self.hidden), nn.Dense(self.hidden)
+        self.policy = nn.DenseGeneral((2, 4))
+        self.critic = nn.Dense(1)
+        self.mix = dense(self.hidden)
+        self.forward = nn.Dense(self.hidden)
         self.inverse = nn.Sequential([dense(self.hidden), nn.swish, nn.DenseGeneral((2, 4))])
 
     def embed(self, action: jax.Array) -> jax.Array:
@@ -133,7 +137,8 @@ class PlainPPO:
 
     def __init__(self, config: Config, env: Any = None, encoder: nn.Module | None = None):
         sizes = {"num_features": config.num_features, "max_steps": config.max_steps}
-        self.config, self.env = config, env or tt.make(config.env_id, **sizes)
+        self.config = config
+        self.env = env or tt.make(config.env_id, **sizes)
         encoder = encoder or Encoder(config.filters)
         self.network: Any = Network(encoder, config.hidden, config.embedding)
         self.apply = jax.vmap(self.network.apply, (None, 0))  # to episodes [B, ...]
@@ -155,7 +160,8 @@ class PlainPPO:
     def collect(self, state: TrainState) -> tuple[TrainState, Batch, jax.Array]:
         """Plays the episodes of an iteration, and draws its minibatches i32[updates, size]."""
         play_key, order_key, key = jax.random.split(state.key, 3)
-        count, epochs = self.config.episodes_per_iteration, self.config.epochs
+        count = self.config.episodes_per_iteration
+        epochs = self.config.epochs
         episode = jax.vmap(self.play, (None, 0))(state.params, jax.random.split(play_key, count))
         variance, batch = self.prepare(state, episode)
         orders = [jax.random.permutation(k, count) for k in jax.random.split(order_key, epochs)]
@@ -178,7 +184,8 @@ class PlainPPO:
             inputs = (hidden, timestep.observation, action, reward[None])
             return (state, mask * (1.0 - timestep.done), inputs), record
 
-        start, nothing = params["params"]["initial"], (jnp.zeros(2, jnp.int32), jnp.zeros(1))
+        start = params["params"]["initial"]
+        nothing = (jnp.zeros(2, jnp.int32), jnp.zeros(1))
         first = (state, jnp.ones(()), (start, timestep.observation, *nothing))
         times = jnp.arange(self.env.max_steps)
         (_, _, inputs), record = jax.lax.scan(step, first, times)
@@ -186,7 +193,8 @@ class PlainPPO:
 
     def prepare(self, state: TrainState, episode: Episode) -> tuple[jax.Array, Batch]:
         """Adds both rewards, estimates advantages; returns the rewards' variances and a batch."""
-        config, mask = self.config, episode.mask
+        config = self.config
+        mask = episode.mask
         error = self.apply(state.params, episode)[2]
         rewards = jnp.stack([episode.reward, mask * jnp.sum(error, axis=-1)])
         keep = jnp.where(state.step > 0, config.reward_ema_decay, 0.0)
@@ -209,7 +217,8 @@ class PlainPPO:
 
     def loss(self, params: Any, batch: Batch) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Returns the loss f32[] and its terms, in whose means padding counts as zeros."""
-        config, (episode, advantage, target) = self.config, batch
+        config = self.config
+        (episode, advantage, target) = batch
         logits, value, error, inferred = self.apply(params, episode)
         entropy = optax.softmax_cross_entropy(logits, jax.nn.softmax(logits)).sum(axis=-1)
         ratio = jnp.exp(log_prob(logits, episode.action) - episode.log_prob)
@@ -229,8 +238,10 @@ def main(env: str = NEAR_FOOD.short, iterations: int = 10) -> float:
     """Trains on a small scale; returns the fraction of the last episodes that were solved."""
     small = {"episodes_per_iteration": 64, "minibatch_size": 16, "epochs": 5}
     learner = PlainPPO(Config.preset("paper", env_id=env, **small))
-    collect, update = jax.jit(learner.collect), jax.jit(learner.update)
-    state, success = learner.init(jax.random.key(0)), 0.0
+    collect = jax.jit(learner.collect)
+    update = jax.jit(learner.update)
+    state = learner.init(jax.random.key(0))
+    success = 0.0
     for iteration in range(1, iterations + 1):
         state, batch, minibatches = collect(state)
         for index in minibatches:

@@ -69,7 +69,8 @@ def _map_rows_backward(
     num_remembered = min((len(kept) - 1 for kept in jax.tree.leaves(memory)), default=math.inf)
 
     def body(index: jax.Array, gradient: Any) -> Any:
-        part, remembered = take(parts, index), take(memory, index)
+        part = take(parts, index)
+        remembered = take(memory, index)
         if num_remembered < num_chunks:
             remembered = jax.lax.cond(
                 index < num_remembered, lambda: remembered, lambda: fn(params, part, None)[1]

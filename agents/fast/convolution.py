@@ -57,9 +57,11 @@ def add_patches(x: jax.Array, size: int) -> jax.Array:
     Every cell of f32[M, H, W, size² * C] holds its contributions to the cells around it, row by
     row; their sums are f32[M, H, W, C].
     """
-    zero, still = jnp.zeros((), x.dtype), (0, 0, 0)
+    zero = jnp.zeros((), x.dtype)
+    still = (0, 0, 0)
     # JAX transposes `split` to one concatenation, but slices to a sum of padded arrays.
-    parts, reach = jnp.split(x, size**2, axis=-1), range(-(size // 2), size // 2 + 1)
+    parts = jnp.split(x, size**2, axis=-1)
+    reach = range(-(size // 2), size // 2 + 1)
     moved = [
         jax.lax.pad(part, zero, [still, (down, -down, 0), (right, -right, 0), still])
         for part, (down, right) in zip(parts, itertools.product(reach, reach), strict=True)

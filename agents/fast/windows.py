@@ -72,10 +72,11 @@ def encode_windows(
     """
     inside = np.ones((BOARD_SIZE, BOARD_SIZE, 1), np.float32)
     board = np.concatenate([coordinates_of_cells(), inside], axis=-1)
-    place = cut_into_windows(jnp.asarray(board[None]))[block]
-    coordinates, inside = place[..., :-1], place[..., -1:]
+    here = cut_into_windows(jnp.asarray(board[None]))[block]
+    coordinates = here[..., :-1]
+    inside = here[..., -1:]
     x = jnp.concatenate([scaled(window) * inside, coordinates], axis=-1)
-    # The second convolution pads its own input, so features beyond the edge are zeros too.
+    # The second convolution pads its input, so features beyond the edge are zeros too.
     x = nn.swish(_unpadded(weights["conv1"], x)) * inside[:, :-1, :-1]
     x = jnp.max(nn.swish(_unpadded(weights["conv2"], x)), axis=(1, 2))
     kernel = weights["block1"]["conv1"]["kernel"][::-1, ::-1]
@@ -92,7 +93,8 @@ def encode_blocks(
         made[name] = value if remembered is None else chunks.recall(value, remembered[name])
         return made[name]
 
-    block1, block2 = weights["block1"], weights["block2"]
+    block1 = weights["block1"]
+    block2 = weights["block2"]
     x = product("x", x)
     y = add_patches(spread, len(block1["conv1"]["kernel"]))
     y = product("block1/conv1", y + as_row(block1["conv1"]["bias"], y.ndim))

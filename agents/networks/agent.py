@@ -48,7 +48,8 @@ class Agent:
             chex.assert_type(features, jnp.float32)
             assert set(encoder) <= {"params"}, f"collections {', '.join(encoder)}, not params alone"
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
-        action, reward = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1, jnp.float32)
+        action = jnp.zeros((1, 2), jnp.int32)
+        reward = jnp.zeros(1, jnp.float32)
         params = {
             "encoder": encoder,
             "core": self.core.init(key, state, features, action, reward),

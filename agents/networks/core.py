@@ -44,7 +44,8 @@ class Core(nn.Module):
         embed = functools.partial(
             nn.Embed, NUM_DIRECTIONS, self.embedding, embedding_init=hidden_init
         )
-        self.grasp_embedding, self.move_embedding = embed(), embed()
+        self.grasp_embedding = embed()
+        self.move_embedding = embed()
         self.reward_embedding = dense(self.embedding)
         self.mix = dense(self.hidden)
         gates = 3 * self.hidden

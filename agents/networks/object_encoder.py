@@ -8,7 +8,7 @@ new ones.
 The description depends only on the observation. A small network reads this description at a
 fraction of the cost of convolutions over 144 cells.
 
-Source: own; objects share a network and are pooled after Zaheer et al. (2017).
+Source: this project; objects share a network and are pooled after Zaheer et al. (2017).
 """
 
 import flax.linen as nn
@@ -22,7 +22,7 @@ from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS
 from trap_tube_jax.state import base_state
 
 MAX_OBJECTS = NUM_OBJECTS - 2
-NAMED_SIZES = 4  # cells; sizes up to here have an input of their own
+NAMED_SIZES = 4  # cells; every size up to here is an input
 NEAR = 2  # rows and columns about agent and food, of which every cell is an input
 NOWHERE = -1e3  # below every activation
 
@@ -40,10 +40,10 @@ class ObjectEncoder(nn.Module):
     def __call__(self, observation: jax.Array) -> jax.Array:
         """Encodes u8[M, 12, 12, N] to f32[M, 2 * filters[1]]."""
         before, after = self.filters
-        x, exists, places = describe_board(observation)
+        x, exists, positions = describe_board(observation)
         exists = exists[..., None]
         x = nn.swish(
-            dense(before, name="object1")(x) + dense(before, name="places")(places)[:, None]
+            dense(before, name="object1")(x) + dense(before, name="places")(positions)[:, None]
         )
         x = nn.swish(dense(before, name="object2")(x))
         scene = jnp.max(jnp.where(exists, x, NOWHERE), axis=1)
@@ -74,8 +74,8 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     lines = _objects(color, left=~(anchors[0] | anchors[1]))
     rows, columns = _project(lines)
     agent, food = (_project(_pack(anchor)) for anchor in anchors)
-    places = [_unpack(bits, BOARD_SIZE) for bits in (*agent, *food)]
-    places += [_relative(*both) for both in zip(food, agent, strict=True)]
+    positions = [_unpack(bits, BOARD_SIZE) for bits in (*agent, *food)]
+    positions += [_relative(*both) for both in zip(food, agent, strict=True)]
     parts = [_unpack(rows, BOARD_SIZE), _unpack(columns, BOARD_SIZE)]
     for anchor in (agent, food):
         row, column = (bits[:, None] for bits in anchor)
@@ -84,11 +84,11 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     parts += [size[..., None] == np.arange(NAMED_SIZES + 1, dtype=np.uint32)[None, None]]
     size = size.astype(jnp.float32)
     parts += [jnp.stack([size / 20, jnp.log1p(size) / 3], axis=-1)]
-    features, places = (
+    features, positions = (
         jnp.concatenate([x.astype(jnp.float32) for x in flags], axis=-1)
-        for flags in (parts, places)
+        for flags in (parts, positions)
     )
-    return features, size > 0, places
+    return features, size > 0, positions
 
 
 # Positions in a row or column are the bits of one integer. Integers are fast to shift, merge and
@@ -118,10 +118,10 @@ def _project(lines: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _pack(lines != 0), columns
 
 
-def _relative(places: jax.Array, origin: jax.Array) -> jax.Array:
-    """Returns flags bool[..., 23] of places u32[...] about an origin; false where it is 0."""
+def _relative(positions: jax.Array, origin: jax.Array) -> jax.Array:
+    """Returns flags bool[..., 23] of positions u32[...] about an origin; false where it is 0."""
     reach = BOARD_SIZE - 1
-    seen = (places << np.uint32(reach)) >> _first(origin)
+    seen = (positions << np.uint32(reach)) >> _first(origin)
     return _unpack(jnp.where(origin != 0, seen, 0), 2 * reach + 1)
 
 
@@ -139,9 +139,9 @@ def _around(lines: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
     return cells.reshape(*cells.shape[:2], -1)
 
 
-def _first(places: jax.Array) -> jax.Array:
-    """Returns the lowest place u32[...] of `places` u32[...]; at most 31."""
-    return jnp.minimum(jax.lax.population_count((places & -places) - 1), 31)
+def _first(positions: jax.Array) -> jax.Array:
+    """Returns the lowest position u32[...] of `positions` u32[...]; at most 31."""
+    return jnp.minimum(jax.lax.population_count((positions & -positions) - 1), 31)
 
 
 def _pack(flags: jax.Array) -> jax.Array:
@@ -152,5 +152,5 @@ def _pack(flags: jax.Array) -> jax.Array:
 
 def _unpack(bits: jax.Array, count: int) -> jax.Array:
     """Unpacks the lowest bits of u32[...] into flags bool[..., count]."""
-    places = np.arange(count, dtype=np.uint32).reshape((1,) * bits.ndim + (-1,))
-    return (bits[..., None] >> places) & 1 == 1
+    positions = np.arange(count, dtype=np.uint32).reshape((1,) * bits.ndim + (-1,))
+    return (bits[..., None] >> positions) & 1 == 1

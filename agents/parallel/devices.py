@@ -68,7 +68,8 @@ class Placement:
         Raises:
           ValueError: the devices do not exist, or do not divide the minibatches.
         """
-        processes, available = jax.process_count(), jax.device_count()
+        processes = jax.process_count()
+        available = jax.device_count()
         counts = range(1, available + 1) if processes == 1 else [available]
         allowed = [n for n in counts if config.minibatch_size % n == 0]
         devices = counts[0] if devices is None else devices

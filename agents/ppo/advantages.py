@@ -24,17 +24,18 @@ from agents.acting.episodes import Episodes
 from agents.config import Config
 from agents.ppo import returns
 
-# Standard deviation to which intrinsic returns are scaled: about that of the extrinsic returns,
+# Standard deviation to which intrinsic returns are scaled: about the extrinsic returns',
 # which are in [0, 1], so that one weight of the value error suits both.
 INTRINSIC_RETURN_STD = 0.3
 
-# Added to the variance of advantages, so that those of a nearly constant reward stay small.
+# Added to the variance of advantages, so that a nearly constant reward has small ones.
 VARIANCE_FLOOR = 4e-4
 
 
 def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
     """Returns the intrinsic reward's weight by iteration: constant, or decaying geometrically."""
-    start, end = config.intrinsic_coef_init, config.intrinsic_coef
+    start = config.intrinsic_coef_init
+    end = config.intrinsic_coef
     steps = round(config.intrinsic_anneal_fraction * config.iterations)
     if not start or not steps:
         return optax.constant_schedule(end)
@@ -48,10 +49,10 @@ def update_variance(
     episodes: Episodes,
     intrinsic_reward: jax.Array,
 ) -> jax.Array:
-    """Moves the variances f32[2] of both rewards towards those of B episodes.
+    """Moves the variances f32[2] of both rewards towards the variances in B episodes.
 
     `intrinsic_reward` is f32[B, T]. Iteration 0 replaces the variances. With separate value heads,
-    the second variance is that of the discounted intrinsic returns.
+    the second is the variance of the discounted intrinsic returns.
     """
     if config.value_heads == "separate":
         discount = jnp.full_like(intrinsic_reward, config.discount)

@@ -185,7 +185,8 @@ class Learner:
         Returns the reward f32[B, T], 0 after an episode's end, and the curiosity's new memory.
         """
         experience = self.experience(state.params, trajectory.episodes)
-        mask, params = trajectory.episodes.mask, state.params["curiosity"]
+        mask = trajectory.episodes.mask
+        params = state.params["curiosity"]
         reward, memory = self.curiosity.reward(params, state.memory, experience)
         with contract("curiosity", self.config.curiosity):
             chex.assert_trees_all_equal_shapes_and_dtypes((reward, memory), (mask, state.memory))
@@ -198,7 +199,8 @@ class Learner:
 
         Returns the batch, and the variances f32[2] of both rewards; see `agents.ppo.advantages`.
         """
-        config, episodes = self.config, trajectory.episodes
+        config = self.config
+        episodes = trajectory.episodes
         variance = advantages.update_variance(
             config, state.reward_variance, state.iteration, episodes, intrinsic_reward
         )
@@ -248,10 +250,11 @@ class Learner:
           L f32[] and metrics: its terms as weighted in L, and the mean entropy of a step.
 
         Raises:
-          ValueError: the name of a curiosity's loss is that of another term or does not end in
+          ValueError: the name of a curiosity's loss is another term's or does not end in
             `_loss`.
         """
-        config, mask = self.config, batch.episodes.mask
+        config = self.config
+        mask = batch.episodes.mask
         experience = self.experience(params, batch.episodes)
         actions, value = self.agent.policy_and_value(params, experience.embedding)
         log_prob = actions.log_prob(batch.episodes.action)

@@ -4,7 +4,7 @@ Reward and curiosity reveal little about which of several objects is the tool. T
 step reveals more, and predicting this motion trains the GRU and the encoder. Two consecutive
 observations show the motion, so the loss uses nothing that is hidden from the agent.
 
-Source: own; auxiliary losses of reinforcement learning, after Jaderberg et al. (2017).
+Source: this project; auxiliary losses of reinforcement learning, after Jaderberg et al. (2017).
 """
 
 import flax.linen as nn
@@ -15,7 +15,8 @@ import optax
 from agents.networks.layers import dense, output_dense
 
 UNITS = 128
-THINGS, AXES = 3, 2  # agent, tool and food; rows and columns
+THINGS = 3
+AXES = 2
 
 
 class MotionHead(nn.Module):

@@ -6,7 +6,7 @@ lists. Each list therefore holds fewer easy tasks than the list before, without 
 difficulty. A task stays in its list, solved or not, until newer tasks overwrite it, so the agent
 rehearses new skills.
 
-Source: own; a simple relative of prioritized level replay, Jiang et al. (2021).
+Source: this project; a simple relative of prioritized level replay, Jiang et al. (2021).
 """
 
 import itertools
@@ -22,7 +22,7 @@ class TaskReplay(NamedTuple):
 
     Attributes:
       keys: PRNG keys [L, K] from which `env.reset` draws the tasks.
-      next: i32[L], the place of each list to fill next.
+      next: i32[L], the index of every list to fill next.
     """
 
     keys: jax.Array
@@ -64,20 +64,21 @@ class TaskReplay(NamedTuple):
             _put(self.keys[index], self.next[index], reset_keys[start:end], failed[start:end])
             for index, (start, end) in enumerate(parts)
         ]
-        keys, places = zip(*lists, strict=True)
+        keys, following = zip(*lists, strict=True)
         # Not by `stack`, whose result `jax_debug_key_reuse` takes for used.
-        return TaskReplay(jnp.concatenate(keys).reshape(self.keys.shape), jnp.stack(places))
+        return TaskReplay(jnp.concatenate(keys).reshape(self.keys.shape), jnp.stack(following))
 
 
 def _put(
     keys: jax.Array, start: jax.Array, new: jax.Array, chosen: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Puts the chosen of `new` [M] into a list [K] from place `start` on.
+    """Puts the chosen of `new` [M] into a list [K] from index `start` on.
 
     Returns:
-      The list, with the last K chosen if there are more, and the place after them.
+      The list, with the last K chosen if there are more, and the index after them.
     """
-    order, total = jnp.cumsum(chosen, dtype=jnp.int32), jnp.sum(chosen, dtype=jnp.int32)
+    order = jnp.cumsum(chosen, dtype=jnp.int32)
+    total = jnp.sum(chosen, dtype=jnp.int32)
     fits = chosen & (order > total - len(keys))
-    place = jnp.where(fits, (start + order - 1) % len(keys), len(keys))
-    return keys.at[place].set(new, mode="drop"), (start + total) % len(keys)
+    index = jnp.where(fits, (start + order - 1) % len(keys), len(keys))
+    return keys.at[index].set(new, mode="drop"), (start + total) % len(keys)

@@ -69,7 +69,8 @@ def save_controls(profile: Table, path: Path) -> None:
     with _plain_style():
         figure = Figure(figsize=(WIDTH, lines * (height + 1.75)), layout="constrained")
         axes = figure.subplots(2 * lines, COLUMNS, height_ratios=lines * [1.4, height])
-        boards, cells = axes[::2].flatten(), axes[1::2].flatten()
+        boards = axes[::2].flatten()
+        cells = axes[1::2].flatten()
         for axis in axes.flat:
             axis.set_axis_off()
         for index, (level, state) in enumerate(layouts.items()):
@@ -100,7 +101,8 @@ def _cropped(state: State) -> np.ndarray:
     for cell in (state.agent, state.food, state.tool, state.tool + state.tool_extent - 1):
         is_used[tuple(np.asarray(cell))] = True
     rows, columns = np.nonzero(is_used)
-    top, left = max(rows.min() - 1, 0), max(columns.min() - 1, 0)
+    top = max(rows.min() - 1, 0)
+    left = max(columns.min() - 1, 0)
     picture = np.asarray(render(state, CELL))
     return picture[top * CELL : (rows.max() + 2) * CELL, left * CELL : (columns.max() + 2) * CELL]
 

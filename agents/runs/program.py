@@ -23,7 +23,7 @@ Tree = TypeVar("Tree")
 
 
 class Program:
-    """What runs share that differ only in their seed.
+    """Holds what runs share that differ only in their seed.
 
     Attributes:
       options: options of the runs.
@@ -40,7 +40,8 @@ class Program:
         Raises:
           ValueError: the settings, or the devices, cannot be trained with.
         """
-        self.config, self.options = config, options
+        self.config = config
+        self.options = options
         self.placement = Placement.of(options.devices, config)
         self.learner = make_learner(config, axis=self.placement.axis)
         names = options.sets or own_and_paper_sets(config)
@@ -77,7 +78,8 @@ class Cohort:
 
     def __init__(self, program: Program, states: Sequence[TrainState]):
         """Compiles the program; `states` are given up to it."""
-        self.size, self.placement = len(states), program.placement
+        self.size = len(states)
+        self.placement = program.placement
         advance = make_advance(program.learner)
         if self.size == 1:
             advance, self.states = self.placement.shard(advance), self.placement.put(states[0])

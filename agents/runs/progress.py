@@ -56,8 +56,11 @@ class Progress:
           ValueError: the run cannot be continued, or files contradict one another.
           OSError: a file cannot be read.
         """
-        self.run, self.program, self.console = run, program, console
-        self.stored, self.folder = stored, folder
+        self.run = run
+        self.program = program
+        self.console = console
+        self.stored = stored
+        self.folder = folder
         if stored.config.is_file():
             run.check_continues(stored.read()[0])
         restored, self.last = restore(stored, run.config.iterations, program.state_shapes)
@@ -92,7 +95,8 @@ class Progress:
 
         `seeds` are trained together.
         """
-        config, options = self.run.config, self.program.options
+        config = self.run.config
+        options = self.program.options
         if options.report:
             self.folder.page.unlink(missing_ok=True)  # it would show the run as it was
         note_provenance(self.folder.provenance, str(self.program.placement))

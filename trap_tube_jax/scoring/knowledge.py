@@ -47,7 +47,8 @@ def choice_of_exit(task: State, push: jax.typing.ArrayLike) -> jax.Array:
     """
     push = jnp.asarray(push)
     can_move = _can_move(task, push) & _can_move(task, -push)
-    forward, backward = _leads_to_exit(task, push), _leads_to_exit(task, -push)
+    forward = _leads_to_exit(task, push)
+    backward = _leads_to_exit(task, -push)
     return jnp.where(can_move, forward.astype(jnp.int32) - backward.astype(jnp.int32), 0)
 
 
