@@ -4,6 +4,6 @@ Everything here is an optimisation: `FastEncoding` has the results of `agents.ac
 rounding. Without this folder everything else works as it is.
 """
 
-from agents.fast.encoding import FastEncoding
+from agents.fast.distinct import FastEncoding
 
 __all__ = ["FastEncoding"]

@@ -85,6 +85,17 @@ def test_a_set_of_your_own_is_evaluated_after_the_papers(own_task_sets):
     assert own_and_paper_sets(Config(env_id="pst")) == papers
 
 
+def test_values_of_states_are_of_the_extrinsic_head():
+    """Of two heads that always value states 5 and -7."""
+    settings = {"curiosity": "effects", "value_heads": "separate", "bootstrap": "value"}
+    config = Config.from_dict({**CONFIG.to_dict(), **settings})
+    params = random_params(config)
+    head = params["heads"]["params"]["value"]
+    head |= {"kernel": 0 * head["kernel"], "bias": jnp.array([5.0, -7.0])}
+    suite = Suite({"mine": food_next_to_agent()}, {"mine": STEPS})
+    np.testing.assert_array_equal(Evaluator(config, suite)(params)["mine"].value, 5)
+
+
 def test_unknown_sets_are_refused():
     with pytest.raises(ValueError, match=r"unknown task set 'q'; allowed: .*pstsy"):
         Evaluator.of_sets(CONFIG, ["q"], 2)

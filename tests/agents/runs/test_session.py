@@ -320,6 +320,21 @@ def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch
     assert final_state(tmp_path / "x")[0] == ITERATIONS
 
 
+def test_speed_is_steps_over_the_seconds_of_an_iteration(tmp_path, monkeypatch):
+    """By a clock on which every iteration takes two seconds."""
+    clock = itertools.count(0, 2)
+    monkeypatch.setattr(session, "time", SimpleNamespace(perf_counter=clock.__next__))
+
+    def play(state, metrics):
+        return state._replace(transitions=state.transitions + 30), metrics
+
+    replace_training(monkeypatch, play)
+    train_run(tmp_path / "x", small_run(iterations=2), PLAIN)
+    rows = read_rows(tmp_path / "x" / "metrics.csv")
+    assert rows["transitions_per_second"].tolist() == [15, 15]
+    assert rows["seconds"].tolist() == [2, 4]
+
+
 def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypatch):
     """Whose float32 mean is 0.99999994."""
     solved = Evaluation(jnp.full(41, True), *jnp.ones((3, 41)))

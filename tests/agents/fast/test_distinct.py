@@ -12,7 +12,7 @@ import trap_tube_jax as tt
 from agents import make_learner
 from agents.acting.encoding import Encoding
 from agents.acting.rollout import rollout
-from agents.fast import FastEncoding, chunks, encoding
+from agents.fast import FastEncoding, chunks, distinct
 from agents.ppo.learner import Learner
 from small_runs import small_config
 from trap_tube_jax.positions import layout_rows
@@ -88,8 +88,8 @@ def distinct_observations(episodes: Any) -> int:
 @pytest.mark.parametrize("bits", [0, 20])
 def test_every_distinct_observation_is_encoded_once(bits, monkeypatch):
     """Across episodes and times; where hashes collide it may be more often, to the same result."""
-    monkeypatch.setattr(encoding, "CACHE_BITS", bits)
-    monkeypatch.setattr(encoding, "CHUNK", 4)
+    monkeypatch.setattr(distinct, "CACHE_BITS", bits)
+    monkeypatch.setattr(distinct, "CHUNK", 4)
     counts, map_rows = [], chunks.map_rows
 
     def counting(fn: Any, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
@@ -112,16 +112,16 @@ def test_every_distinct_observation_is_encoded_once(bits, monkeypatch):
         counts.clear()
         episodes = play(layouts).episodes
         jax.effects_barrier()
-        distinct = distinct_observations(episodes)
+        count = distinct_observations(episodes)
         assert len(counts) == episodes.cells.shape[1]
-        assert sum(counts) == distinct if bits else sum(counts) > distinct
+        assert sum(counts) == count if bits else sum(counts) > count
 
 
 def test_observations_are_grouped_alike_by_one_key_and_by_two(monkeypatch):
     layout_id = jnp.array([0, 1, 1, 2])
     position = jnp.array([[5, 5, 7], [5, 7, 7], [7, 5, 5], [5, 5, 5]])
-    one = encoding._group_observations(layout_id, position)
-    monkeypatch.setattr(encoding, "NUM_POSITIONS", 2**31)
-    two = encoding._group_observations(layout_id, position)
+    one = distinct._group_observations(layout_id, position)
+    monkeypatch.setattr(distinct, "NUM_POSITIONS", 2**31)
+    two = distinct._group_observations(layout_id, position)
     np.testing.assert_array_equal(one.group_id, [0, 0, 1, 2, 3, 3, 3, 2, 2, 4, 4, 4])
     jax.tree.map(np.testing.assert_array_equal, one, two)
