@@ -57,6 +57,11 @@ def test_both_paths_play_the_same_episodes_and_have_the_same_loss_and_gradient(c
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, want)
 
 
+def test_a_cpu_takes_the_fast_path():
+    learner = make_learner(small_config())
+    assert (learner.path, learner.agent.core.scan_unroll) == ("fast", 1)
+
+
 def test_several_seeds_in_one_program_are_encoded_as_alone():
     _, fast = paths(env_id="psy", curiosity="none", encoder="objects")
     keys = jax.random.split(jax.random.key(1), 2)
