@@ -4,6 +4,7 @@ import atexit
 import os
 import re
 import shutil
+import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,12 @@ SETTINGS = {
     # An accidental broadcast between ranks is a bug that a shape test may not see.
     "jax_numpy_rank_promotion": "raise",
 }
+
+# A shell starts commands in the background with signals ignored, and processes pass that on.
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        is_ctrl_c = number == signal.SIGINT
+        signal.signal(number, signal.default_int_handler if is_ctrl_c else signal.SIG_DFL)
 
 if (0, 8) <= jax.__version_info__ < (0, 11):  # a flag that XLA does not know ends the process
     # The older code generator compiles in two thirds of the time.
