@@ -67,7 +67,11 @@ def test_a_signal_ends_a_command_with_one_line_and_its_code(body, times, lines):
 
 def test_ignored_signals_stay_ignored():
     """As `nohup` ignores that of a closed terminal."""
-    process = start(SAVES, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # which a new process inherits
+    try:
+        process = start(SAVES)
+    finally:
+        signal.signal(signal.SIGHUP, before)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGHUP)
