@@ -88,7 +88,8 @@ def stopping(hint: Callable[[], str]) -> Iterator[None]:
     Raises:
       SystemExit: `Stopped` or KeyboardInterrupt was raised within.
     """
-    before, _process.hint = _process.hint, hint
+    before = _process.hint
+    _process.hint = hint
     try:
         yield
     except (Stopped, KeyboardInterrupt) as stopped:

@@ -1,9 +1,8 @@
 """Files of a grid's results, and what is drawn from them.
 
 A grid's folder holds results.csv (rows of `agents.results`), curves.csv (metrics by iteration) and
-grid.json (title, commands, settings that all runs share, machines,
-unfinished runs). table.md and the figures are
-made from only these three files.
+grid.json (title, commands, settings that all runs share, machines, unfinished runs). table.md and
+the figures are made from only these three files.
 """
 
 import itertools

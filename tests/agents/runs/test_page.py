@@ -61,7 +61,7 @@ window.onload = () => {{
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    """What a browser finds after clicks, keys and a minute of play, in virtual time."""
+    """Opens a page in a browser: clicks, keys and a minute of play, in virtual time."""
     if BROWSER is None:
         pytest.skip("needs Chromium")
     folder = RunFolder(tmp_path_factory.mktemp("page") / "mine")
