@@ -43,9 +43,9 @@ class Config:
     """The settings of one training run; defaults are the paper's.
 
     Attributes:
-      env_id: task set to train on, by id or short name.
+      env_id: task set to train on, by id or short name; p+pstsy mixes two.
       num_features: N, feature channels of the observation; 3 is RGB.
-      max_steps: steps before an episode of training is truncated; None keeps the task set's limit,
+      max_steps: limit of steps of an episode of training; None keeps the task set's limit,
         which holds in evaluations on `sets` in any case.
       iterations: rollouts to train for, at most. Schedules span this number.
       max_transitions: environment steps to train for, at most; training stops before an iteration
@@ -69,7 +69,7 @@ class Config:
       motion_coef: weight of the motion-prediction loss. 0 trains without its head
         (`agents.ppo.motion`).
       learning_rate: Adam's step size.
-      lr_decay_fraction: final fraction of training that decays the step size. It decays
+      lr_decay_fraction: final fraction that decays the step size. It decays
         geometrically to a fiftieth.
       adam_epsilon: Adam's epsilon.
       max_gradient_norm: global norm of clipped gradients.
@@ -86,16 +86,17 @@ class Config:
       reward_ema_decay: decay of the rewards' moving variances. These variances normalise both
         rewards; the rates of `effects` use the same decay.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
-      replay_capacity: newest failed tasks kept per replay fraction.
-      align_to_food: turns the board once per episode so that food is ahead; mirrors it, too.
+      replay_capacity: failed tasks kept per replay fraction.
+      align_to_food: turns the board so that food is ahead, once per episode; mirrors it, too.
       repeat_penalty: penalty on repeats in greedy play. An action loses this many nats for each of
         the last 64 steps that took it at the same observation (`agents.acting.repeats`).
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
-      filters: channels of the first and of later convolutions; layer widths of `objects`.
+      filters: channels of first and later convolutions; layer widths of `objects`.
+      object_colors: `objects` also describes objects by their colours.
       hidden: units of the GRU. The layer before the GRU and the inverse model have the same number
         of units.
-      embedding: units of each embedding of actions and reward.
+      embedding: units of embeddings of action and reward.
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.
       previous_inputs: also reads the previous action and reward.
@@ -140,6 +141,7 @@ class Config:
     repeat_penalty: float = _network(0.0, 0)
     encoder: str = _network("paper")
     filters: tuple[int, int] = _network((32, 64), 1, 4096)
+    object_colors: bool = _network(False)
     hidden: int = _network(64, 1, 65_536)
     embedding: int = _network(8, 1, 65_536)
     recurrent: bool = _network(True)

@@ -50,8 +50,8 @@ def receive(number: int) -> None:
       KeyboardInterrupt: at once is now, and the process is not a command's.
     """
     if _process.deferred and not _process.deferred[-1]:
+        _write(FINISHING)  # before the program can see the signal, and print its own end
         _process.deferred[-1].append(number)
-        _write(FINISHING)
     elif _process.is_command:
         if sys.stdout is not None and sys.stdout.isatty():
             _write(SHOW_CURSOR, end="")

@@ -3,15 +3,16 @@
 Source: paper, section "Experimental Setup"; environment.md, "Task sets"; controls.md.
 """
 
+import collections
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 from trap_tube_jax.checks import check_registered_name, did_you_mean
 from trap_tube_jax.controls import CONTROLS, LayoutDraw
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.state import State, base_state
-from trap_tube_jax.transfers import Transfer, perceptual, structural, symbolic
+from trap_tube_jax.transfers import Mixture, Transfer, compose, perceptual, structural, symbolic
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +79,10 @@ def registered_ids() -> tuple[str, ...]:
 
 
 def task_set(name: str) -> TaskSet:
-    """Returns the task set with this id, short name or label.
+    """Returns the task set with this id, short name or label, or a mixture of sets.
+
+    A mixture, such as "p+p+pstsy", draws every task from one of its sets. A set that is named
+    twice is drawn twice as often.
 
     Raises:
       ValueError: no set has the name; the message lists the short names and the nearest names.
@@ -86,11 +90,37 @@ def task_set(name: str) -> TaskSet:
     by_name = {known: entry for entry in _task_sets.values() for known in entry.names}
     if isinstance(name, str) and name in by_name:
         return by_name[name]
+    if isinstance(name, str) and "+" in name:
+        return _mixture([task_set(part.strip()) for part in name.split("+")])
     allowed = ", ".join(entry.short for entry in _task_sets.values())
     raise ValueError(
         f"unknown task set {name!r}{did_you_mean(name, by_name)}; allowed: {allowed}, or their ids "
         "(trap_tube_jax.registered_ids()); a set of yours is known once its module is imported, as "
         "by --import MODULE"
+    )
+
+
+def _mixture(entries: Sequence[TaskSet]) -> TaskSet:
+    """Returns the set whose tasks come from one of several sets, equally often.
+
+    Raises:
+      ValueError: the sets have different step limits, or a base state of their own.
+    """
+    first = entries[0]
+    for entry in entries:
+        if entry.base is not None or entry.max_steps != first.max_steps:
+            raise ValueError(
+                f"a mixture is of sets that start from the base task and have one step limit; "
+                f"{first.short} has {first.max_steps} steps, {entry.short} {entry.max_steps}"
+                + ("" if entry.base is None else " and a base state of its own")
+            )
+    counts = collections.Counter(compose(*entry.transfers) for entry in entries)
+    return TaskSet(
+        "+".join(entry.id for entry in entries),
+        "+".join(entry.short for entry in entries),
+        " + ".join(entry.label for entry in entries),
+        (Mixture(tuple(counts), tuple(counts.values())),),
+        max_steps=first.max_steps,
     )
 
 
@@ -104,8 +134,8 @@ def make(
     """Makes the environment of a registered task set.
 
     Args:
-      name: an id such as "PerceptualStructuralTrapTube-v0", its short name "pst", or its label
-        "{P, St}".
+      name: an id such as "PerceptualStructuralTrapTube-v0", its short name "pst", its label
+        "{P, St}", or a mixture of sets such as "p+pstsy" (`task_set`).
       num_features: N, number of feature channels of the base task, 1 to 1024; 3 (RGB) if absent.
         With `base`, the palette of `base` has N channels.
       base: a base state instead of the set's.

@@ -86,6 +86,32 @@ class Composition:
         return ", ".join(map(transfer_name, self.transfers))
 
 
+@dataclasses.dataclass(frozen=True)
+class Mixture:
+    """The transfer that applies one of `transfers`, drawn with odds `weights`.
+
+    Attributes:
+      transfers: the transfers to choose from.
+      weights: positive integers, one per transfer.
+    """
+
+    transfers: tuple[Transfer, ...]
+    weights: tuple[int, ...]
+
+    def __call__(self, key: jax.Array, state: State) -> State:
+        """Applies the drawn transfer to `state`."""
+        choice_key, transfer_key = jax.random.split(threefry_key(key))
+        ticket = jax.random.randint(choice_key, (), 0, sum(self.weights), jnp.int32)
+        tickets = np.repeat(np.arange(len(self.weights), dtype=np.int32), self.weights)
+        # Compositions return the same types, whatever the transfers do.
+        branches = [compose(transfer) for transfer in self.transfers]
+        return jax.lax.switch(jnp.asarray(tickets)[ticket], branches, transfer_key, state)
+
+    @property
+    def __name__(self) -> str:
+        return " + ".join(map(transfer_name, self.transfers))
+
+
 def transfer_name(transfer: Transfer) -> str:
     """Returns the name of a transfer for labels and messages."""
     return getattr(transfer, "__name__", None) or repr(transfer)

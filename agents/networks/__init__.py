@@ -12,7 +12,7 @@ __all__ = ["make_encoder", "register"]
 register = encoders.register
 
 encoders["paper"] = lambda config: Encoder(config.filters)
-encoders["objects"] = lambda config: ObjectEncoder(config.filters)
+encoders["objects"] = lambda config: ObjectEncoder(config.filters, config.object_colors)
 
 
 def make_encoder(config: Config) -> nn.Module:

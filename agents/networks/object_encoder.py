@@ -2,8 +2,8 @@
 
 An object is all cells of one colour. Agent and food are known by their colours, which no transfer
 changes. Every other object is described by its cells, on the board and relative to agent and food,
-and by its size. Colours of other objects are left out, because they say nothing if every task draws
-new ones.
+and by its size. Colours of other objects say nothing if every task draws new ones; they are
+described only if asked for.
 
 The description depends only on the observation. A small network reads this description at a
 fraction of the cost of convolutions over 144 cells.
@@ -11,11 +11,14 @@ fraction of the cost of convolutions over 144 cells.
 Source: this project; objects share a network and are pooled after Zaheer et al. (2017).
 """
 
+from typing import NamedTuple
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from agents.networks.encoder import scaled
 from agents.networks.hashing import hash_rows
 from agents.networks.layers import dense
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS
@@ -32,16 +35,23 @@ class ObjectEncoder(nn.Module):
 
     Layers before the objects are pooled into a scene have `filters[0]` units, later ones
     `filters[1]`.
+
+    Attributes:
+      filters: units of the layers before and after pooling.
+      has_colors: also describes each object by its colour.
     """
 
     filters: tuple[int, int]
+    has_colors: bool = False
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
         """Encodes u8[M, 12, 12, N] to f32[M, 2 * filters[1]]."""
         before, after = self.filters
-        x, exists, positions = describe_board(observation)
-        exists = exists[..., None]
+        board = describe_board(observation)
+        x, exists, positions = board.features, board.exists[..., None], board.positions
+        if self.has_colors:
+            x = jnp.concatenate([x, board.colors], axis=-1)
         x = nn.swish(
             dense(before, name="object1")(x) + dense(before, name="places")(positions)[:, None]
         )
@@ -54,24 +64,36 @@ class ObjectEncoder(nn.Module):
         return jnp.concatenate([largest, total / MAX_OBJECTS], axis=-1)
 
 
-def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+class Board(NamedTuple):
+    """Description of M boards.
+
+    Attributes:
+      features: f32[M, 6, 173], by object: flags of the rows and columns that the object occupies,
+        12 + 12; flags of the same rows and columns relative to the agent, 23 + 23, and of the
+        object's cells in the 5x5 square around the agent, 25; the same three for the food; flags
+        of the sizes 0 to 4; size / 20 and log(1 + size) / 3. Flags relative to an invisible agent
+        or food are 0.
+      colors: f32[M, 6, N], by object, in [-1, 1].
+      exists: bool[M, 6], whether there is such an object.
+      positions: f32[M, 94]: flags of the agent's row and column, 12 + 12, the food's, 12 + 12, and
+        the food's relative to the agent, 23 + 23.
+    """
+
+    features: jax.Array
+    colors: jax.Array
+    exists: jax.Array
+    positions: jax.Array
+
+
+def describe_board(observation: jax.Array) -> Board:
     """Describes objects on boards u8[M, 12, 12, N], in the reading order of their first cells.
 
     At most 6 objects besides agent and food are described; any further ones are left out.
-
-    Returns:
-      f32[M, 6, 173]: flags of the rows and columns that the object occupies, 12 + 12; flags of the
-        same rows and columns relative to the agent, 23 + 23, and of the object's cells in the 5x5
-        square around the agent, 25; the same three for the food; flags of the sizes 0 to 4; size /
-        20 and log(1 + size) / 3. Flags relative to an invisible agent or food are 0.
-      bool[M, 6]: whether there is such an object.
-      f32[M, 94]: flags of the agent's row and column, 12 + 12, the food's, 12 + 12, and the food's
-        relative to the agent, 23 + 23.
     """
     color = hash_rows(observation)
     own_colors = hash_rows(base_state(observation.shape[-1]).palette)
     anchors = [color == own_colors[thing] for thing in (AGENT, FOOD)]
-    lines = _objects(color, left=~(anchors[0] | anchors[1]))
+    lines, first_cells = _objects(color, left=~(anchors[0] | anchors[1]))
     rows, columns = _project(lines)
     agent, food = (_project(_pack(anchor)) for anchor in anchors)
     positions = [_unpack(bits, BOARD_SIZE) for bits in (*agent, *food)]
@@ -88,28 +110,33 @@ def describe_board(observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
         jnp.concatenate([x.astype(jnp.float32) for x in flags], axis=-1)
         for flags in (parts, positions)
     )
-    return features, size > 0, positions
+    cells = scaled(observation).reshape(len(observation), -1, observation.shape[-1])
+    colors = jnp.take_along_axis(cells, first_cells[..., None], axis=1)
+    return Board(features, colors, size > 0, positions)
 
 
 # Positions in a row or column are the bits of one integer. Integers are fast to shift, merge and
 # count; arrays of flags need gathers and reductions, which do not vectorise.
 
 
-def _objects(color: jax.Array, left: jax.Array) -> jax.Array:
+def _objects(color: jax.Array, left: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns the columns u32[M, 6, 12], row by row, of the first six colours in u32[M, 12, 12].
 
-    Considers only the cells flagged in `left`, bool[M, 12, 12].
+    Considers only the cells flagged in `left`, bool[M, 12, 12]. Also returns each colour's first
+    cell, i32[M, 6].
     """
     count = len(color)
     color, left = color.reshape(count, -1), left.reshape(count, -1)
     cells = np.arange(color.shape[1], dtype=np.int32)[None]
     objects = []
+    first_cells = []
     for _ in range(MAX_OBJECTS):
         first = jnp.min(jnp.where(left, cells, cells[0, -1]), axis=1, keepdims=True)
         is_same = left & (color == jnp.take_along_axis(color, first, axis=1))
         left = left & ~is_same
         objects.append(_pack(is_same.reshape(count, BOARD_SIZE, BOARD_SIZE)))
-    return jnp.stack(objects, axis=1)
+        first_cells.append(first)
+    return jnp.stack(objects, axis=1), jnp.concatenate(first_cells, axis=1)
 
 
 def _project(lines: jax.Array) -> tuple[jax.Array, jax.Array]:

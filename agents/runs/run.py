@@ -101,7 +101,7 @@ class RunOptions(DeviceOptions):
       evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation
         selects the parameters that the run reports.
       sets: sets to evaluate on, by default the paper's eight and the training set.
-      test_tasks: test tasks per set in the final evaluation, by default `eval_episodes`.
+      test_tasks: test tasks per set, by default `eval_episodes`.
       report: writes curves, page and GIF at the end.
       tensorboard: logs metrics for TensorBoard.
       wandb: logs metrics to Weights & Biases; offline with WANDB_MODE=offline.

@@ -52,17 +52,19 @@ def start(body, **options):
 )
 def test_a_signal_ends_a_command_with_one_line_and_its_code(body, times, lines):
     processes = {number: start(body) for number in SIGNALS}
+    ends = {}
     for number, process in processes.items():
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        assert process.stderr is not None
-        errors = ""
-        for _ in range(times):
-            process.send_signal(number)
-            errors += process.stderr.readline()  # equal signals that come together are one
-        errors += process.stderr.read()
-        process.communicate()
-        assert (process.returncode, errors.splitlines()) == (128 + number, lines)
+        with process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            assert process.stderr is not None
+            errors = ""
+            for _ in range(times):
+                process.send_signal(number)
+                errors += process.stderr.readline()  # equal signals that come together are one
+            errors += process.stderr.read()
+        ends[number] = (process.returncode, errors.splitlines())
+    assert ends == {number: (128 + number, lines) for number in SIGNALS}
 
 
 def test_ignored_signals_stay_ignored():
@@ -72,11 +74,11 @@ def test_ignored_signals_stay_ignored():
         process = start(SAVES)
     finally:
         signal.signal(signal.SIGHUP, before)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    process.send_signal(signal.SIGHUP)
-    process.send_signal(signal.SIGTERM)
-    process.communicate()
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGHUP)
+        process.send_signal(signal.SIGTERM)
     assert process.returncode == 128 + signal.SIGTERM
 
 

@@ -1,13 +1,16 @@
 """The task sets by name."""
 
 import dataclasses
+import pickle
 
+import jax
 import numpy as np
 import pytest
 
 import trap_tube_jax as tt
 from refusal import assert_refused
 from trap_tube_jax import play
+from trap_tube_jax.state import take
 
 # environment.md, "Task sets".
 SPECIFIED = [
@@ -166,3 +169,33 @@ BAD_SETS = [
 def test_register_refuses(own_task_sets, name, transfers, options, words):
     assert_refused(words, tt.register, name, transfers, **options)
     assert "Mine-v0" not in tt.registered_ids()
+
+
+def test_a_mixture_draws_a_set_as_often_as_it_is_named():
+    env = tt.make("base+{P}+p+base+st+base")
+    assert env.max_steps == 50
+    keys = jax.random.split(jax.random.key(0), 1200)
+    states, _ = jax.jit(jax.vmap(env.reset))(keys)
+    base = tt.base_state()
+    is_recolored = (np.asarray(states.palette) != np.asarray(base.palette)).any(axis=(1, 2))
+    is_base_board = (np.asarray(states.board) == np.asarray(base.board)).all(axis=(1, 2))
+    counts = np.array([is_recolored.sum(), (is_base_board & ~is_recolored).sum()])
+    np.testing.assert_allclose(counts / 1200, [1 / 6, 3 / 6], atol=0.05)
+    for index in range(20):
+        tt.validate(take(states, index))
+
+
+def test_a_mixture_is_a_task_set_with_names_of_its_own():
+    entry = tt.task_set("p + {P, St, Sy}")
+    assert (entry.short, entry.label) == ("p+pstsy", "{P} + {P, St, Sy}")
+    assert tt.task_set(entry.id) == tt.task_set(entry.short) == tt.task_set(entry.label) == entry
+    assert hash(tt.make("p+pstsy")) == hash(pickle.loads(pickle.dumps(tt.make("p+pstsy"))))
+    assert len(tt.evaluation_tasks("p+pstsy", 3).time) == 3
+
+
+def test_a_mixture_refuses_sets_that_do_not_mix(own_task_sets):
+    tt.register("Short-v0", (), max_steps=20)
+    tt.register("Own-v0", (), base=tt.base_state())
+    assert_refused(["one step limit; p has 50 steps, Short-v0 20"], tt.make, "p+Short-v0")
+    assert_refused(["Own-v0 50 and a base state of its own"], tt.make, "p+Own-v0")
+    assert_refused(["unknown task set 'pts' (did you mean"], tt.make, "p+pts")

@@ -22,8 +22,8 @@ def tasks() -> tt.State:
     return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 32))[0]
 
 
-def described(board: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-    """The features of every object and the places of agent and food, found cell by cell."""
+def described(board: np.ndarray) -> tuple[list[np.ndarray], list[tuple], np.ndarray]:
+    """Features and colours of every object, and positions of agent and food, cell by cell."""
     colors = [tuple(color) for color in board.reshape(-1, board.shape[-1])]
     anchors = [tuple(PALETTE[thing]) for thing in (AGENT, FOOD)]
     others = [color for color in dict.fromkeys(colors) if color not in anchors]
@@ -48,27 +48,28 @@ def described(board: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
     places = [thing[axis] == n for thing in (agent, food) for axis in (0, 1) for n in range(12)]
     seen = min(agent[0], food[0]) >= 0
     places += [seen and food[axis] - agent[axis] == n for axis in (0, 1) for n in range(-11, 12)]
-    return rows, np.array(places, np.float32)
+    return rows, others, np.array(places, np.float32)
 
 
-def test_objects_are_where_they_are(tasks):
+def test_every_object_is_described_as_its_cells_say(tasks):
     """The last board has neither agent nor food."""
     blank = np.zeros((1, 12, 12, 3), np.uint8)
     boards = np.concatenate([jax.jit(jax.vmap(tt.observe))(tasks), blank])
-    features, exists, places = map(np.asarray, describe(jnp.asarray(boards)))
-    for board, found, is_there, place in zip(boards, features, exists, places, strict=True):
-        expected, expected_place = described(board)
-        assert is_there.sum() == len(expected)
-        assert is_there[: len(expected)].all()
-        np.testing.assert_allclose(found[: len(expected)], expected, rtol=1e-6)
-        np.testing.assert_array_equal(place, expected_place)
+    for board, *found in zip(boards, *map(np.asarray, describe(jnp.asarray(boards))), strict=True):
+        features, colors, exists, positions = found
+        expected, expected_colors, expected_positions = described(board)
+        count = len(expected)
+        assert exists.tolist() == [True] * count + [False] * (6 - count)
+        np.testing.assert_allclose(features[:count], expected, rtol=1e-6)
+        np.testing.assert_allclose((colors[:count] + 1) * 127.5, expected_colors, rtol=1e-5)
+        np.testing.assert_array_equal(positions, expected_positions)
 
 
 def test_objects_beyond_the_sixth_are_left_out():
     board = np.arange(144, dtype=np.uint8).reshape(1, 12, 12, 1)
-    features, exists, _ = describe(jnp.asarray(board))
-    assert exists.all()
-    assert np.argmax(np.asarray(features[0, :, 12:24]), axis=1).tolist() == list(range(6))
+    found = describe(jnp.asarray(board))
+    assert found.exists.all()
+    assert np.argmax(np.asarray(found.features[0, :, 12:24]), axis=1).tolist() == list(range(6))
 
 
 @pytest.mark.parametrize("num_features", [1, 5])
@@ -81,15 +82,16 @@ def test_any_number_of_features_will_do(num_features):
     board = tt.observe(tt.base_state(num_features))[None]
     features = encode(params, board)
     assert features.shape == (1, 12)
-    _, exists, _ = describe(board)
-    assert exists.sum() == 5  # ground, trap, exit, tubes, tool
+    assert describe(board).exists.sum() == 5  # ground, trap, exit, tubes, tool
     moved = tt.observe(tt.base_state(num_features).replace(agent=jnp.zeros(2, jnp.int32)))[None]
     assert (encode(params, moved) != features).any()
 
 
 def test_objects_that_are_not_there_do_not_count(monkeypatch):
     """The features of a board do not depend on what the empty places are filled with."""
-    config = Config(encoder="objects", filters=(4, 6), hidden=4, curiosity="none")
+    config = Config(
+        encoder="objects", object_colors=True, filters=(4, 6), hidden=4, curiosity="none"
+    )
     agent = Agent(config)
     params = jax.jit(agent.init)(jax.random.key(0))
     # No object but the ground; and one more, with neither agent nor food.
@@ -97,12 +99,28 @@ def test_objects_that_are_not_there_do_not_count(monkeypatch):
     plain = jax.jit(agent.encode)(params, boards)
 
     def filled(board):
-        described, exists, *rest = described_by(board)
-        noise = jax.random.normal(jax.random.key(1), described.shape, described.dtype)
-        return (jnp.where(exists[..., None], described, noise), exists, *rest)
+        found = described_by(board)
+        exists = found.exists[..., None]
+        features = jnp.where(exists, found.features, noise(found.features))
+        colors = jnp.where(exists, found.colors, noise(found.colors))
+        return found._replace(features=features, colors=colors)
+
+    def noise(like):
+        return jax.random.normal(jax.random.key(1), like.shape, like.dtype)
 
     described_by = object_encoder.describe_board
     monkeypatch.setattr(object_encoder, "describe_board", filled)
     found = jax.jit(lambda: agent.encode(params, boards))()
     np.testing.assert_array_equal(found, plain)
     assert (plain[0] != plain[1]).any()
+
+
+@pytest.mark.parametrize("has_colors", [False, True])
+def test_colors_of_objects_matter_only_if_asked_for(has_colors):
+    config = Config(encoder="objects", object_colors=has_colors, filters=(4, 6), hidden=4)
+    agent = Agent(config)
+    state = tt.base_state()
+    recolored = tt.structural(jax.random.key(0), state)
+    boards = jnp.stack([tt.observe(state), tt.observe(recolored)])
+    features = jax.jit(agent.encode)(jax.jit(agent.init)(jax.random.key(0)), boards)
+    assert bool((features[0] != features[1]).any()) == has_colors
