@@ -100,6 +100,11 @@ class Config:
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.
       previous_inputs: also reads the previous action and reward.
+
+    Example:
+      >>> config = agents.Config.preset("fast", env_id="sy", iterations=50)
+      >>> config.curiosity, config.episodes_per_iteration, config.gradient_steps
+      ('effects', 256, 32)
     """
 
     env_id: str = _task("TrapTube-v0", flags=("--env",))

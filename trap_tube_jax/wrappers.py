@@ -70,6 +70,15 @@ class AutoReset:
 
     Raises:
       ValueError: `env` resets itself, is an `EpisodeStatistics`, or is not an environment.
+
+    Example:
+      >>> env = tt.AutoReset(tt.make("base", max_steps=1))
+      >>> state, first = env.reset(jax.random.key(0))
+      >>> state, timestep = env.step(state, jnp.array([0, 0]))
+      >>> bool(jnp.all(timestep.observation == first.observation)), bool(timestep.truncated)
+      (True, True)
+      >>> bool(jnp.all(timestep.final_observation == first.observation))
+      False
     """
 
     env: EnvironmentLike
@@ -156,6 +165,13 @@ class EpisodeStatistics:
 
     Raises:
       ValueError: `env` is no environment.
+
+    Example:
+      >>> env = tt.EpisodeStatistics(tt.AutoReset(tt.make("base", max_steps=1)))
+      >>> state, timestep = env.reset(jax.random.key(0))
+      >>> state, timestep = env.step(state, jnp.array([0, 0]))
+      >>> int(state.episodes), int(state.last_length), float(state.last_return)
+      (1, 1, 0.0)
     """
 
     env: EnvironmentLike

@@ -95,6 +95,15 @@ def score(
     Raises:
       ValueError: an argument is invalid; the policy returns an action out of range, or its memory
         becomes NaN.
+
+    Example:
+      >>> class Still:
+      ...     def initial(self, batch):
+      ...         return jnp.zeros((batch, 2), int)
+      ...     def act(self, observation, carry, key):
+      ...         return carry, carry
+      >>> tt.score(Still(), sets=("base",), tasks=1)["base"].percent
+      0.0
     """
     for name in ("initial", "act"):
         if not callable(getattr(policy, name, None)):
@@ -153,6 +162,13 @@ def score_gymnasium(
     Raises:
       ValueError: an argument is invalid, the agent acts on observations of another dtype, or it
         returns an invalid action.
+
+    Example:
+      >>> class Still:
+      ...     def act(self, observation):
+      ...         return 0, 0
+      >>> tt.score_gymnasium(Still(), sets=("base",), tasks=1)["base"].percent
+      0.0
     """
     caller = PythonAgent(agent)
 
