@@ -7,13 +7,15 @@
     train_state = learner.init(jax.random.key(0))
     train_state, metrics = jax.jit(learner.iterate)(train_state)
 
+`help(agents.load)` explains a name. The examples assume these two imports and
+`import trap_tube_jax as tt`.
+
     settings       Config
     training       make_learner, Learner, TrainState
     policies       load, save, Policy
     runs           train_run, Run, RunOptions, results
 
-`help(agents.load)` explains a name. The examples assume these two imports and
-`import trap_tube_jax as tt`. To add a curiosity or an encoder, see extending.md.
+extending.md in this folder adds intrinsic rewards and encoders.
 """
 
 from agents.acting.policy import Policy

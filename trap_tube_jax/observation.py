@@ -16,7 +16,7 @@ def visible_objects(state: State) -> jax.Array:
     """Returns the topmost object of every cell: u8[12, 12] of object codes 0 to 7.
 
     Raises:
-      ValueError: `state` is not one unbatched state; likewise below.
+      ValueError: `state` is not one unbatched state.
 
     Example:
       >>> objects = tt.visible_objects(tt.base_state())
@@ -31,7 +31,10 @@ def visible_objects(state: State) -> jax.Array:
 
 
 def observe(state: State) -> jax.Array:
-    """Returns the features u8[12, 12, N] of the topmost object of every cell.
+    """Returns the features u8[12, 12, N] of the topmost object of every cell. Pure.
+
+    Raises:
+      ValueError: `state` is not one unbatched state.
 
     Example:
       >>> observation = tt.observe(tt.base_state())
@@ -50,6 +53,9 @@ def render_ascii(state: State) -> str:
     """Draws the board as 12 lines of 12 characters, as `State.from_ascii` reads. Host side.
 
     A character shows the topmost object of its cell alone, so not every state can be read back.
+
+    Raises:
+      ValueError: `state` is not one unbatched state.
 
     Example:
       >>> tt.render_ascii(tt.base_state()).splitlines()[5]

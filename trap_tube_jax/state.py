@@ -204,6 +204,9 @@ class TimeStep(ByValue, struct.PyTreeNode, eq=False):
 def base_state(num_features: int = 3) -> State:
     """Builds the base task in base colours of N features; environment.md, "Base task".
 
+    Raises:
+      ValueError: `num_features` is not an integer from 1 to 1024.
+
     Example:
       >>> state = tt.base_state()
       >>> state.tool.tolist(), state.tool_extent.tolist()

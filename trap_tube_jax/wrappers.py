@@ -62,8 +62,9 @@ class AutoResetTimeStep(TimeStep, eq=False):
 class AutoReset:
     """Starts the next episode within the step that ends one.
 
-    Reward, flags and discount belong to the action taken; the observation is the one to act on
-    next. Every episode draws its task with a fresh key.
+    Reward, flags and discount belong to the action taken; `observation` is the one to act on next.
+    `final_observation`, u8[12, 12, N], is the one before any reset: an episode's last observation
+    is not lost, and its value can be bootstrapped. Every episode draws its task with a fresh key.
 
     Attributes:
       env: an environment that does not reset itself.

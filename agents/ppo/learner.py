@@ -122,7 +122,7 @@ class Learner:
         return self.encoding.name
 
     def init(self, key: jax.Array) -> TrainState:
-        """Returns the first state."""
+        """Returns the first state; draws the parameters with `key`, one PRNG key."""
         return jax.jit(self._init)(key)  # compiled as a whole in a fraction of the time
 
     def _init(self, key: jax.Array) -> TrainState:

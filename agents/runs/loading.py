@@ -96,6 +96,9 @@ def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]
 def save(path: str | Path, policy: Policy) -> None:
     """Saves a policy to one safetensors file, which `load` reads; its name is not stored.
 
+    Raises:
+      OSError: the file cannot be written.
+
     Example:
       >>> agents.save("mine.safetensors", agents.load("fast-base"))
       >>> agents.load("mine.safetensors").name

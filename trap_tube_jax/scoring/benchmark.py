@@ -92,6 +92,9 @@ def score(
       optimality: number of tasks per set, the first ones, to compare with shortest plans.
       num_features: N, feature channels of the observation; see `make`.
 
+    Returns:
+      The scores by set; printed, a table.
+
     Raises:
       ValueError: an argument is invalid; the policy returns an action out of range, or its memory
         becomes NaN.
@@ -158,6 +161,9 @@ def score_gymnasium(
       tasks: as for `score`.
       optimality: as for `score`.
       num_features: as for `score`.
+
+    Returns:
+      The scores by set; printed, a table.
 
     Raises:
       ValueError: an argument is invalid, the agent acts on observations of another dtype, or it
