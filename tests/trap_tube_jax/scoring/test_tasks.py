@@ -28,7 +28,7 @@ def test_keys_differ_within_and_between_sets_and_purposes():
 
 
 @pytest.mark.parametrize("name", ALL_SETS)
-def test_sets_of_few_layouts(name):
+def test_only_sets_without_p_have_few_layouts(name):
     layout = layout_numbers(name, evaluation_tasks(name, 64))
     number = {"base": 1, "st": 1, "sy": 5, "stsy": 5}.get(name)
     assert (None if layout is None else len(set(layout.tolist()))) == number
