@@ -340,7 +340,7 @@ def test_an_agent_that_cannot_be_scored_is_refused(near):
         ),
     ):
         assert_refused(words, tt.score, Random(), sets, **options)
-    words = ["purpose", "test, validation", "'train'"]
+    words = ["purpose", "test, validation, confirmation", "'train'"]
     purpose: Any = "train"
     assert_refused(words, evaluation_tasks, "base", 1, purpose=purpose)
     assert_refused(words, evaluation_keys, "TrapTube-v0", 1, purpose)
