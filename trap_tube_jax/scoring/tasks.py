@@ -29,8 +29,8 @@ ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
 FEW_LAYOUTS = 5  # a set with at most as many layouts, colours aside, has few
 SETS_OF_FEW = tuple(x.short for x in PAPER_TASK_SETS if perceptual not in x.transfers)
 
-# "trap" and the first four letters of "tube", "validation" and "confirmation". The first word of `jax.random.key(seed)` is 0 for every
-# seed from 0 to 2**32 - 1, so no seed of training leads here.
+# "trap", and the first letters of "tube", "validation" and "confirmation". The first word of
+# `jax.random.key(seed)` is 0 for every seed from 0 to 2**32 - 1, so no seed of training leads here.
 _ROOTS: dict[Purpose, np.ndarray] = {
     "test": np.array([0x74726170, 0x74756265], np.uint32),
     "validation": np.array([0x74726170, 0x76616C69], np.uint32),
