@@ -260,7 +260,7 @@ def test_a_grid_from_its_command_to_its_table(capsys, tmp_path):
     assert str(root / "table.md") in shown
     assert run() == first, "nothing is left to do"
     rows = pd.read_csv(root / "results.csv")
-    assert {len(each) for _, each in rows.groupby(["purpose", "iteration"])} == {2}
+    assert {len(group) for _, group in rows.groupby(["purpose", "iteration"])} == {2}
     tested = rows[rows["purpose"] == "test"].set_index("task_set")
     assert tested["tasks"].to_dict() == {"base": 1, "p": 3}
     assert {"run", "algorithm", "seed", "commit", "clip_eps", "solved", "length"} <= set(rows)

@@ -32,11 +32,11 @@ def described(board: np.ndarray) -> tuple[list[np.ndarray], list[tuple], np.ndar
     for color in others:
         features = []
         for axis in (0, 1):
-            features += [place in cells[color][:, axis] for place in range(12)]
+            features += [index in cells[color][:, axis] for index in range(12)]
         for anchor in anchors:
             for axis in (0, 1):
                 there = cells[anchor][0, axis] if anchor in cells else -1000
-                features += [place + there in cells[color][:, axis] for place in range(-11, 12)]
+                features += [offset + there in cells[color][:, axis] for offset in range(-11, 12)]
             origin = cells[anchor][0] if anchor in cells else np.array([-1000, -1000])
             near = [(origin[0] + i, origin[1] + j) for i in range(-2, 3) for j in range(-2, 3)]
             features += [list(cell) in cells[color].tolist() for cell in near]
@@ -45,10 +45,10 @@ def described(board: np.ndarray) -> tuple[list[np.ndarray], list[tuple], np.ndar
         rows.append(np.array(features, np.float32))
     nowhere = np.array([[-1000, -1000]])
     agent, food = (cells.get(anchor, nowhere)[0] for anchor in anchors)
-    places = [thing[axis] == n for thing in (agent, food) for axis in (0, 1) for n in range(12)]
+    positions = [thing[axis] == n for thing in (agent, food) for axis in (0, 1) for n in range(12)]
     seen = min(agent[0], food[0]) >= 0
-    places += [seen and food[axis] - agent[axis] == n for axis in (0, 1) for n in range(-11, 12)]
-    return rows, others, np.array(places, np.float32)
+    positions += [seen and food[axis] - agent[axis] == n for axis in (0, 1) for n in range(-11, 12)]
+    return rows, others, np.array(positions, np.float32)
 
 
 def test_every_object_is_described_as_its_cells_say(tasks):
@@ -88,7 +88,7 @@ def test_any_number_of_features_will_do(num_features):
 
 
 def test_objects_that_are_not_there_do_not_count(monkeypatch):
-    """The features of a board do not depend on what the empty places are filled with."""
+    """The features of a board do not depend on what the rows of absent objects are filled with."""
     config = Config(
         encoder="objects", object_colors=True, filters=(4, 6), hidden=4, curiosity="none"
     )

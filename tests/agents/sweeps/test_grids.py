@@ -63,7 +63,7 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, o
 @pytest.mark.parametrize(
     ("name", "short", "iterations"), [("exp1", "base", 250), ("exp2", "pstsy", 500)]
 )
-def test_the_papers_experiments(name, short, iterations):
+def test_grids_train_as_the_paper_says(name, short, iterations):
     grid = GRIDS[name]
     found = grid.configs(grid.options)
     assert {k: v.curiosity for k, v in found.items()} == {"ppo": "none", "ppo+icm": "icm"}
