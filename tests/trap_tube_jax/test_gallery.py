@@ -20,10 +20,8 @@ def test_the_gallery_shows_distinct_tasks_of_the_seed_and_a_legend(tmp_path, mon
     base, sy, legend = np.split(np.array(figures[0].axes), [5, 10])
     assert [len(axis.images) for axis in base] == [1, 0, 0, 0, 0]
     base_picture = np.asarray(tt.render(tt.base_state(), gallery.CELL_SIZE))
-    rows, columns = (
-        slice(3 * gallery.CELL_SIZE, 11 * gallery.CELL_SIZE),
-        slice(9 * gallery.CELL_SIZE),
-    )
+    rows = slice(3 * gallery.CELL_SIZE, 11 * gallery.CELL_SIZE)
+    columns = slice(9 * gallery.CELL_SIZE)
     np.testing.assert_array_equal(base[0].images[0].get_array(), base_picture[rows, columns])
     pictures = [np.asarray(axis.images[0].get_array()) for axis in sy]
     assert len({picture.tobytes() for picture in pictures}) == 5
