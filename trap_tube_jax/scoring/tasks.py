@@ -54,6 +54,11 @@ def evaluation_tasks(
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
+
+    Example:
+      >>> tasks = tt.evaluation_tasks("sy", 100)
+      >>> tasks.agent.shape, tasks.board.shape
+      ((100, 2), (100, 12, 12))
     """
     return fixed_tasks(make(name, num_features=num_features), task_set(name).id, num_tasks, purpose)
 
