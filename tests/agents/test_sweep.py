@@ -50,7 +50,8 @@ def end(path):
     costs = {"iteration": 250, "episodes": 9, "transitions": 5, "seconds": 1.0}
     append_rows(folder.metrics, [{**costs, "validation_success": 0.0}])
     tested = {"purpose": "test", "task_set": "base", "tasks": 1, "solved": 0}
-    append_rows(folder.evaluations, [{"iteration": 250, **tested}])
+    few = {"layouts": "", "layouts_total": ""}
+    append_rows(folder.evaluations, [{"iteration": 250, **tested, **few}])
 
 
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
