@@ -93,7 +93,7 @@ class Config:
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
       filters: channels of first and later convolutions; layer widths of `objects`.
-      object_colors: `objects` also describes objects by their colours.
+      object_colors: `objects` also knows the colours of the base task.
       hidden: units of the GRU. The layer before the GRU and the inverse model have the same number
         of units.
       embedding: units of embeddings of action and reward.

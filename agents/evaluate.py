@@ -8,11 +8,10 @@ import pandas as pd
 
 import trap_tube_jax as tt
 from agents.command_line import option, parse
-from agents.files import write_bytes
 from agents.runs import compilation
 from agents.runs.evaluator import Evaluator, own_and_paper_sets
 from agents.runs.loading import load
-from agents.runs.metrics import evaluation_rows
+from agents.runs.metrics import evaluation_rows, write_rows
 from agents.runs.report import save_first_solved
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import run_command
@@ -67,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.output is not None:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         table = pd.DataFrame(evaluation_rows(scores, policy, options.purpose))
-        write_bytes(options.output, table.to_csv(index=False).encode())
+        write_rows(options.output, table)
     print(
         f"{policy.name}, iteration {policy.iteration}, {options.purpose} tasks", scores, sep="\n\n"
     )

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from trap_tube_jax.command_line import one_line
+
 Plain = bool | int | float | str | None
 
 LARGEST = 2**26  # bytes of a text file
@@ -23,8 +25,10 @@ def expand(path: str | os.PathLike[str]) -> Path:
     Shells expand `--out ~/x`, but not `--out=~/x`; Python expands neither.
 
     Raises:
-      ValueError: there is no such home folder.
+      ValueError: there is no such home folder, or a terminal would take the path for a command.
     """
+    if not str(path).isprintable():
+        raise ValueError(f"paths must be printable, got {str(path)!r}; rename it")
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
@@ -59,12 +63,6 @@ def damage_named(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # parsers raise many kinds, also RecursionError
         raise ValueError(f"{path} cannot be read: {one_line(error)}") from error
-
-
-def one_line(error: Exception) -> str:
-    """Returns the message of an error as one line that any terminal can show."""
-    text = " ".join(str(error).split())
-    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
 
 
 def read_text(path: Path) -> str:

@@ -39,12 +39,15 @@ def main(
         with stopping(lambda: "The same command continues."):
             workers = make_executor(options.processes, options.cluster)
             with workers as executor, RunFolder(root).lock():
+                before = records.commands(root)
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 sizes = program_sizes(runs, run_options, executor, options.seeds_per_program)
                 failed = launch(group_runs(runs, sizes), run_options, executor, console)
                 if any(RunFolder(path).metrics.exists() for path in runs):
-                    records.collect(root, f"{program} {shlex.join(arguments)}".strip())
-                    console.out(records.write(root))
+                    records.collect(root, [*before, f"{program} {shlex.join(arguments)}".strip()])
+                    console.out(records.write_tables(root))
+                    files = [root / "results.csv", root / "table.md", *records.draw(root)]
+                    console.out("", *files, sep="\n")
     if failed:
         raise SystemExit(1)
 

@@ -17,6 +17,12 @@ def prepare_terminal() -> None:
             stream.reconfigure(errors="replace")
 
 
+def one_line(error: Exception) -> str:
+    """Returns the message of an error as one line that any terminal can show."""
+    text = " ".join(str(error).split())
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
+
+
 @contextlib.contextmanager
 def plain_errors() -> Iterator[None]:
     """Prepares the terminal, and ends the process with one line in place of a traceback.
@@ -32,7 +38,7 @@ def plain_errors() -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python warns at exit
         raise SystemExit(CLOSED_PIPE) from None
     except (ValueError, ImportError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {one_line(error)}", file=sys.stderr)
         raise SystemExit(1 if isinstance(error, OSError) else 2) from error
 
 

@@ -5,6 +5,7 @@ finish and save what it has begun.
 """
 
 import contextlib
+import dataclasses
 import os
 import signal
 import sys
@@ -31,13 +32,21 @@ class Stopped(Exception):  # noqa: N818  not an error
         self.signal = number
 
 
+@dataclasses.dataclass
+class _Block:
+    """A block of `deferring`, and the number of the first signal in it."""
+
+    on_first: Callable[[], object]
+    received: int | None = None
+
+
 class _Process:
     """The process's answer to the next signal."""
 
     def __init__(self) -> None:
         self.is_command = False  # else the process is somebody's, as a notebook's
         self.hint: Callable[[], str] = lambda: "The same command starts again."
-        self.deferred: list[list[int]] = []  # by block, the signals received in it
+        self.blocks: list[_Block] = []  # the present `deferring`, within others
 
 
 _process = _Process()
@@ -49,9 +58,11 @@ def receive(number: int) -> None:
     Raises:
       KeyboardInterrupt: at once is now, and the process is not a command's.
     """
-    if _process.deferred and not _process.deferred[-1]:
+    block = _process.blocks[-1] if _process.blocks else None
+    if block is not None and block.received is None:
         _write(FINISHING)  # before the program can see the signal, and print its own end
-        _process.deferred[-1].append(number)
+        block.received = number
+        block.on_first()
     elif _process.is_command:
         if sys.stdout is not None and sys.stdout.isatty():
             _write(SHOW_CURSOR, end="")
@@ -62,19 +73,21 @@ def receive(number: int) -> None:
 
 
 @contextlib.contextmanager
-def deferring() -> Iterator[Callable[[], int | None]]:
-    """Defers the first signal; a second one is obeyed at once.
+def deferring(
+    on_first: Callable[[], object] = lambda: None,
+) -> Iterator[Callable[[], int | None]]:
+    """Defers the first signal, and calls `on_first` when it comes; a second one ends at once.
 
     Yields a function that returns the number of the first signal, or None. In a thread other than
     the main one of a process that is no command's, no signals arrive.
     """
-    received: list[int] = []
-    _process.deferred.append(received)
+    block = _Block(on_first)
+    _process.blocks.append(block)
     before = {} if _process.is_command else _handle(lambda number, _: receive(number))
     try:
-        yield lambda: received[0] if received else None
+        yield lambda: block.received
     finally:
-        _process.deferred.pop()
+        _process.blocks.pop()
         for number, handler in before.items():
             signal.signal(number, handler)
 

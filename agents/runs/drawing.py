@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from agents.files import one_line
+from trap_tube_jax.command_line import one_line
 
 
 @contextlib.contextmanager

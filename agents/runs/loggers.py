@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from agents.files import one_line
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import Row, read_rows
 from agents.runs.run import Run, RunOptions
+from trap_tube_jax.command_line import one_line
 from trap_tube_jax.imports import needs_extra
 
 Log = Callable[[Row], Any]

@@ -7,19 +7,31 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pandas as pd
 
 from agents.acting.policy import Policy
 from agents.config import Config
 from agents.files import append_text, damage_named, is_file, read_text, write_bytes
+from agents.runs.run import check_algorithm
 from trap_tube_jax.checks import check_stored_name
 from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import Purpose
 
 Row = Mapping[str, Any]
 Table = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
+
+
+def _purpose(value: str) -> str:
+    if value not in get_args(Purpose):
+        raise ValueError(f"not {' or '.join(get_args(Purpose))}")
+    return value
+
+
+def _algorithm(value: str) -> str:
+    check_algorithm(value)
+    return value
 
 
 def _text(value: str) -> str:
@@ -69,19 +81,20 @@ COSTS = {"iteration": _count, "episodes": _count, "transitions": _count, "second
 METRICS = {**COSTS, "validation_success": _number}
 EVALUATIONS = {
     "iteration": _count,
-    "purpose": _text,
+    "purpose": _purpose,
     "task_set": _name,
     "tasks": _positive,
     "solved": _count,
+    "layouts": _number,
+    "layouts_total": _number,
 }
-LAYOUTS = {"layouts": _number, "layouts_total": _number}
-OF_A_RUN = {"algorithm": _text, "seed": _count}
+OF_A_RUN = {"algorithm": _algorithm, "seed": _count}
 SCHEMAS = {  # by the name of the file
     "metrics.csv": Schema(METRICS),
     "evaluations.csv": Schema(EVALUATIONS),
     # Older records do not count transitions.
     "curves.csv": Schema({**OF_A_RUN, **METRICS, "transitions": _number, "success": _number}),
-    "results.csv": Schema({**OF_A_RUN, **EVALUATIONS, **LAYOUTS}, _text),
+    "results.csv": Schema({**OF_A_RUN, **EVALUATIONS}, _text),
 }
 
 
@@ -95,6 +108,11 @@ def append_rows(path: Path, rows: Sequence[Row]) -> None:
     table = pd.DataFrame(rows)
     lines = table.to_csv(index=False, header=False)
     append_text(path, lines, head=table[:0].to_csv(index=False))
+
+
+def write_rows(path: Path, table: Table) -> None:
+    """Writes a table as a CSV file, atomically."""
+    write_bytes(path, table.to_csv(index=False).encode())
 
 
 def read_rows(path: Path) -> Table:
@@ -134,12 +152,16 @@ def _records(path: Path) -> list[list[str]]:
         header, *rows = filter(None, csv.reader(io.StringIO(text, newline=""), strict=True))
         if rows and not text.endswith("\n") and len(rows[-1]) < len(header):
             rows.pop()
-        if len(set(header)) < len(header) or "" in header:
-            raise ValueError("its columns must have different names")
+        if len(set(header)) < len(header) or not all(map(_is_name, header)):
+            raise ValueError("its columns must have different, printable names")
         for number, row in enumerate(rows, 1):
             if len(row) != len(header):
                 raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
         return [header, *rows]
+
+
+def _is_name(text: str) -> bool:
+    return text != "" and text.isprintable()
 
 
 def _parsed(parse: Callable[[str], Any], value: str, name: str) -> Any:

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
+from agents.files import write_bytes
+from agents.runs.drawing import drawing, to_png
 from agents.runs.metrics import Table
 from agents.sweeps import tables
 from trap_tube_jax.scoring.tasks import label
@@ -19,22 +19,24 @@ COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#00
 
 
 def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) -> list[Path]:
-    """Writes the figures that the results allow, and returns their files.
+    """Writes the figures that the results allow, and returns the files that were drawn.
 
     See `tables.tables` for the arguments.
     """
-    names = list(curves["algorithm"].unique())
     tested = tables.reported(results)
-    drawn = {}
-    if len(names) <= len(COLORS):
-        drawn["curves.png"] = draw_curves(results, curves, about)
-    if len(tested):
-        drawn["success.png"] = draw_success(tested, about)
-    for name in ("curves.png", "success.png"):  # or those of an earlier, smaller grid would stay
-        (root / name).unlink(missing_ok=True)
-    for name, figure in drawn.items():
-        figure.savefig(root / name, dpi=DPI)
-    return [root / name for name in drawn]
+    has_few = curves["algorithm"].nunique() <= len(COLORS)
+    drawn = []
+    for name, is_drawn, make in (
+        ("curves.png", has_few, lambda: draw_curves(results, curves, about)),
+        ("success.png", len(tested) > 0, lambda: draw_success(tested, about)),
+    ):
+        path = root / name
+        path.unlink(missing_ok=True)  # it may be of an earlier, smaller grid
+        if is_drawn:
+            with drawing(path):
+                write_bytes(path, to_png(make(), DPI))
+                drawn.append(path)
+    return drawn
 
 
 def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
@@ -98,8 +100,10 @@ def draw_success(tested: Table, about: Mapping[str, Any]) -> Any:
 
 def make_panels(
     titles: Sequence[str], columns: int, height: float, title: str = "", *, sharex: bool = True
-) -> tuple[Figure, list[Any]]:
-    """Makes a figure of titled panels, in rows of `height` inches."""
+) -> tuple[Any, list[Any]]:
+    """Makes a figure of Matplotlib with titled panels, in rows of `height` inches."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+
     rows = math.ceil(len(titles) / columns)
     figure = Figure(figsize=(WIDTH, rows * height + 0.9), layout="constrained")
     figure.suptitle(title, parse_math=False)

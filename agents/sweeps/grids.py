@@ -155,6 +155,20 @@ CODE_POINTS = {
 PAPER_RUN = RunOptions(evaluate_every=1, test_tasks=1000)
 BEST_RUN = RunOptions(evaluate_every=20, test_tasks=1000)
 CURIOSITIES = ("icm", "rnd", "noveld", "effects")
+# Preset `best`, and without one ingredient at a time.
+INGREDIENT_POINTS: dict[str, dict[str, Any]] = {
+    "best": {},
+    "known-colors": {"object_colors": True},
+    "paper-encoder": {"encoder": "paper", "filters": (32, 64)},
+    "unturned": {"align_to_food": False},
+    "no-motion": {"motion_coef": 0.0},
+    "no-replay": {"replay_fractions": ()},
+    "rnd": {"curiosity": "rnd"},
+    "noveld": {"curiosity": "noveld"},
+    "repeats": {"repeat_penalty": 0.0},
+    "no-memory": {"recurrent": False},
+    "paper-ppo": {"epochs": 10, "discount": 0.99, "value_coef": 0.01, "entropy_coef": 1e-4},
+}
 
 GRIDS = {
     "exp1": Grid(
@@ -204,5 +218,12 @@ GRIDS = {
             **{f"ppo+{name}": {"curiosity": name} for name in CURIOSITIES},
         },
         "preset best with every intrinsic reward; 5 hours on one core",
+    ),
+    "ingredients": Grid(
+        Options(preset="best", env="pstsy", seeds=8, seed=10),
+        BEST_RUN,
+        {"iterations": 360, "max_transitions": 8_000_000},
+        INGREDIENT_POINTS,
+        "preset best without one ingredient at a time; a day on one core",
     ),
 }

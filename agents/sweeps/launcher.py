@@ -73,7 +73,7 @@ def launch(
     failed: list[Path] = []
     count = 0
     try:
-        with deferring() as request, Overview(console, runs) as overview:
+        with deferring(present.end) as request, Overview(console, runs) as overview:
             calls = {executor.submit(*_call(group, options, present)): group for group in groups}
             pending = set(calls)
             while pending:
@@ -81,7 +81,6 @@ def launch(
                 # A wait without a timeout would miss a signal that arrives just before it.
                 ended, pending = wait(pending, timeout=1, return_when=FIRST_COMPLETED)
                 if request():
-                    present.end()
                     _cancel_waiting({call: calls[call] for call in pending})
                     ended |= {call for call in pending if call.cancelled()}  # Dask does not tell
                     pending -= ended

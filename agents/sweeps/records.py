@@ -1,23 +1,21 @@
 """Files of a grid's results, and what is drawn from them.
 
 A grid's folder holds results.csv (rows of `agents.results`), curves.csv (metrics by iteration) and
-grid.json (title, commands, settings that all runs share, machines, unfinished runs). table.md and
-the figures are made from only these three files.
+grid.json (see `About`). table.md and the figures are made from only these three files.
 """
 
 import itertools
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import NotRequired, TypedDict
 
 import agents
-from agents.files import read_json, write_bytes, write_json
-from agents.runs.folder import RunFolder
-from agents.runs.metrics import Table
+from agents.files import is_file, read_json, write_bytes, write_json
+from agents.runs.folder import RunFolder, Settings, check_name
+from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.progress import has_ended
+from agents.runs.provenance import Machine, read_provenance
 from agents.runs.results import find_runs, metrics
 from agents.sweeps import figures, tables
 from trap_tube_jax.registry import task_set
@@ -25,75 +23,66 @@ from trap_tube_jax.registry import task_set
 COUNTS = ["iteration", "episodes", "transitions", "seconds"]
 CURVES = ["algorithm", "seed", *COUNTS, "success", "validation_success"]
 WIDTH = 80
-ABOUT = "grid.json"
 
 
-def collect(root: Path, command: str) -> None:
+class About(TypedDict):
+    """The content of grid.json.
+
+    Attributes:
+      title: heading of the table and the figures.
+      commands: commands that have trained the runs.
+      train_set: short name of the training set; "training set" for several.
+      threshold: share of the validation tasks that counts as solved.
+      settings: settings that all runs share.
+      machines: hardware, versions and commits that trained the runs.
+      unfinished: algorithm and seed of runs that have not reached their end.
+      note: what else a reader must know; written by hand.
+    """
+
+    title: str
+    commands: list[str]
+    train_set: str
+    threshold: float
+    settings: Settings
+    machines: list[Machine]
+    unfinished: list[list[str | int]]
+    note: NotRequired[str]
+
+
+def collect(root: Path, commands: Sequence[str]) -> None:
     """Writes results.csv, curves.csv and grid.json from the runs in a folder.
 
-    `command` is added to those that have trained the runs before.
+    Raises:
+      ValueError: a run's file is damaged, or a folder has a name that no table can hold.
     """
-    results = agents.results(root)
-    results["run"] = results["run"].map(lambda path: Path(path).name)
-    results.to_csv(root / "results.csv", index=False)
-    metrics(root)[CURVES].to_csv(root / "curves.csv", index=False)
     folders = find_runs(root)
-    stored = [read_json(folder.config) for folder in folders]
+    for folder in folders:
+        check_name(folder.title)
+    results = agents.results(root)
+    write_rows(root / "results.csv", results.assign(run=results["run"].map(lambda x: Path(x).name)))
+    write_rows(root / "curves.csv", metrics(root)[CURVES])
+    write_json(root / "grid.json", _about(root.name, folders, commands))
+
+
+def _about(name: str, folders: Sequence[RunFolder], commands: Sequence[str]) -> About:
+    stored = [folder.stored() for folder in folders]
     configs = [run["config"] for run in stored]
-    machines = [read_json(folder.provenance) for folder in folders if folder.provenance.exists()]
-    commands = commands_of(read_json(root / ABOUT)) if (root / ABOUT).exists() else []
-    first = configs[0]
     train_sets = [task_set(name) for name in dict.fromkeys(config["env_id"] for config in configs)]
-    about = {
-        "title": f"{root.name}: trained on {' or '.join(known.label for known in train_sets)}",
-        "commands": list(dict.fromkeys([*commands, command])),
+    machines = itertools.chain.from_iterable(read_provenance(x.provenance) for x in folders)
+    unique = {repr(machine): machine for machine in machines}
+    return {
+        "title": f"{name}: trained on {' or '.join(known.label for known in train_sets)}",
+        "commands": list(dict.fromkeys(commands)),
         "train_set": train_sets[0].short if len(train_sets) == 1 else "training set",
         "threshold": max(config["stop_when_solved"] or 1.0 for config in configs),
-        "settings": {k: v for k, v in first.items() if all(c.get(k) == v for c in configs)},
-        "machines": distinct(itertools.chain(*machines)),
+        "settings": {k: v for k, v in configs[0].items() if all(c.get(k) == v for c in configs)},
+        "machines": list(unique.values()),
         "unfinished": [
             [run["algorithm"], run["seed"]]
             for folder, run in zip(folders, stored, strict=True)
             if is_unfinished(folder)
         ],
     }
-    write_json(root / ABOUT, about)
-
-
-def write(root: Path) -> str:
-    """Writes table.md and the figures from the files of `collect`.
-
-    Returns:
-      The main tables as text of at most 80 columns, and the files that were written.
-    """
-    results, curves = (read_table(root / name) for name in ("results.csv", "curves.csv"))
-    about = read_json(root / ABOUT)
-    found = tables.tables(results, curves, about)
-    note = tables.unfinished_note(about)
-    parts = [f"**{heading}**\n\n{tables.markdown(table)}" for heading, table in found.items()]
-    parts += [*note, tables.NOTE, *(f"`{command}`" for command in commands_of(about))]
-    parts += [
-        f"{machine['cores']} core(s) of {machine['processor']}, {machine['device']}; "
-        f"jax {machine['jax']}, commit `{machine['commit']}`."
-        for machine in about["machines"]
-    ]
-    text = "\n\n".join([f"# {about['title']}", *parts]) + "\n"
-    write_bytes(root / "table.md", text.encode())
-    drawn = figures.save(root, results, curves, about)
-    shown = [f"{name}\n{found[name].to_string(line_width=WIDTH)}" for name in found]
-    shown += [textwrap.fill(line, WIDTH) for line in note]
-    files = map(str, (root / "results.csv", root / "table.md", *drawn))
-    return "\n\n".join([*shown, "\n".join(files)])
-
-
-def read_table(path: Path) -> Table:
-    """Reads a CSV file in which only an empty field is missing: a task set may be named NA."""
-    return pd.read_csv(path, keep_default_na=False, na_values=[""])
-
-
-def commands_of(about: Mapping[str, Any]) -> list[str]:
-    """Returns the commands that have trained the runs; records of before had one."""
-    return about.get("commands") or [about["command"]]
 
 
 def is_unfinished(folder: RunFolder) -> bool:
@@ -105,10 +94,51 @@ def is_unfinished(folder: RunFolder) -> bool:
     return not has_ended(folder, run)
 
 
-def distinct(values: Iterable[Any]) -> list[Any]:
-    """Returns plain values once each, in order; unlike `dict.fromkeys`, also unhashable ones."""
-    found: list[Any] = []
-    for value in values:
-        if value not in found:
-            found.append(value)
-    return found
+def commands(root: Path) -> list[str]:
+    """Returns the commands that have trained the runs of a folder.
+
+    Raises:
+      ValueError: grid.json is damaged.
+    """
+    path = root / "grid.json"
+    return read_json(path, About)["commands"] if is_file(path) else []
+
+
+def read(root: Path) -> tuple[Table, Table, About]:
+    """Reads results.csv, curves.csv and grid.json.
+
+    Raises:
+      ValueError: a file is damaged.
+      OSError: a file cannot be opened.
+    """
+    about = read_json(root / "grid.json", About)
+    return read_rows(root / "results.csv"), read_rows(root / "curves.csv"), about
+
+
+def write_tables(root: Path) -> str:
+    """Writes table.md from the files of `collect`.
+
+    Returns the tables as text of at most 80 columns.
+    """
+    results, curves, about = read(root)
+    found = tables.tables(results, curves, about)
+    note = tables.unfinished_note(about)
+    parts = [f"**{heading}**\n\n{tables.markdown(table)}" for heading, table in found.items()]
+    parts += [*note, tables.NOTE]
+    parts += [f"    {command}" for command in about["commands"]]  # indented, a block of code
+    parts += [
+        tables.escape(
+            f"{machine['cores']} core(s) of {machine['processor']}, {machine['device']}; "
+            f"jax {machine['jax']}, commit {machine['commit']}."
+        )
+        for machine in about["machines"]
+    ]
+    text = "\n\n".join([f"# {tables.escape(about['title'])}", *parts]) + "\n"
+    write_bytes(root / "table.md", text.encode())
+    shown = [f"{name}\n{found[name].to_string(line_width=WIDTH)}" for name in found]
+    return "\n\n".join([*shown, *(textwrap.fill(line, WIDTH) for line in note)])
+
+
+def draw(root: Path) -> list[Path]:
+    """Draws the figures from the files of `collect`, and returns their files."""
+    return figures.save(root, *read(root))

@@ -3,6 +3,7 @@
 Source: the paper's Tables 1 and 2; Student's t for the interval of a mean of few seeds.
 """
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -39,13 +40,13 @@ def tables(results: Table, curves: Table, about: Mapping[str, Any]) -> dict[str,
 
     Args:
       results: rows of `agents.results`.
-      curves: rows of metrics, with the columns of `report.CURVES`.
+      curves: rows of metrics, with the columns of `records.CURVES`.
       about: `train_set`, which decides the paper's table to compare with, `threshold`, the share of
         its validation tasks that counts as solved, and `unfinished`, algorithm and seed of runs.
     """
     tested = reported(results)
     train_set = about["train_set"]
-    unfinished = Counter(algorithm for algorithm, _ in about.get("unfinished", ()))
+    unfinished = Counter(algorithm for algorithm, _ in about["unfinished"])
     with_paper = train_set == "base"
     found = {"Training": training_table(curves, about["threshold"], with_paper, unfinished)}
     if len(tested):
@@ -55,7 +56,7 @@ def tables(results: Table, curves: Table, about: Mapping[str, Any]) -> dict[str,
 
 def unfinished_note(about: Mapping[str, Any]) -> list[str]:
     """Names the runs that have not reached their end, in one sentence; none if all have."""
-    runs = [f"{algorithm} seed {seed}" for algorithm, seed in about.get("unfinished", ())]
+    runs = [f"{algorithm} seed {seed}" for algorithm, seed in about["unfinished"]]
     return [f"Unfinished, so the table may change: {', '.join(runs)}."] if runs else []
 
 
@@ -135,3 +136,8 @@ def markdown(table: Table) -> str:
     """Returns a table as Markdown."""
     heads = ["", *map(str, table.columns)]
     return markdown_table([heads, *([str(name), *row] for name, *row in table.itertuples())])
+
+
+def escape(text: str) -> str:
+    """Returns text that Markdown shows as it is, without HTML and links."""
+    return re.sub(r"[\\`*\[\]<>&|]", r"\\\g<0>", text)

@@ -50,7 +50,8 @@ def end(path):
     costs = {"iteration": 250, "episodes": 9, "transitions": 5, "seconds": 1.0}
     append_rows(folder.metrics, [{**costs, "validation_success": 0.0}])
     tested = {"purpose": "test", "task_set": "base", "tasks": 1, "solved": 0}
-    append_rows(folder.evaluations, [{"iteration": 250, **tested}])
+    few = {"layouts": "", "layouts_total": ""}
+    append_rows(folder.evaluations, [{"iteration": 250, **tested, **few}])
 
 
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
@@ -366,13 +367,23 @@ def test_a_lost_scheduler_is_a_failure(tmp_path, cluster):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("signals", [1, 2])
-def test_ctrl_c_ends_a_sweep_on_this_machine(tmp_path, signals):
-    process = start_endless(tmp_path, "--processes", 1)
+@pytest.mark.parametrize("where", ["here", "on a cluster"])
+def test_ctrl_c_ends_a_sweep(request, tmp_path, where, signals):
+    """The second run is queued."""
+    workers_of = ["--processes", 1]
+    if where == "on a cluster":
+        workers_of = ["--cluster", request.getfixturevalue("cluster")[1]]
+    process = start_endless(tmp_path, *workers_of)
     assert process.stderr is not None
     for _ in range(signals):
         process.send_signal(signal.SIGINT)
         process.stderr.readline()
-    errors = process.stderr.read()
-    process.communicate()
-    assert process.returncode == 130
+    output, errors = process.communicate()
+    assert process.returncode == 130, errors
     assert "Traceback" not in errors
+    assert not (tmp_path / "x" / ".launch").exists(), "its workers would train on"
+    if signals == 1:
+        assert output.count(": stopped\n") == 2
+        folder = tmp_path / "x" / "fast-seed0"
+        assert small_runs.final_state(folder)[0] == len(small_runs.untimed(folder))
+        assert not (tmp_path / "x" / "fast-seed1").exists()

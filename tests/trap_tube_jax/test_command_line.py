@@ -25,6 +25,13 @@ def test_commands_end_with_one_line(error, code, capsys):
     assert capsys.readouterr().err == f"error: {error}\n"
 
 
+def test_an_error_is_no_command_to_the_terminal(capsys):
+    with pytest.raises(SystemExit), plain_errors():
+        raise ValueError("no set \x1b[2J\nerror: forged \u202e \udcff")
+    shown = capsys.readouterr().err
+    assert shown == "error: no set \\x1b[2J error: forged \\u202e \\udcff\n"
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252", "cp437", "cp932", "utf-8"])
 def test_any_terminal_shows_the_characters_that_it_knows(encoding, monkeypatch):
     output = io.TextIOWrapper(io.BytesIO(), encoding=encoding)

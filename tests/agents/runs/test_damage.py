@@ -18,11 +18,17 @@ from agents.files import LARGEST
 from agents.runs import checkpoint
 from agents.runs.folder import RunFolder
 from agents.runs.loading import load, save
-from agents.runs.metrics import append_rows, read_rows, rewind_rows
-from agents.runs.provenance import note_provenance
+from agents.runs.metrics import SCHEMAS, append_rows, read_rows, rewind_rows
+from agents.runs.provenance import Machine, note_provenance
 from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
+from agents.sweeps import records
 from tiny_policy import CONFIG, random_params, random_policy
+
+
+def without(row: dict[str, Any], key: str) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name != key}
+
 
 ROOM = 2**30  # bytes that reading may allocate, whatever a file says
 CHECKPOINT = "checkpoints/4.safetensors"
@@ -32,12 +38,20 @@ METRICS = {
     "validation_success": 0.5, "loss": 0.25,
 }  # fmt: skip
 EVALUATION = {
-    "iteration": 4, "purpose": "test", "task_set": "p", "tasks": 2, "solved": 1, "length": 6.5
+    "iteration": 4, "purpose": "test", "task_set": "p", "tasks": 2, "solved": 1,
+    "layouts": "", "layouts_total": "", "length": 6.5,
+}  # fmt: skip
+OF_A_RUN = {"run": "a", "algorithm": "ppo", "seed": 0}
+CURVE = {**without(OF_A_RUN, "run"), **without(METRICS, "loss"), "success": 0.5}
+RESULT = {**OF_A_RUN, **EVALUATION}
+GRID = {
+    "title": "x", "commands": ["x"], "train_set": "p", "threshold": 1.0,
+    "settings": {}, "machines": [], "unfinished": [["ppo", 0]],
 }  # fmt: skip
 ABOUT = {"config": CONFIG.to_dict(), "iteration": 4}
 PARAMS = to_arrays(random_params())
 
-# What reads a file of a run, by the file's name.
+# What reads a file of a run or a grid, by the file's name.
 READERS: dict[str, list[Any]] = {
     "config.json": [RunFolder.read, RunFolder.devices, lambda run: results(run.path)],
     "provenance.json": [
@@ -59,12 +73,15 @@ READERS: dict[str, list[Any]] = {
         lambda run: load(run.path, iteration=4),
     ],
     "best.safetensors": [lambda run: load(run.path)],
+    "curves.csv": [lambda run: records.read(run.path)],
+    "results.csv": [lambda run: records.read(run.path)],
+    "grid.json": [lambda run: records.read(run.path), lambda run: records.commands(run.path)],
 }
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
-    """A folder with every file that a run's readers read."""
+    """A folder with every file of a run and of a grid."""
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "whole")
     folder.path.mkdir()
     folder.note(Run(CONFIG), RunOptions(evaluate_every=2))
@@ -73,6 +90,10 @@ def whole(tmp_path_factory) -> Path:
     append_rows(folder.evaluations, [EVALUATION])
     checkpoint.save(folder.checkpoints, 4, {"params": random_params()}, METRICS)
     save(folder.best, random_policy().replace(iteration=4))
+    (folder.path / "curves.csv").write_bytes(csv_file(CURVE))
+    (folder.path / "results.csv").write_bytes(csv_file(RESULT))
+    (folder.path / "grid.json").write_text(json.dumps(GRID))
+    records.write_tables(folder.path)
     return folder.path
 
 
@@ -136,16 +157,17 @@ WRONG_ROWS = [
     {"more\x1b": "x"},
 ]
 WRONG_METRICS = [{"seconds": "inf"}, {"loss": "high"}, {"validation_success": "1,2"}]
-WRONG_EVALUATIONS = [{"tasks": 0}, {"task_set": "=1+1"}, {"purpose": "\x1b[2J"}, {"length": "x"}]
+WRONG_EVALUATIONS = [{"tasks": 0}, {"task_set": "=1+1"}, {"purpose": "=1+1"}, {"length": "x"}]
+WRONG_ALGORITHMS = [{"algorithm": name} for name in WRONG["algorithm"][2:7]]
 # What follows a good row.
 CSV = {
     "other encoding": b"\xff\n",
-    "long row": b"1,2,3,4,5,6,7,8\n",
+    "long row": b"1" + b",1" * 20 + b"\n",
     "short row": b"1,2\n",
     "open quote": b'1,"2\n',
     "nul": b"\0\0\0\n",
 }
-MACHINE = {"processor": "x", "cores": 1, "device": "cpu", "commit": None, "jax": "1"}
+MACHINE = {**dict.fromkeys(Machine.__required_keys__, "x"), "cores": 1, "commit": None}
 ARRAYS = {
     "empty": b"",
     "zeros": bytes(100),
@@ -184,13 +206,9 @@ Damages = dict[
 ]  # contents, or functions that make a path bad, by file and kind
 
 
-def without(row: dict[str, Any], key: str) -> dict[str, Any]:
-    return {name: value for name, value in row.items() if name != key}
-
-
 def json_damages() -> Damages:
     found: Damages = {}
-    for name in ("config.json", "provenance.json"):
+    for name in ("config.json", "provenance.json", "grid.json"):
         found |= {(name, kind): content for kind, content in NO_JSON.items()}
     for key, values in WRONG.items():
         runs = {
@@ -199,8 +217,12 @@ def json_damages() -> Damages:
         }
         for kind, run in runs.items():
             found["config.json", f"{key} {kind}"] = json.dumps(run).encode()
-    for kind, machines in {"key": [{**MACHINE, "x": 1}], "part": [MACHINE], "map": {}}.items():
-        found["provenance.json", kind] = json.dumps(machines).encode()
+    for key in GRID:
+        found["grid.json", f"no {key}"] = json.dumps(without(GRID, key)).encode()
+    changes = {"key": {"x": 1}, "cores": {"cores": "1"}, "commit": {"commit": "=1+1"}}
+    for kind, change in changes.items():
+        found["provenance.json", kind] = json.dumps([{**MACHINE, **change}]).encode()
+    found["provenance.json", "part"] = json.dumps([without(MACHINE, "jax")]).encode()
     return found
 
 
@@ -209,12 +231,14 @@ def csv_damages() -> Damages:
     for name, row, wrong in (
         ("metrics.csv", METRICS, WRONG_METRICS),
         ("evaluations.csv", EVALUATION, WRONG_EVALUATIONS),
+        ("curves.csv", CURVE, WRONG_ALGORITHMS),
+        ("results.csv", RESULT, [*WRONG_EVALUATIONS[:3], *WRONG_ALGORITHMS]),
     ):
         for change in WRONG_ROWS + wrong:
             found[name, str(change)] = csv_file(row, **change)
         for kind, content in CSV.items():
             found[name, kind] = csv_file(row) + content
-        for key in list(row)[:5]:
+        for key in SCHEMAS[name].columns:
             found[name, f"no {key}"] = csv_file(without(row, key))
         found[name, "large"] = sparse
         found[name, "other columns"] = b"x,y\n"

@@ -9,6 +9,8 @@ import pytest
 from agents.config import Config
 from agents.files import read_json, write_bytes, write_json
 from agents.runs.folder import RunFolder, check_name
+from agents.runs.loading import load
+from agents.runs.results import results
 from agents.runs.run import Run, RunOptions
 from refusal import assert_refused
 
@@ -31,6 +33,9 @@ def test_a_run_is_the_same_after_json():
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
         (RunOptions, {"devices": 100_000}, ["devices must be an integer >= 1 and <= 1024"]),
         (partial(Run, Config()), {"algorithm": "=1+1"}, ["algorithm must begin with a letter"]),
+        (RunFolder, {"path": "a/\x1b[2J/b"}, [r"paths must be printable, got 'a/\x1b[2J/b'"]),
+        (load, {"source": "\udcff"}, [r"paths must be printable, got '\udcff'"]),
+        (results, {"paths": ["\n"]}, [r"paths must be printable, got '\n'"]),
         *(
             (check_name, {"name": name}, ["a folder's name without a path", repr(name)])
             for name in ("", ".", "..", "a/b", ".hidden", "-x", "=1+1", "a\nb", "\udcff")

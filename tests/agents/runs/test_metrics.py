@@ -49,6 +49,7 @@ def test_names_that_pandas_takes_for_missing_are_names(tmp_path):
     path = tmp_path / "evaluations.csv"
     names = ["NA", "null", "nan", "None"]
     values = {"iteration": 1, "purpose": "test", "tasks": 2, "solved": 1}
+    values |= {"layouts": "", "layouts_total": ""}
     append_rows(path, [{**values, "task_set": name} for name in names])
     assert list(read_rows(path)["task_set"]) == names
 

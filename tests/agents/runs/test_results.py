@@ -12,7 +12,10 @@ from agents.runs.run import Run
 from refusal import assert_refused
 from tiny_policy import CONFIG
 
-EVALUATION = {"iteration": 4, "purpose": "test", "task_set": "NA", "tasks": 2, "solved": 1}
+EVALUATION = {
+    "iteration": 4, "purpose": "test", "task_set": "NA", "tasks": 2, "solved": 1,
+    "layouts": "", "layouts_total": "",
+}  # fmt: skip
 
 
 @pytest.fixture

@@ -8,12 +8,14 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
-from agents.files import read_json
+from agents.files import read_json, write_json
 from agents.runs.folder import RunFolder
-from agents.runs.metrics import append_rows
+from agents.runs.metrics import append_rows, read_rows
+from agents.runs.provenance import note_provenance
 from agents.runs.run import Run
 from agents.sweeps import figures, records, tables
 from paths import ROOT
+from refusal import assert_refused
 from small_runs import small_config
 
 RESULTS = ROOT / "benchmarks" / "results"
@@ -25,7 +27,10 @@ RECORDS = (
     "exp2_paper_encoder",
     "fast_base",
 )
-ABOUT = {"title": "x", "train_set": "pstsy", "threshold": 1.0}
+ABOUT: records.About = {
+    "title": "x", "commands": [], "train_set": "pstsy", "threshold": 1.0,
+    "settings": {}, "machines": [], "unfinished": [],
+}  # fmt: skip
 
 
 def rows(algorithm, solved, *, task_set="p", purpose="test", iteration=2, tasks=10, layouts=None):
@@ -142,9 +147,9 @@ def test_many_algorithms_are_points_and_bars_but_not_lines(tmp_path):
 @pytest.mark.parametrize("record", RECORDS)
 def test_the_tables_of_the_records_fit_a_terminal(record, tmp_path):
     copy = shutil.copytree(RESULTS / record, tmp_path / record)
-    shown = records.write(copy)
+    shown = records.write_tables(copy)
     assert "**Test tasks solved, %**" in (copy / "table.md").read_text()
-    assert max(map(len, shown.splitlines()[:-5])) <= records.WIDTH
+    assert max(map(len, shown.splitlines())) <= records.WIDTH
 
 
 def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path, own_task_sets):
@@ -153,7 +158,7 @@ def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path
     tested = rows("ppo", [3], task_set="NA") + rows("ppo", [4], task_set="other")
     greedy = [{**row, "purpose": "validation", "iteration": i} for row in tested for i in (1, 2)]
     pd.DataFrame(tested + greedy).to_csv(tmp_path / "results.csv", index=False)
-    results = records.read_table(tmp_path / "results.csv")
+    results = read_rows(tmp_path / "results.csv")
     table = tables.tables(results, curves(), ABOUT)["Test tasks solved, %"]
     assert table.loc[["NA", "other"], "ppo"].tolist() == ["30.0", "40.0"]
     figure = figures.draw_curves(results, curves(), ABOUT)
@@ -169,12 +174,12 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
         tested = pd.DataFrame(rows("ppo", [1])).drop(columns=["algorithm", "seed"])
         append_rows(folder.evaluations, tested.to_dict("records"))
     for command in ("first", "second", "first"):
-        records.collect(tmp_path, command)
-    shown = records.write(tmp_path)
+        records.collect(tmp_path, [*records.commands(tmp_path), command])
+    shown = records.write_tables(tmp_path)
     assert "2 of 2, 1 unfinished" in shown
     assert "Unfinished, so the table may change: ppo+effects seed 1." in shown
     text = (tmp_path / "table.md").read_text()
-    assert "`first`\n\n`second`\n" in text
+    assert "\n    first\n\n    second\n" in text
 
 
 def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
@@ -183,8 +188,25 @@ def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
         folder.note(Run(small_config(env_id=name, stop_when_solved=threshold)))
         metrics = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, metrics.to_dict("records"))
-    records.collect(tmp_path, "")
+    records.collect(tmp_path, [])
     about = read_json(tmp_path / "grid.json")
     assert about["title"].endswith(": trained on base or {Sy}")
     assert about["train_set"] == "training set"
     assert about["threshold"] == 0.9, "what one run solves is solved by the standard of all"
+
+
+def test_what_others_have_written_is_plain_text(tmp_path):
+    """In Markdown as in a spreadsheet."""
+    folder = RunFolder(tmp_path / "seed0")
+    folder.note(Run(small_config()))
+    append_rows(folder.metrics, curves().drop(columns=["algorithm", "seed"]).to_dict("records"))
+    note_provenance(folder.provenance, "cpu")
+    (machine,) = read_json(folder.provenance)
+    write_json(folder.provenance, [{**machine, "processor": "<b>[x](y)`"}])
+    records.collect(tmp_path, ["sweep `<script>`"])
+    records.write_tables(tmp_path)
+    text = (tmp_path / "table.md").read_text()
+    assert "\n    sweep `<script>`\n" in text, "a block of code"
+    assert r"\<b\>\[x\](y)\`" in text
+    folder.path.rename(tmp_path / "=1+1")
+    assert_refused(["got '=1+1'"], records.collect, tmp_path, [])
