@@ -170,18 +170,19 @@ class Scores:
 
     def __str__(self) -> str:
         heads = ["set", "tasks", "solved", "%", "95 % interval", "layouts", "steps"]
-        if any(score.optimality for score in self.sets):
-            heads += ["of solvable %", "optimality"]
-        rows = [heads, *(_cells(score)[: len(heads)] for score in self.sets)]
+        parts = [markdown_table([heads, *map(_cells, self.sets)])]
+        compared = [score for score in self.sets if score.optimality]
+        if compared:  # a table of its own, since lines of both would not fit a terminal
+            heads = ["set", "% of solvable", "shortest plan / steps"]
+            parts.append(markdown_table([heads, *map(_optimality_cells, compared)]))
         end = f"Protocol {self.protocol}, trap-tube-jax {self.version}."
         if any(score.layouts for score in self.sets):
             end = f"A layout counts as solved if more than half of its draws are solved.\n{end}"
-        return f"{markdown_table(rows)}\n\n{end}"
+        return "\n\n".join([*parts, end])
 
 
 def _cells(score: Score) -> list[str]:
     interval = score.interval
-    found = score.optimality
     return [
         score.label,
         str(score.tasks),
@@ -190,6 +191,13 @@ def _cells(score: Score) -> list[str]:
         "-" if interval is None else f"{interval[0]:.1f}-{interval[1]:.1f}",
         "-" if score.layouts is None else str(score.layouts),
         _number(score.mean_steps, ".1f"),
+    ]
+
+
+def _optimality_cells(score: Score) -> list[str]:
+    found = score.optimality
+    return [
+        score.label,
         _number(found and found.percent_of_solvable, ".1f"),
         _number(found and found.mean, ".3f"),
     ]

@@ -39,3 +39,12 @@ def test_few_layouts_are_counted_and_have_no_interval():
     assert score.layouts is None
     assert score.interval == pytest.approx((23.659, 76.341), abs=1e-3)
     assert " 23.7-76.3 |" in str(Scores(1, "0", None, (score,)))
+
+
+def test_a_printed_table_fits_a_terminal():
+    solved = np.array([True, False])
+    found = Optimality.of(solved, np.array([20, 50]), np.array([10, 11]), 50)
+    score = Score.of("pstsy", "{P, St, Sy}", solved, np.array([20, 50]), optimality=found)
+    text = str(Scores(1, "0.2.0", 0, (score,)))
+    assert " 0.500 |" in text
+    assert max(map(len, text.splitlines())) <= 80
