@@ -1,5 +1,7 @@
 """The loss that predicts motion, on steps that are known."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,9 +25,10 @@ def test_motion_is_a_change_of_row_or_column():
 
 def test_the_head_reads_embedding_and_action_of_a_step():
     embedding, action = jnp.ones((2, 4, 5)), jnp.ones((2, 4, 3))
-    params = init_module(MotionHead(), jax.random.key(0), embedding, action)
-    logits = MotionHead().apply(params, embedding, action)
+    head: Any = MotionHead()
+    params = init_module(head, jax.random.key(0), embedding, action)
+    logits = head.apply(params, embedding, action)
     assert logits.shape == (2, 4, 3, 2)
     for changed in ((embedding.at[1, 2, 0].set(2), action), (embedding, action.at[1, 2, 0].set(2))):
-        differs = np.asarray(MotionHead().apply(params, *changed) != logits).any(axis=(2, 3))
+        differs = np.asarray(head.apply(params, *changed) != logits).any(axis=(2, 3))
         assert np.argwhere(differs).tolist() == [[1, 2]]
