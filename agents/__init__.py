@@ -1,11 +1,21 @@
 """Agents that learn the trap-tube task: PPO with curiosity, jitted end to end.
 
-import agents, jax
+    import agents
+    import jax
 
-config = agents.Config.preset("fast", env_id="sy")
-learner = agents.make_learner(config)           # init and iterate, pure functions
-policy = agents.load("best-pstsy")              # a shipped agent, a run's folder or a file
-action, carry = policy.act(observation, policy.initial(batch))
+    learner = agents.make_learner(agents.Config.preset("fast", env_id="sy"))
+    train_state = learner.init(jax.random.key(0))
+    train_state, metrics = jax.jit(learner.iterate)(train_state)
+
+`help(agents.load)` explains a name. The examples assume these two imports and
+`import trap_tube_jax as tt`.
+
+    settings       Config
+    training       make_learner, Learner, TrainState
+    policies       load, save, Policy
+    runs           train_run, Run, RunOptions, results
+
+extending.md in this folder adds intrinsic rewards and encoders.
 """
 
 from agents.acting.policy import Policy

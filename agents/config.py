@@ -43,7 +43,7 @@ class Config:
     """The settings of one training run; defaults are the paper's.
 
     Attributes:
-      env_id: task set to train on, by id or short name; p+pstsy mixes two.
+      env_id: task set to train on, by id or short name, or a mixture such as p+pstsy.
       num_features: N, feature channels of the observation; 3 is RGB.
       max_steps: limit of steps of an episode of training; None keeps the task set's limit,
         which holds in evaluations on `sets` in any case.
@@ -93,13 +93,21 @@ class Config:
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
       filters: channels of first and later convolutions; layer widths of `objects`.
-      object_colors: `objects` also describes objects by their colours.
+      object_colors: `objects` also knows the colours of the base task.
       hidden: units of the GRU. The layer before the GRU and the inverse model have the same number
         of units.
       embedding: units of embeddings of action and reward.
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.
       previous_inputs: also reads the previous action and reward.
+
+    Raises:
+      ValueError: a setting's value is not allowed; the message names the allowed ones.
+
+    Example:
+      >>> config = agents.Config.preset("fast", env_id="sy", iterations=50)
+      >>> config.curiosity, config.episodes_per_iteration, config.gradient_steps
+      ('effects', 256, 32)
     """
 
     env_id: str = _task("TrapTube-v0", flags=("--env",))

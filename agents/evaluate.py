@@ -15,6 +15,7 @@ from agents.runs.metrics import evaluation_rows, write_rows
 from agents.runs.report import save_first_solved
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import run_command
+from trap_tube_jax.scoring.tasks import Purpose
 from trap_tube_jax.solver import solve_batch
 
 
@@ -27,6 +28,7 @@ class Options:
       sets: ids or short names of task sets, by default the paper's eight and the training set.
       imports: modules to import first, which register curiosities, encoders or task sets.
       tasks: tasks per set, by default the run's `eval_episodes`. Base has one.
+      purpose: tasks to play: `test`, or those for selection or for a final confirmation.
       iteration: checkpoint of a run, by default its best policy, or the newest without one.
       optimality: compares with shortest plans, which are searched for first.
       output: CSV file for the results.
@@ -37,6 +39,7 @@ class Options:
     sets: tuple[str, ...] = ()
     imports: tuple[str, ...] = option((), append=True, flags=("--import",))
     tasks: int | None = None
+    purpose: Purpose = "test"
     iteration: int | None = None
     optimality: bool = False
     output: Path | None = None
@@ -51,7 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     policy = load(options.source, iteration=options.iteration, imports=options.imports)
     config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks
-    evaluator = Evaluator.of_sets(config, options.sets or own_and_paper_sets(config), tasks)
+    sets = options.sets or own_and_paper_sets(config)
+    evaluator = Evaluator.of_sets(config, sets, tasks, options.purpose)
     # An unknown training set is refused before anything is played.
     train_set = tt.task_set(config.env_id).short if options.gif else ""
     shortest = None
@@ -61,8 +65,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scores = evaluator.scores(played, shortest)
     if options.output is not None:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        write_rows(options.output, pd.DataFrame(evaluation_rows(scores, policy, "test")))
-    print(f"{policy.name}, iteration {policy.iteration}", scores, sep="\n\n")
+        table = pd.DataFrame(evaluation_rows(scores, policy, options.purpose))
+        write_rows(options.output, table)
+    print(
+        f"{policy.name}, iteration {policy.iteration}, {options.purpose} tasks", scores, sep="\n\n"
+    )
     if options.output is not None:
         print(f"\nresults: {options.output}")
     if options.gif is not None:

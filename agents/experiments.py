@@ -15,8 +15,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ("",)
     if name not in GRIDS:
         asked = name in ("-h", "--help")
-        usage = f"usage: {PROGRAM} {{{','.join(GRIDS)}}} [--help]"
-        print(usage, file=sys.stdout if asked else sys.stderr)
+        lines = [f"usage: {PROGRAM} NAME [options]", "", "names:"]
+        lines += [f"  {known:<13}{grid.about}" for known, grid in GRIDS.items()]
+        lines += ["", f"{PROGRAM} NAME --help lists the options."]
+        print("\n".join(lines), file=sys.stdout if asked else sys.stderr)
         raise SystemExit(0 if asked else 2)
     sweep.main(rest, f"{PROGRAM} {name}", name, GRIDS[name])
 

@@ -1,12 +1,15 @@
-"""Our learner and plain recurrent PPO with ICM: `python -m benchmarks.learner_peers`.
+"""Our learner beside others: `python -m benchmarks.learner_peers`.
 
-Times a whole iteration, rollout and update, of `agents.ppo` and of the program in
-`agents/examples/plain_ppo.py`, in turn within one process. Settings are those of preset `paper`,
-with fewer episodes and epochs. There are two networks:
+Times a whole iteration, rollout and update, of `agents.ppo`, of the program in
+`agents/examples/plain_ppo.py` (recurrent PPO with ICM) and of rejax's PPO, in turn within one
+process. Settings are those of preset `paper`, with fewer episodes and epochs. There are three
+networks; the others' programs play the last two through the gymnax adapter, which needs the extra
+`[interop]`:
 
-    paper   the paper's, in our own environment
-    dense   encoder and GRU of 128 units, as in PureJaxRL's recurrent PPO; the plain program plays
-            through the gymnax adapter, which needs the extra `[interop]`
+    paper        the paper's, in our own environment
+    dense        encoder and GRU of 128 units, as in PureJaxRL's recurrent PPO
+    feedforward  two layers of 64 units, without memory and curiosity, as in rejax's PPO; our
+                 network keeps the layers of its GRU
 
 `plain` is one compiled program, as is usual in JAX. `plain-by-step` calls each gradient step from
 Python, because XLA's CPU backend is slow at derivatives of convolutions in a loop.
@@ -31,25 +34,36 @@ from benchmarks import harness
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.state import State, TimeStep
 
-NetworkName = Literal["paper", "dense"]
-ProgramName = Literal["ours", "plain", "plain-by-step"]
-UNITS = 128  # of PureJaxRL's encoder and GRU
+NetworkName = Literal["paper", "dense", "feedforward"]
+ProgramName = Literal["ours", "plain", "plain-by-step", "rejax"]
+PROGRAMS: dict[NetworkName, tuple[ProgramName, ...]] = {
+    "paper": ("ours", "plain", "plain-by-step"),
+    "dense": ("ours", "plain", "plain-by-step"),
+    "feedforward": ("ours", "rejax"),
+}
+SETTINGS: dict[NetworkName, dict[str, Any]] = {
+    "paper": {},
+    "dense": {"encoder": "dense", "hidden": 128},
+    "feedforward": {"encoder": "dense", "hidden": 64, "recurrent": False, "curiosity": "none"},
+}
 # A compiled iteration, state -> (state, environment steps taken); the seconds of tracing and
 # compiling; and the first state.
 Program = tuple[Callable[[Any], tuple[Any, jax.Array]], float, Any]
 
 
 class DenseEncoder(nn.Module):
-    """Encodes u8[..., 12, 12, N] to f32[..., UNITS] by one layer."""
+    """Encodes u8[..., 12, 12, N] to f32[..., units] by one layer."""
+
+    units: int
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
         """Flattens the features, scaled to [-1, 1]."""
         flat = observation.reshape(*observation.shape[:-3], -1)
-        return nn.swish(plain_ppo.dense(UNITS)(flat / 127.5 - 1))
+        return nn.swish(plain_ppo.dense(self.units)(flat / 127.5 - 1))
 
 
-agents.networks.register("dense", lambda config: DenseEncoder())
+agents.networks.register("dense", lambda config: DenseEncoder(config.hidden))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +73,8 @@ class Options(harness.Options):
     Attributes:
       sets: task sets to train on, by id or short name.
       networks: networks to train.
-      programs: programs to compare; the first is compared with the others.
+      programs: programs to compare, as far as they train a network; the first is compared with
+        the others.
       episodes_per_iteration: episodes of an iteration; the paper has 1,024.
       minibatch_size: episodes of a gradient step; the paper has 128.
       epochs: passes over the episodes; the paper has 10.
@@ -67,22 +82,21 @@ class Options(harness.Options):
 
     repeats: int = 3
     sets: tuple[str, ...] = ("base",)
-    networks: tuple[NetworkName, ...] = ("paper", "dense")
-    programs: tuple[ProgramName, ...] = ("ours", "plain", "plain-by-step")
+    networks: tuple[NetworkName, ...] = ("paper", "dense", "feedforward")
+    programs: tuple[ProgramName, ...] = ("ours", "plain", "plain-by-step", "rejax")
     episodes_per_iteration: int = 64
     minibatch_size: int = 8
     epochs: int = 1
 
     def config(self, task_set: str, network: NetworkName) -> Config:
         """Returns the settings of training."""
-        size = {"encoder": "dense", "hidden": UNITS} if network == "dense" else {}
         return Config.preset(
             "paper",
             env_id=tt.task_set(task_set).id,
             episodes_per_iteration=self.episodes_per_iteration,
             minibatch_size=self.minibatch_size,
             epochs=self.epochs,
-            **size,
+            **SETTINGS[network],
         )
 
 
@@ -178,21 +192,55 @@ def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
     return iterate, collect_s + update_s, state
 
 
-def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed]:
-    """Times our program and the plain ones in alternating calls, after a warm-up round."""
-    config = options.config(task_set, network)
+def rejax_program(config: Config) -> Program:
+    """Compiles an iteration of rejax's PPO, which steps as many environments as many times.
+
+    Raises:
+      ImportError: rejax or gymnax is not installed.
+    """
+    import rejax  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  needs the extra
+
+    from trap_tube_jax.adapters import to_gymnax  # noqa: PLC0415
+
+    env, params = to_gymnax.make(config.env_id)
+    num_steps = config.step_limit(config.env_id)
+    ppo = rejax.PPO.create(
+        env=env,
+        env_params=params,
+        num_envs=config.episodes_per_iteration,
+        num_steps=num_steps,
+        num_epochs=config.epochs,
+        num_minibatches=config.episodes_per_iteration // config.minibatch_size,
+        agent_kwargs={"hidden_layer_sizes": (config.hidden, config.hidden)},
+    )
+    steps = jnp.array(config.episodes_per_iteration * num_steps)
+    state = jax.jit(ppo.init_state)(jax.random.key(0))
+    return *harness.compiled(lambda state: (ppo.train_iteration(state), steps), state), state
+
+
+def make_program(name: ProgramName, config: Config, network: NetworkName) -> Program:
+    """Compiles the program of a name."""
+    if name == "ours":
+        return our_program(config)
+    if name == "rejax":
+        return rejax_program(config)
     env = None
     encoder = None
     if network == "dense":
         env = ThroughGymnax(config)
-        encoder = DenseEncoder()
-    plain = plain_ppo.PlainPPO(config, env, encoder)
-    compile_program: dict[ProgramName, Callable[[], Program]] = {
-        "ours": lambda: our_program(config),
-        "plain": lambda: plain_program(plain),
-        "plain-by-step": lambda: plain_program_by_step(plain),
+        encoder = DenseEncoder(config.hidden)
+    learner = plain_ppo.PlainPPO(config, env, encoder)
+    return plain_program(learner) if name == "plain" else plain_program_by_step(learner)
+
+
+def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed]:
+    """Times the programs in alternating calls, after a warm-up round."""
+    config = options.config(task_set, network)
+    programs = {
+        name: make_program(name, config, network)
+        for name in options.programs
+        if name in PROGRAMS[network]
     }
-    programs = {name: compile_program[name]() for name in options.programs}
     states: dict[str, Any] = {name: state for name, (*_, state) in programs.items()}
     steps: dict[str, Any] = {}
     calls: dict[str, list[float]] = {name: [] for name in programs}

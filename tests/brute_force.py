@@ -1,6 +1,6 @@
 """An exhaustive search over the rules as `spec_reference` reads them.
 
-Shares no code with the package, on purpose. A place is (agent, tool, food), each a flat cell; the
+Shares no code with the package, on purpose. A position is (agent, tool, food), flat cells; the
 tool's is its top-left one.
 """
 
@@ -18,60 +18,60 @@ SHIFTS = spec.DIRECTIONS[MOVE] @ (12, 1)
 
 
 class Level(NamedTuple):
-    """Places i64[n, 3] at one distance, successors i64[n, 16, 3], and solved bool[n, 16]."""
+    """Positions i64[n, 3] at one distance, successors i64[n, 16, 3], and solved bool[n, 16]."""
 
-    places: np.ndarray
+    positions: np.ndarray
     successors: np.ndarray
     solved: np.ndarray
 
 
 class Graph(NamedTuple):
-    """All places i64[n, 3] that can be reached, the start first, and fewest steps between them.
+    """All positions i64[n, 3] that can be reached, the start first, and fewest steps between them.
 
-    The successors i32[n, 16] are indices of places, -1 for a solved place, which has none. A
+    The successors i32[n, 16] are indices of positions, -1 for a solved position, which has none. A
     distance f64[n] is infinite where there is no way.
     """
 
-    places: np.ndarray
+    positions: np.ndarray
     successors: np.ndarray
     from_start: np.ndarray
     to_goal: np.ndarray
 
 
 def levels(state) -> Iterator[Level]:
-    """Yields the unsolved places by fewest steps from the state, each once."""
+    """Yields the unsolved positions by fewest steps from the state, each once."""
     layout = spec.Layouts(np.asarray(state.board), np.asarray(state.tool_extent))
     cells = (state.agent, state.tool, state.food)
-    places = (np.stack(cells) @ (12, 1))[None]
+    positions = (np.stack(cells) @ (12, 1))[None]
     known = set()
-    while len(places):
-        known |= set(map(tuple, places.tolist()))
-        agent, tool, food = (spec.Cell(*np.divmod(each, 12)) for each in places.T[..., None])
+    while len(positions):
+        known |= set(map(tuple, positions.tolist()))
+        agent, tool, food = (spec.Cell(*np.divmod(axis, 12)) for axis in positions.T[..., None])
         moved = spec.step(layout, agent, tool, food, (GRASP[None], MOVE[None]))
         moves = np.stack([moved.agent, moved.tool, moved.food], axis=-1)
-        following = places[:, None] + moves * SHIFTS[:, None]
-        yield Level(places, following, moved.solved)
+        following = positions[:, None] + moves * SHIFTS[:, None]
+        yield Level(positions, following, moved.solved)
         new = np.unique(following[~moved.solved], axis=0)
-        places = new[[tuple(place) not in known for place in new.tolist()]]
+        positions = new[[tuple(position) not in known for position in new.tolist()]]
 
 
 def graph(state) -> Graph:
     """Explores everything that can be reached from a state."""
     found, following, solved = map(np.concatenate, zip(*levels(state), strict=True))
     goals = np.unique(following[solved], axis=0)
-    places = np.concatenate([found, goals])
-    index = {place: number for number, place in enumerate(map(tuple, places.tolist()))}
-    successors = np.full((len(places), 16), -1, np.int32)  # SciPy 1.14 takes no wider indices
+    positions = np.concatenate([found, goals])
+    index = {position: number for number, position in enumerate(map(tuple, positions.tolist()))}
+    successors = np.full((len(positions), 16), -1, np.int32)  # SciPy 1.14 takes no wider indices
     successors[: len(found)] = [[index[tuple(to)] for to in row] for row in following.tolist()]
     starts = np.repeat(np.arange(len(found), dtype=np.int32), 16)
     edges = starts, successors[: len(found)].ravel()
-    matrix = csr_array((np.ones(len(edges[0])), edges), (len(places), len(places)))
+    matrix = csr_array((np.ones(len(edges[0])), edges), (len(positions), len(positions)))
     from_start = dijkstra(matrix, unweighted=True, indices=0)
-    to_goal = np.full(len(places), np.inf)
+    to_goal = np.full(len(positions), np.inf)
     if len(goals):
-        ends = np.arange(len(found), len(places))
+        ends = np.arange(len(found), len(positions))
         to_goal = dijkstra(matrix.T, unweighted=True, indices=ends, min_only=True)
-    return Graph(places, successors, from_start, to_goal)
+    return Graph(positions, successors, from_start, to_goal)
 
 
 def first_plan(state) -> list[list[int]] | None:
@@ -79,9 +79,9 @@ def first_plan(state) -> list[list[int]] | None:
     _, successors, _, to_goal = graph(state)
     if np.isinf(to_goal[0]):
         return None
-    place, plan = 0, []
-    while to_goal[place]:
-        action = int(np.argmin(to_goal[successors[place]]))
+    position, plan = 0, []
+    while to_goal[position]:
+        action = int(np.argmin(to_goal[successors[position]]))
         plan.append([*divmod(action, 4)])
-        place = successors[place, action]
+        position = successors[position, action]
     return plan

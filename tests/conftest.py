@@ -53,14 +53,17 @@ for setting in SETTINGS.items():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _optimisation(request: pytest.FixtureRequest) -> None:
+def _compilation(request: pytest.FixtureRequest) -> Iterator[None]:
     """Agents take longer to compile than to run here; the rules run in millions of states.
 
-    A module for which it is otherwise says so by OPTIMISED.
+    A module for which it is otherwise says so by OPTIMISED. Programs are dropped after a module, or
+    they would fill the memory of a laptop.
     """
     is_of_agents = re.search(r"^(from|import) agents\b", Path(request.path).read_text(), re.M)
     optimised = getattr(request.module, "OPTIMISED", is_of_agents is None)
     set_for_all_processes("jax_disable_most_optimizations", not optimised)
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

@@ -33,8 +33,8 @@ def flat(cells: np.ndarray) -> np.ndarray:
 
 def tally(shape: tuple[int, ...], *indices: np.ndarray) -> np.ndarray:
     """Counts how often each tuple of indices occurs."""
-    places = np.ravel_multi_index(indices, shape)
-    return np.bincount(places, minlength=int(np.prod(shape))).reshape(shape)
+    flat = np.ravel_multi_index(indices, shape)
+    return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape)
 
 
 def find_boards(boards: np.ndarray) -> np.ndarray:

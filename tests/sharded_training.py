@@ -111,8 +111,8 @@ def shared_rows():
     axis = placement.axis
 
     def both(rows, key):
-        own = jax.random.key_data(axis.own_key(key))[-1:]
-        return axis.gather(axis.part(rows)), axis.gather(own)
+        device_keys = jax.random.key_data(axis.own_key(key))[-1:]
+        return axis.gather(axis.part(rows)), axis.gather(device_keys)
 
     given = placement.put((jnp.arange(6), jax.random.key(0)))
     rows, words = placement.local(jax.jit(placement.shard(both))(*given))

@@ -25,7 +25,7 @@ READ_ONLY = "/proc/self"  # a home in which nobody can write
     ],
     ids=lambda settings: "-".join(f"{name}={value}" for name, value in settings.items()),
 )
-def test_the_suite_passes_under(settings):
+def test_the_suite_passes_under_settings_of_users(settings):
     environment = {**os.environ, **settings}
     environment = {name: value for name, value in environment.items() if value is not None}
     for name in ("PYTEST_XDIST_WORKER", "XDG_CACHE_HOME"):  # the suite's own

@@ -87,14 +87,14 @@ def test_imports_run_downward():
         package: {name: height for height, names in enumerate(rooms) for name in names}
         for package, rooms in (("trap_tube_jax", ENVIRONMENT), ("agents", AGENTS))
     }
-    for own, names in IMPORTS.items():
-        package = own.split(".")[0]
+    for module, names in IMPORTS.items():
+        package = module.split(".")[0]
         for name in names & SOURCES.keys():
             above = name.split(".")[0]
-            assert PACKAGES.index(above) <= PACKAGES.index(package), (own, name)
-            if above == package and package in levels and room(own) and room(name):
+            assert PACKAGES.index(above) <= PACKAGES.index(package), (module, name)
+            if above == package and package in levels and room(module) and room(name):
                 level = levels[package]
-                assert level[room(name)] <= level[room(own)], (own, name)
+                assert level[room(name)] <= level[room(module)], (module, name)
     graph = {
         name: (imported(WithoutFunctions().visit(tree)) & SOURCES.keys()) - {name}
         for name, tree in TREES.items()
@@ -123,9 +123,16 @@ def modules_after(program: str, folder: pathlib.Path) -> list[set[str]]:
 
 def test_nothing_is_unpickled():
     """Reading somebody's file runs none of its code."""
-    for own, tree in TREES.items():
-        assert not IMPORTS[own] & {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
-        assert not re.search("allow_pickle|read_pickle", ast.unparse(tree)), own
+    for module, tree in TREES.items():
+        assert not IMPORTS[module] & {
+            "pickle",
+            "cloudpickle",
+            "dill",
+            "joblib",
+            "marshal",
+            "shelve",
+        }
+        assert not re.search("allow_pickle|read_pickle", ast.unparse(tree)), module
 
 
 def test_the_environment_is_light(tmp_path):
@@ -160,10 +167,10 @@ def test_the_wheel_holds_the_environment_and_what_it_imports():
     extras = project["optional-dependencies"]
     required = modules_of(project["dependencies"])
     allowed = required | modules_of(extras["pictures"] + extras["gymnasium"] + extras["gymnax"])
-    for own, names in IMPORTS.items():
-        if own.split(".")[0] == "trap_tube_jax":
+    for module, names in IMPORTS.items():
+        if module.split(".")[0] == "trap_tube_jax":
             used = {name.split(".")[0] for name in names} - {"trap_tube_jax"}
-            assert used <= allowed | sys.stdlib_module_names, own
+            assert used <= allowed | sys.stdlib_module_names, module
     assert required == {"jax", "flax", "chex", "numpy", "scipy"}
 
 

@@ -11,7 +11,7 @@
     print(timestep.reward, timestep.terminated)
 
 `help(trap_tube_jax.make)` explains a name. Functions are pure and unbatched: jit, vmap and scan
-them.
+them. The examples assume these two imports, `import jax.numpy as jnp` and `import numpy as np`.
 
     task sets      make, task_set, register, registered_ids, TaskSet, PAPER_TASK_SETS,
                    CONTROL_TASK_SETS
@@ -31,14 +31,13 @@ Pages in this folder: environment.md, own_tasks.md, graded.md, controls.md, prot
 import importlib.util
 import warnings
 
+from trap_tube_jax import registry, transfers
 from trap_tube_jax._version import __version__ as __version__
 from trap_tube_jax.environment import ArraySpec, Environment, action_from_index, action_to_index
 from trap_tube_jax.graded import graded_perceptual, graded_structural
 from trap_tube_jax.objects import base_palette
 from trap_tube_jax.observation import observe, render_ascii, visible_objects
 from trap_tube_jax.registry import (
-    CONTROL_TASK_SETS,
-    PAPER_TASK_SETS,
     TaskSet,
     make,
     register,
@@ -51,7 +50,7 @@ from trap_tube_jax.scoring.scores import Score, Scores
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
-from trap_tube_jax.transfers import Transfer, compose, perceptual, structural, symbolic
+from trap_tube_jax.transfers import compose, perceptual, structural, symbolic
 from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
 
@@ -100,6 +99,35 @@ __all__ = [
     "validate",
     "visible_objects",
 ]
+
+PAPER_TASK_SETS = registry.PAPER_TASK_SETS
+"""The paper's eight task sets; the first is the base task alone.
+
+Example:
+  >>> [entry.short for entry in tt.PAPER_TASK_SETS]
+  ['base', 'p', 'st', 'sy', 'pst', 'psy', 'stsy', 'pstsy']
+"""
+
+CONTROL_TASK_SETS = registry.CONTROL_TASK_SETS
+"""The controls of comparative psychology, which controls.md describes.
+
+Example:
+  >>> [entry.short for entry in tt.CONTROL_TASK_SETS[:3]]
+  ['trap-turned', 'trap-exchanged', 'no-trap']
+"""
+
+Transfer = transfers.Transfer
+"""A pure function (key, state) -> state, which `Environment.reset` applies.
+
+It is hashable and runs under jit. The state it returns is valid and at time 0.
+
+Example:
+  >>> def far_agent(key, state):
+  ...     return state.replace(agent=jnp.array([0, 11]))
+  >>> state, timestep = tt.Environment((far_agent,)).reset(jax.random.key(0))
+  >>> state.agent.tolist()
+  [0, 11]
+"""
 
 
 def _register_with_gymnasium() -> None:

@@ -65,6 +65,16 @@ def check_registered_name(kind: str, name: Any) -> None:
         raise ValueError(f"{kind} names consist of letters, digits, '_', '.' and '-', got {name!r}")
 
 
+def check_stored_name(kind: str, name: Any) -> None:
+    """Checks a name that a file holds: a registered name, or task sets of a mixture joined by "+".
+
+    Raises:
+      ValueError: see `check_registered_name`.
+    """
+    for part in name.split("+") if isinstance(name, str) else [name]:
+        check_registered_name(kind, part)
+
+
 def did_you_mean(name: Any, known: Iterable[str]) -> str:
     """Returns " (did you mean ...?)" with at most three known names near `name`, or "".
 

@@ -55,6 +55,10 @@ class ArraySpec:
       dtype: NumPy dtype of the elements.
       minimum: smallest allowed element.
       maximum: largest allowed element.
+
+    Example:
+      >>> tt.make("p").action_spec
+      ArraySpec(shape=(2,), dtype=dtype('int32'), minimum=0, maximum=3)
     """
 
     shape: tuple[int, ...]
@@ -70,6 +74,13 @@ class Environment(ByValue):
     episode; everything that changes is in the `State`. Environments with equal transfers, base
     state and step limit are equal. To shard a batch, use a mesh of `Auto` axes, or `jax.shard_map`
     with `check_vma=False`.
+
+    Example:
+      >>> env = tt.Environment((tt.perceptual, tt.structural), max_steps=30)
+      >>> state, timestep = env.reset(jax.random.key(0))
+      >>> state, timestep = env.step(state, jnp.array([0, 3]))  # grasp up, move right
+      >>> timestep.observation.shape, float(timestep.reward), bool(timestep.done)
+      ((12, 12, 3), 0.0, False)
     """
 
     def __init__(
@@ -184,6 +195,10 @@ def action_from_index(index: jax.typing.ArrayLike) -> jax.Array:
 
     Raises:
       ValueError: `index` does not hold integers.
+
+    Example:
+      >>> tt.action_from_index(jnp.array([0, 6])).tolist()
+      [[0, 0], [1, 2]]
     """
     return jnp.asarray(pairs_of(integer_array("index", index)))
 
@@ -204,6 +219,10 @@ def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
 
     Raises:
       ValueError: `action` does not hold pairs of integers.
+
+    Example:
+      >>> tt.action_to_index(jnp.array([[0, 0], [1, 2]])).tolist()
+      [0, 6]
     """
     action = integer_array("action", action)
     if action.ndim == 0 or action.shape[-1] != 2:

@@ -81,13 +81,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     parser = argparse.ArgumentParser(
         prog="python -m trap_tube_jax.gallery",
-        description="Draw the eight task sets.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        description="Draws tasks of the eight task sets.",
     )
     add = parser.add_argument
-    add("--output", type=pathlib.Path, default=".", help="folder of gallery.png")
-    add("--tasks", type=int, default=4, help="distinct tasks per set, 2 to 64")
-    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1")
+    add("--output", type=pathlib.Path, default=".", help="folder of gallery.png [%(default)s]")
+    add("--tasks", type=int, default=4, help="distinct tasks per set, 2 to 64 [%(default)s]")
+    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1 [%(default)s]")
     options = parser.parse_args(arguments)
     with plain_errors():
         options.output.mkdir(parents=True, exist_ok=True)

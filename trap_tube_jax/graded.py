@@ -54,6 +54,12 @@ def graded_perceptual(strength: float) -> Transfer:
 
     Raises:
       ValueError: `strength` is not a number from 0 to 1.
+
+    Example:
+      >>> env = tt.Environment((tt.graded_perceptual(0.25),))
+      >>> state, timestep = env.reset(jax.random.key(0))
+      >>> state.agent.tolist()  # of the base task: [9, 1]
+      [8, 1]
     """
     strength = _check_strength(strength)
     return perceptual if strength == 1 else GradedPerceptual(strength)
@@ -80,6 +86,11 @@ def graded_structural(strength: float) -> Transfer:
 
     Raises:
       ValueError: `strength` is not a number from 0 to 1.
+
+    Example:
+      >>> state = tt.graded_structural(0.25)(jax.random.key(0), tt.base_state())
+      >>> state.palette[1].tolist()  # the trap was [208, 113, 57]
+      [219, 179, 87]
     """
     strength = _check_strength(strength)
     return structural if strength == 1 else GradedStructural(strength)

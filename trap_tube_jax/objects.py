@@ -67,6 +67,10 @@ def base_palette(num_features: int = 3) -> np.ndarray:
 
     Raises:
       ValueError: `num_features` is not an integer from 1 to 1024.
+
+    Example:
+      >>> tt.base_palette().shape, tt.base_palette()[5].tolist()  # the food's colour
+      ((8, 3), [208, 57, 77])
     """
     check_integer("num_features", num_features, maximum=MAX_FEATURES)
     if num_features == 1:

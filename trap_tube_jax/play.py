@@ -134,16 +134,19 @@ def screen(game: Game) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     parser = argparse.ArgumentParser(
-        prog="python -m trap_tube_jax.play", description="Play a task set in the terminal."
+        prog="python -m trap_tube_jax.play", description="Plays a task set in the terminal."
     )
     parser.add_argument(
         "task_set",
         nargs="?",
         default="TrapTube-v0",
-        help="id such as PerceptualTrapTube-v0, or short name such as p",
+        help="id such as PerceptualTrapTube-v0, or short name such as p [%(default)s]",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="first task, 0 to 2**32 - 1; the next ones follow it"
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of the first task, 0 to 2**32 - 1; later tasks count up from it [%(default)s]",
     )
     add_import_option(parser)
     options = parser.parse_args(arguments)

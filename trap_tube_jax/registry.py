@@ -27,6 +27,11 @@ class TaskSet:
       transfers: the transfers, in the order in which they apply.
       base: the state that the transfers start from; None is the base task.
       max_steps: steps after which an unsolved episode is truncated.
+
+    Example:
+      >>> entry = tt.task_set("pst")
+      >>> entry.id, entry.label, entry.max_steps
+      ('PerceptualStructuralTrapTube-v0', '{P, St}', 50)
     """
 
     id: str
@@ -74,7 +79,12 @@ _task_sets = dict(_BUILT_IN)
 
 
 def registered_ids() -> tuple[str, ...]:
-    """Returns the ids that `make` takes: the paper's eight, the controls, registered ones."""
+    """Returns the ids that `make` takes: the paper's eight, the controls, registered ones.
+
+    Example:
+      >>> tt.registered_ids()[:2]
+      ('TrapTube-v0', 'PerceptualTrapTube-v0')
+    """
     return tuple(_task_sets)
 
 
@@ -86,6 +96,12 @@ def task_set(name: str) -> TaskSet:
 
     Raises:
       ValueError: no set has the name; the message lists the short names and the nearest names.
+
+    Example:
+      >>> tt.task_set("psy") == tt.task_set("{P, Sy}")
+      True
+      >>> tt.task_set("p+pstsy").label
+      '{P} + {P, St, Sy}'
     """
     by_name = {known: entry for entry in _task_sets.values() for known in entry.names}
     if isinstance(name, str) and name in by_name:
@@ -143,6 +159,12 @@ def make(
 
     Raises:
       ValueError: naming the value and what is allowed.
+
+    Example:
+      >>> tt.make("psy")
+      Environment(transfers=(perceptual, symbolic), max_steps=50)
+      >>> tt.make("PerceptualTrapTube-v0", num_features=8).observation_spec.shape
+      (12, 12, 8)
     """
     entry = task_set(name)
     base = entry.base if base is None else base
@@ -181,6 +203,11 @@ def register(
       ValueError: a name is taken or has other characters than letters, digits, "_", "." and
         "-", a transfer is not a function or not hashable, or the base state or the step limit is
         invalid; the message says what is allowed.
+
+    Example:
+      >>> entry = tt.register("Hasty-v0", (tt.perceptual,), short="hasty", max_steps=20)
+      >>> tt.make("hasty")
+      Environment(transfers=(perceptual), max_steps=20)
     """
     short = id if short is None else short
     others = [entry for entry in _task_sets.values() if entry.id != id or id in _BUILT_IN]

@@ -76,6 +76,11 @@ def render(
 
     Raises:
       ValueError: `cell_size` is not an integer >= 1, or `state` not one unbatched state.
+
+    Example:
+      >>> picture = tt.render(tt.base_state(), 32, grasp=0)
+      >>> picture.shape, picture.dtype
+      ((384, 384, 3), dtype('uint8'))
     """
     check_state(state)
     cell_size = check_integer("cell_size", cell_size)
@@ -106,6 +111,12 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
+
+    Example:
+      >>> state = tt.base_state()
+      >>> frames = tt.episode_frames(state, tt.solve(state).actions)
+      >>> frames.shape
+      (12, 240, 240, 3)
     """
     check_state(state)
     cell_size = check_integer("cell_size", cell_size)
@@ -134,6 +145,11 @@ def save_gif(
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
       ImportError: pillow is not installed.
+
+    Example:
+      >>> state = tt.base_state()
+      >>> frames = tt.episode_frames(state, tt.solve(state).actions)
+      >>> tt.save_gif(frames, "plan.gif", fps=4)
     """
     pictures = np.asarray(frames)
     shape = pictures.shape

@@ -52,6 +52,13 @@ class State(ByValue, struct.PyTreeNode, eq=False):
       time: i32[], steps taken in this episode.
       terminated: bool[], the agent has reached the food.
       truncated: bool[], the step limit ended the episode without success.
+
+    Example:
+      >>> state = tt.base_state()
+      >>> state.agent.tolist(), state.food.tolist(), bool(state.done)
+      ([9, 1], [5, 5], False)
+      >>> state.replace(agent=jnp.array([0, 0])).agent.tolist()
+      [0, 0]
     """
 
     board: jax.Array
@@ -95,6 +102,14 @@ class State(ByValue, struct.PyTreeNode, eq=False):
 
         Raises:
           ValueError: naming the value and what is allowed.
+
+        Example:
+          >>> board = np.zeros((12, 12), int)
+          >>> state = tt.State.create(
+          ...     board=board, agent=(0, 0), tool=(0, 3), tool_extent=(1, 2), food=(0, 11)
+          ... )
+          >>> tt.render_ascii(state).splitlines()[0]
+          'A..TT......F'
         """
         given = {
             "board": board,
@@ -138,6 +153,11 @@ class State(ByValue, struct.PyTreeNode, eq=False):
         Raises:
           ValueError: naming the offending row and character, or the value, and what
             is allowed.
+
+        Example:
+          >>> state = tt.State.from_ascii(["A..TT......F", *["." * 12] * 11])
+          >>> state.tool.tolist(), state.tool_extent.tolist()
+          ([0, 3], [1, 2])
         """
         codes = _parse_picture(rows)
         if (tool is None) != (tool_extent is None):
@@ -162,6 +182,11 @@ class TimeStep(ByValue, struct.PyTreeNode, eq=False):
       terminated: bool[], the task is solved.
       truncated: bool[], the step limit is reached without success.
       discount: f32[], 0 where `terminated`, else 1: the weight of future rewards.
+
+    Example:
+      >>> state, timestep = tt.make("base").reset(jax.random.key(0))
+      >>> timestep.observation.shape, float(timestep.discount), bool(timestep.done)
+      ((12, 12, 3), 1.0, False)
     """
 
     observation: jax.Array
@@ -177,7 +202,16 @@ class TimeStep(ByValue, struct.PyTreeNode, eq=False):
 
 
 def base_state(num_features: int = 3) -> State:
-    """Builds the base task in base colours of N features; environment.md, "Base task"."""
+    """Builds the base task in base colours of N features; environment.md, "Base task".
+
+    Raises:
+      ValueError: `num_features` is not an integer from 1 to 1024.
+
+    Example:
+      >>> state = tt.base_state()
+      >>> state.tool.tolist(), state.tool_extent.tolist()
+      ([4, 1], [4, 1])
+    """
     return State.from_ascii(
         """
         ............
@@ -216,6 +250,12 @@ def validate(state: State) -> State:
     Raises:
       ValueError: a field has the wrong type, shape or dtype, the episode is over, an
         object is off the board or where it cannot be; the message says what is allowed.
+
+    Example:
+      >>> tt.validate(tt.base_state().replace(agent=jnp.array([5, 4])))
+      Traceback (most recent call last):
+        ...
+      ValueError: agent at (5, 4) stands on trap; allowed: ground
     """
     check_state(state)
     for flag in ("terminated", "truncated"):

@@ -48,6 +48,12 @@ def compose(*transfers: Transfer) -> Transfer:
 
     Raises:
       ValueError: a transfer is not callable, or not hashable.
+
+    Example:
+      >>> transfer = tt.compose(tt.perceptual, tt.symbolic)
+      >>> state = transfer(jax.random.key(0), tt.base_state())
+      >>> state.tool.tolist(), state.tool_extent.tolist()
+      ([4, 4], [3, 1])
     """
     return Composition(transfers)
 
@@ -133,6 +139,11 @@ def perceptual(key: jax.Array, state: State) -> State:
 
     Raises:
       ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
+
+    Example:
+      >>> state = tt.perceptual(jax.random.key(0), tt.base_state())
+      >>> state.agent.tolist()  # of the base task: [9, 1]
+      [3, 11]
     """
     return draw_layout(key, state, layout_tables())
 
@@ -171,6 +182,11 @@ def structural(key: jax.Array, state: State) -> State:
 
     Raises:
       ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
+
+    Example:
+      >>> state = tt.structural(jax.random.key(0), tt.base_state())
+      >>> state.palette[0].tolist()  # the ground was [72, 65, 17]
+      [161, 142, 249]
     """
     check_state(state)
     return recolor(state, sphere_points(key, state.palette.shape[-1]))
@@ -219,6 +235,11 @@ def symbolic(key: jax.Array, state: State) -> State:
 
     Raises:
       ValueError: `key` is not one PRNG key, or `state` not one unbatched state.
+
+    Example:
+      >>> state = tt.symbolic(jax.random.key(1), tt.base_state())
+      >>> state.tool.tolist(), state.tool_extent.tolist()  # a wall of the tube
+      ([4, 4], [1, 4])
     """
     check_state(state)
     choice = jax.random.randint(threefry_key(key), (), 0, len(SYMBOLIC_OBJECTS), jnp.int32)

@@ -42,6 +42,12 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
     Attributes:
       episodes: states and keys, as `jax.vmap` of an `AutoReset` keeps them.
       background: u8[B, 12 * 12 * N], the boards without food, tool and agent.
+
+    Example:
+      >>> env = tt.VectorEnvironment(tt.make("base"))
+      >>> state, timestep = env.reset(jax.random.split(jax.random.key(0), 64))
+      >>> state.episodes.inner.agent.shape  # the positions of 64 agents
+      (64, 2)
     """
 
     episodes: AutoResetState
@@ -67,6 +73,13 @@ class VectorEnvironment:
 
     Raises:
       ValueError: naming the argument, its value and what is allowed.
+
+    Example:
+      >>> env = tt.VectorEnvironment(tt.make("base"))
+      >>> state, timestep = env.reset(jax.random.split(jax.random.key(0), 64))
+      >>> state, timestep = jax.jit(env.step)(state, jnp.zeros((64, 2), jnp.int32))
+      >>> timestep.observation.shape, timestep.final_observation.shape
+      ((64, 12, 12, 3), (64, 12, 12, 3))
     """
 
     env: Environment

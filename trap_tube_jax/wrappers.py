@@ -62,14 +62,24 @@ class AutoResetTimeStep(TimeStep, eq=False):
 class AutoReset:
     """Starts the next episode within the step that ends one.
 
-    Reward, flags and discount belong to the action taken; the observation is the one to act on
-    next. Every episode draws its task with a fresh key.
+    Reward, flags and discount belong to the action taken; `observation` is the one to act on next.
+    `final_observation`, u8[12, 12, N], is the one before any reset: an episode's last observation
+    is not lost, and its value can be bootstrapped. Every episode draws its task with a fresh key.
 
     Attributes:
       env: an environment that does not reset itself.
 
     Raises:
       ValueError: `env` resets itself, is an `EpisodeStatistics`, or is not an environment.
+
+    Example:
+      >>> env = tt.AutoReset(tt.make("base", max_steps=1))
+      >>> state, first = env.reset(jax.random.key(0))
+      >>> state, timestep = env.step(state, jnp.array([0, 0]))
+      >>> bool(jnp.all(timestep.observation == first.observation)), bool(timestep.truncated)
+      (True, True)
+      >>> bool(jnp.all(timestep.final_observation == first.observation))
+      False
     """
 
     env: EnvironmentLike
@@ -156,6 +166,13 @@ class EpisodeStatistics:
 
     Raises:
       ValueError: `env` is no environment.
+
+    Example:
+      >>> env = tt.EpisodeStatistics(tt.AutoReset(tt.make("base", max_steps=1)))
+      >>> state, timestep = env.reset(jax.random.key(0))
+      >>> state, timestep = env.step(state, jnp.array([0, 0]))
+      >>> int(state.episodes), int(state.last_length), float(state.last_return)
+      (1, 1, 0.0)
     """
 
     env: EnvironmentLike

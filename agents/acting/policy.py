@@ -41,6 +41,13 @@ class Policy(struct.PyTreeNode):
       params: its parameters.
       iteration: iterations trained.
       greedy: takes the most probable actions after `repeat_penalty`; otherwise draws them.
+
+    Example:
+      >>> policy = agents.load("fast-base")
+      >>> observation = tt.observe(tt.base_state())[None]
+      >>> action, carry = jax.jit(policy.act)(observation, policy.initial(1))
+      >>> action.shape
+      (1, 2)
     """
 
     name: str = struct.field(pytree_node=False)

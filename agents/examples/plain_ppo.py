@@ -252,5 +252,8 @@ def main(env: str = NEAR_FOOD.short, iterations: int = 10) -> float:
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__).parse_args()
+    argparse.ArgumentParser(
+        "python -m agents.examples.plain_ppo",
+        description="Trains recurrent PPO with ICM, in one file, on a task of two steps.",
+    ).parse_args()
     main()

@@ -7,11 +7,14 @@ import argparse
 from collections.abc import Callable
 
 import jax
-import rejax  # pyright: ignore[reportMissingImports]
 
 import trap_tube_jax as tt
 from agents.examples.near_food import NEAR_FOOD
 from trap_tube_jax.adapters import to_gymnax
+from trap_tube_jax.imports import needs_extra
+
+with needs_extra("interop"):
+    import rejax  # pyright: ignore[reportMissingImports]
 
 
 class Policy:
@@ -54,5 +57,7 @@ def main(total_timesteps: int = 8_192) -> tt.Scores:
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__).parse_args()
+    argparse.ArgumentParser(
+        "python -m agents.examples.rejax_agent", description="Trains rejax's PPO and scores it."
+    ).parse_args()
     main()

@@ -1,12 +1,16 @@
-"""Trains Stable-Baselines3's PPO and scores it; needs the extra `interop`.
+"""Trains PPO of Stable-Baselines3 and scores it; needs the extra `interop`.
 
 python -m agents.examples.sb3_agent
 """
 
 import argparse
 
-import stable_baselines3  # pyright: ignore[reportMissingImports]
-import torch  # pyright: ignore[reportMissingImports]
+from trap_tube_jax.imports import needs_extra
+
+with needs_extra("interop"):
+    import stable_baselines3  # pyright: ignore[reportMissingImports]
+    import torch  # pyright: ignore[reportMissingImports]
+
 
 import trap_tube_jax as tt
 from agents.examples.near_food import NEAR_FOOD
@@ -27,5 +31,8 @@ def main(total_timesteps: int = 3_000) -> tt.Scores:
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__).parse_args()
+    argparse.ArgumentParser(
+        "python -m agents.examples.sb3_agent",
+        description="Trains PPO of Stable-Baselines3 and scores it.",
+    ).parse_args()
     main()

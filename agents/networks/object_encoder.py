@@ -2,8 +2,8 @@
 
 An object is all cells of one colour. Agent and food are known by their colours, which no transfer
 changes. Every other object is described by its cells, on the board and relative to agent and food,
-and by its size. Colours of other objects say nothing if every task draws new ones; they are
-described only if asked for.
+and by its size. Colours say nothing if every task draws new ones. Where some tasks keep them, flags
+can tell which object of the base task has the same colour.
 
 The description depends only on the observation. A small network reads this description at a
 fraction of the cost of convolutions over 144 cells.
@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from agents.networks.encoder import scaled
 from agents.networks.hashing import hash_rows
 from agents.networks.layers import dense
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS
@@ -38,11 +37,11 @@ class ObjectEncoder(nn.Module):
 
     Attributes:
       filters: units of the layers before and after pooling.
-      has_colors: also describes each object by its colour.
+      knows_colors: also describes each object by the colours of the base task.
     """
 
     filters: tuple[int, int]
-    has_colors: bool = False
+    knows_colors: bool = False
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
@@ -50,8 +49,8 @@ class ObjectEncoder(nn.Module):
         before, after = self.filters
         board = describe_board(observation)
         x, exists, positions = board.features, board.exists[..., None], board.positions
-        if self.has_colors:
-            x = jnp.concatenate([x, board.colors], axis=-1)
+        if self.knows_colors:
+            x = jnp.concatenate([x, board.looks_like.astype(jnp.float32)], axis=-1)
         x = nn.swish(
             dense(before, name="object1")(x) + dense(before, name="places")(positions)[:, None]
         )
@@ -73,14 +72,15 @@ class Board(NamedTuple):
         object's cells in the 5x5 square around the agent, 25; the same three for the food; flags
         of the sizes 0 to 4; size / 20 and log(1 + size) / 3. Flags relative to an invisible agent
         or food are 0.
-      colors: f32[M, 6, N], by object, in [-1, 1].
+      looks_like: bool[M, 6, 8], by object: whether it has the colour of object code k in the base
+        task.
       exists: bool[M, 6], whether there is such an object.
       positions: f32[M, 94]: flags of the agent's row and column, 12 + 12, the food's, 12 + 12, and
         the food's relative to the agent, 23 + 23.
     """
 
     features: jax.Array
-    colors: jax.Array
+    looks_like: jax.Array
     exists: jax.Array
     positions: jax.Array
 
@@ -91,9 +91,9 @@ def describe_board(observation: jax.Array) -> Board:
     At most 6 objects besides agent and food are described; any further ones are left out.
     """
     color = hash_rows(observation)
-    own_colors = hash_rows(base_state(observation.shape[-1]).palette)
-    anchors = [color == own_colors[thing] for thing in (AGENT, FOOD)]
-    lines, first_cells = _objects(color, left=~(anchors[0] | anchors[1]))
+    base_colors = hash_rows(base_state(observation.shape[-1]).palette)
+    anchors = [color == base_colors[code] for code in (AGENT, FOOD)]
+    lines, object_colors = _objects(color, left=~(anchors[0] | anchors[1]))
     rows, columns = _project(lines)
     agent, food = (_project(_pack(anchor)) for anchor in anchors)
     positions = [_unpack(bits, BOARD_SIZE) for bits in (*agent, *food)]
@@ -110,9 +110,8 @@ def describe_board(observation: jax.Array) -> Board:
         jnp.concatenate([x.astype(jnp.float32) for x in flags], axis=-1)
         for flags in (parts, positions)
     )
-    cells = scaled(observation).reshape(len(observation), -1, observation.shape[-1])
-    colors = jnp.take_along_axis(cells, first_cells[..., None], axis=1)
-    return Board(features, colors, size > 0, positions)
+    looks_like = object_colors[..., None] == base_colors[None, None]
+    return Board(features, looks_like, size > 0, positions)
 
 
 # Positions in a row or column are the bits of one integer. Integers are fast to shift, merge and
@@ -122,21 +121,21 @@ def describe_board(observation: jax.Array) -> Board:
 def _objects(color: jax.Array, left: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns the columns u32[M, 6, 12], row by row, of the first six colours in u32[M, 12, 12].
 
-    Considers only the cells flagged in `left`, bool[M, 12, 12]. Also returns each colour's first
-    cell, i32[M, 6].
+    Considers only the cells flagged in `left`, bool[M, 12, 12]. Also returns these colours,
+    u32[M, 6].
     """
     count = len(color)
     color, left = color.reshape(count, -1), left.reshape(count, -1)
     cells = np.arange(color.shape[1], dtype=np.int32)[None]
     objects = []
-    first_cells = []
+    colors = []
     for _ in range(MAX_OBJECTS):
         first = jnp.min(jnp.where(left, cells, cells[0, -1]), axis=1, keepdims=True)
-        is_same = left & (color == jnp.take_along_axis(color, first, axis=1))
+        colors.append(jnp.take_along_axis(color, first, axis=1))
+        is_same = left & (color == colors[-1])
         left = left & ~is_same
         objects.append(_pack(is_same.reshape(count, BOARD_SIZE, BOARD_SIZE)))
-        first_cells.append(first)
-    return jnp.stack(objects, axis=1), jnp.concatenate(first_cells, axis=1)
+    return jnp.stack(objects, axis=1), jnp.concatenate(colors, axis=1)
 
 
 def _project(lines: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -48,6 +48,12 @@ class TrainState(NamedTuple):
       key: PRNG key of all iterations to come.
       iteration: i32[], iterations done.
       transitions: i32[], environment steps taken.
+
+    Example:
+      >>> learner = agents.make_learner(agents.Config.preset("fast"))
+      >>> state = learner.init(jax.random.key(0))
+      >>> sorted(state.params), int(state.iteration)
+      (['core', 'curiosity', 'encoder', 'heads'], 0)
     """
 
     params: Params
@@ -92,6 +98,14 @@ class Learner:
       curiosity: intrinsic reward.
       optimizer: gradient clipping and Adam.
       axis: devices that share the episodes of an iteration.
+
+    Example:
+      >>> config = agents.Config.preset("fast", episodes_per_iteration=64, filters=(4, 8))
+      >>> learner = agents.make_learner(config)
+      >>> state = learner.init(jax.random.key(0))
+      >>> state, metrics = jax.jit(learner.iterate)(state)
+      >>> int(state.iteration), metrics["loss"].shape
+      (1, ())
     """
 
     config: Config
@@ -108,7 +122,7 @@ class Learner:
         return self.encoding.name
 
     def init(self, key: jax.Array) -> TrainState:
-        """Returns the first state."""
+        """Returns the first state; draws the parameters with `key`, one PRNG key."""
         return jax.jit(self._init)(key)  # compiled as a whole in a fraction of the time
 
     def _init(self, key: jax.Array) -> TrainState:
@@ -329,6 +343,11 @@ def make_learner(
     Raises:
       ValueError: `env` contradicts `config`, the curiosity does not suit the environment or the
         devices, or there are too many environment steps to count.
+
+    Example:
+      >>> config = agents.Config.preset("fast", max_steps=30)
+      >>> agents.make_learner(config, tt.make("p", max_steps=30)).env
+      Environment(transfers=(perceptual), max_steps=30)
     """
     if env is None:
         env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)

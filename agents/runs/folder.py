@@ -12,7 +12,7 @@ import filelock
 from agents.files import Plain, damage_named, expand, is_file, read_json, write_json
 from agents.runs.run import DeviceOptions, Run, RunOptions, check_algorithm
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import check_registered_name, check_seed
+from trap_tube_jax.checks import check_seed, check_stored_name
 from trap_tube_jax.imports import import_modules
 
 CONFIG_FILE = "config.json"
@@ -104,7 +104,7 @@ class RunFolder:
             DeviceOptions(values["options"].get("devices"))
             for setting, value in values["config"].items():
                 if isinstance(value, str):
-                    check_registered_name(setting, value)
+                    check_stored_name(setting, value)
         return values
 
     def devices(self) -> int | None:

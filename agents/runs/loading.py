@@ -34,10 +34,6 @@ def load(
 ) -> Policy:
     """Loads a trained policy, which acts from observations alone.
 
-        policy = load("best-pstsy")
-        carry = policy.initial(batch)
-        action, carry = policy.act(observation, carry, key)
-
     Loading runs no code that the source names; only modules in `imports` are imported.
 
     Args:
@@ -51,6 +47,11 @@ def load(
     Raises:
       ValueError: there is no such policy, or it is damaged or of another version.
       OSError: a file cannot be opened.
+
+    Example:
+      >>> policy = agents.load("best-pstsy")
+      >>> policy.config.env_id, policy.iteration
+      ('PerceptualStructuralSymbolicTrapTube-v0', 1150)
     """
     folder = RunFolder(source)
     if is_file(folder.config):
@@ -93,7 +94,16 @@ def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]
 
 
 def save(path: str | Path, policy: Policy) -> None:
-    """Saves a policy to one safetensors file, which `load` reads; its name is not stored."""
+    """Saves a policy to one safetensors file, which `load` reads; its name is not stored.
+
+    Raises:
+      OSError: the file cannot be written.
+
+    Example:
+      >>> agents.save("mine.safetensors", agents.load("fast-base"))
+      >>> agents.load("mine.safetensors").name
+      'mine'
+    """
     params = {part: policy.params[part] for part in PARTS}
     about = {"config": policy.config.to_dict(), "iteration": policy.iteration}
     write_arrays(expand(path), to_arrays(params), about)

@@ -15,7 +15,7 @@ from agents.acting.policy import Policy
 from agents.config import Config
 from agents.files import append_text, damage_named, is_file, read_text, write_bytes
 from agents.runs.run import check_algorithm
-from trap_tube_jax.checks import check_registered_name
+from trap_tube_jax.checks import check_stored_name
 from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import Purpose
 
@@ -41,7 +41,7 @@ def _text(value: str) -> str:
 
 
 def _name(value: str) -> str:
-    check_registered_name("task set", value)
+    check_stored_name("task set", value)
     return value
 
 

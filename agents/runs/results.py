@@ -30,6 +30,14 @@ def results(paths: Paths) -> pd.DataFrame:
     Raises:
       ValueError: a folder holds no run, or a file is damaged.
       OSError: a file or folder cannot be opened.
+
+    Example:
+      >>> config = agents.Config.preset("fast", iterations=1, episodes_per_iteration=32)
+      >>> options = agents.RunOptions(sets=("base",), report=False)
+      >>> scores = agents.train_run("runs/mine", agents.Run(config, seed=3), options)
+      >>> table = agents.results("runs")
+      >>> table.seed.unique().tolist(), table.task_set.unique().tolist()
+      ([3], ['base'])
     """
     tables = []
     for folder in find_runs(paths):

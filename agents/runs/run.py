@@ -24,6 +24,11 @@ class Run:
       algorithm: name in tables, by default `ppo+<curiosity>`; see `check_algorithm`.
       imports: modules that registered names of the settings. They are recorded, and imported
         again only at the caller's request.
+
+    Example:
+      >>> run = agents.Run(agents.Config.preset("fast", env_id="sy"), seed=1)
+      >>> run.algorithm, run.config.env_id
+      ('ppo+effects', 'SymbolicTrapTube-v0')
     """
 
     config: Config
@@ -105,6 +110,10 @@ class RunOptions(DeviceOptions):
       report: writes curves, page and GIF at the end.
       tensorboard: logs metrics for TensorBoard.
       wandb: logs metrics to Weights & Biases; offline with WANDB_MODE=offline.
+
+    Example:
+      >>> agents.RunOptions(evaluate_every=10, sets=("p", "psy")).checkpoint_every
+      10
     """
 
     checkpoint_every: int = option(10, "run")

@@ -56,6 +56,13 @@ def train_run(
       ValueError: the run cannot be trained or continued, or it diverged.
       OSError: a file cannot be read or written.
       Stopped: on a signal or `stop`, after the current iteration has been saved.
+
+    Example:
+      >>> config = agents.Config.preset("fast", iterations=1, episodes_per_iteration=32)
+      >>> options = agents.RunOptions(sets=("base",), report=False)
+      >>> scores = agents.train_run("runs/mine", agents.Run(config), options)
+      >>> scores["base"].tasks
+      1
     """
     path = Path(path)
     consoles = {} if console is None else {path: console}

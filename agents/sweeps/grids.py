@@ -66,12 +66,14 @@ class Grid:
       run_options: defaults of the options of every run.
       settings: settings of all points, which the command line may replace.
       points: settings by the name of the point.
+      about: a line of help.
     """
 
     options: Options = dataclasses.field(default_factory=Options)
     run_options: RunOptions = dataclasses.field(default_factory=RunOptions)
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     points: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=lambda: {"": {}})
+    about: str = ""
 
     def make_runs(self, name: str, options: Options) -> dict[Path, Run]:
         """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
@@ -153,25 +155,60 @@ CODE_POINTS = {
 PAPER_RUN = RunOptions(evaluate_every=1, test_tasks=1000)
 BEST_RUN = RunOptions(evaluate_every=20, test_tasks=1000)
 CURIOSITIES = ("icm", "rnd", "noveld", "effects")
+# Preset `best`, and without one ingredient at a time.
+INGREDIENT_POINTS: dict[str, dict[str, Any]] = {
+    "best": {},
+    "known-colors": {"object_colors": True},
+    "paper-encoder": {"encoder": "paper", "filters": (32, 64)},
+    "unturned": {"align_to_food": False},
+    "no-motion": {"motion_coef": 0.0},
+    "no-replay": {"replay_fractions": ()},
+    "rnd": {"curiosity": "rnd"},
+    "noveld": {"curiosity": "noveld"},
+    "repeats": {"repeat_penalty": 0.0},
+    "no-memory": {"recurrent": False},
+    "paper-ppo": {"epochs": 10, "discount": 0.99, "value_coef": 0.01, "entropy_coef": 1e-4},
+}
 
 GRIDS = {
     "exp1": Grid(
-        Options(preset="paper", env="base", seeds=5), PAPER_RUN, {"iterations": 250}, PAPER_POINTS
+        Options(preset="paper", env="base", seeds=5),
+        PAPER_RUN,
+        {"iterations": 250},
+        PAPER_POINTS,
+        "the paper's Experiment 1: base, with and without ICM",
     ),
     "exp2": Grid(
-        Options(preset="paper", env="pstsy", seeds=5), PAPER_RUN, {"iterations": 500}, PAPER_POINTS
+        Options(preset="paper", env="pstsy", seeds=5),
+        PAPER_RUN,
+        {"iterations": 500},
+        PAPER_POINTS,
+        "the paper's Table 2: {P, St, Sy}, with and without ICM; takes days",
     ),
     "exp1-code": Grid(
-        Options(preset="paper", env="base", seeds=5), PAPER_RUN, {"iterations": 250}, CODE_POINTS
+        Options(preset="paper", env="base", seeds=5),
+        PAPER_RUN,
+        {"iterations": 250},
+        CODE_POINTS,
+        "exp1, and what the published code may have run",
     ),
     "exp2-code": Grid(
-        Options(preset="paper", env="pstsy", seeds=5), PAPER_RUN, {"iterations": 500}, CODE_POINTS
+        Options(preset="paper", env="pstsy", seeds=5),
+        PAPER_RUN,
+        {"iterations": 500},
+        CODE_POINTS,
+        "exp2, and what the published code may have run; takes days",
     ),
     "fast": Grid(
         Options(preset="fast", env="base", seeds=10),
         RunOptions(evaluate_every=100, test_tasks=1000),
+        about="preset fast on base; a minute per seed",
     ),
-    "best": Grid(Options(preset="best", env="pstsy", seeds=5), BEST_RUN),
+    "best": Grid(
+        Options(preset="best", env="pstsy", seeds=5),
+        BEST_RUN,
+        about="preset best on {P, St, Sy}; 40 minutes per seed",
+    ),
     "curiosities": Grid(
         Options(preset="best", env="pstsy", seeds=5),
         BEST_RUN,
@@ -180,5 +217,13 @@ GRIDS = {
             "ppo": {"curiosity": "none"},
             **{f"ppo+{name}": {"curiosity": name} for name in CURIOSITIES},
         },
+        "preset best with every intrinsic reward; 5 hours on one core",
+    ),
+    "ingredients": Grid(
+        Options(preset="best", env="pstsy", seeds=8, seed=10),
+        BEST_RUN,
+        {"iterations": 360, "max_transitions": 8_000_000},
+        INGREDIENT_POINTS,
+        "preset best without one ingredient at a time; a day on one core",
     ),
 }

@@ -17,10 +17,10 @@ from refusal import assert_refused
 def test_presets_survive_json_and_train_without_curiosity_and_in_an_environment_of_ones_own(name):
     config = Config.preset(name)
     assert Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    own = tt.make("sy", max_steps=9)
-    for each in (config, Config.preset(name, curiosity="none")):
-        assert make_learner(each, own).env is own
-    blind = make_learner(Config.preset(name, previous_inputs=False), own)
+    env = tt.make("sy", max_steps=9)
+    for settings in (config, Config.preset(name, curiosity="none")):
+        assert make_learner(settings, env).env is env
+    blind = make_learner(Config.preset(name, previous_inputs=False), env)
     jax.eval_shape(blind.iterate, jax.eval_shape(blind.init, jax.random.key(0)))
 
 

@@ -65,7 +65,7 @@ def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajecto
     return 1 / jnp.sqrt(state.reward_variance[0]), played
 
 
-def test_value_of_a_certain_reward(learn):
+def test_a_certain_reward_has_its_value(learn):
     reward, played = learn("value")
     np.testing.assert_allclose(played.value[:, 0, 0], reward, rtol=0.1)
     np.testing.assert_allclose(played.value[:, 1:-1, 0] / reward, 0.0, atol=0.1)

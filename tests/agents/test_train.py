@@ -130,12 +130,13 @@ def test_training_runs_in_a_thread(tmp_path):
 def test_evaluate_writes_before_it_prints(whole, tmp_path):
     """Also on a terminal that shows ASCII alone."""
     arguments = [whole[0], "--sets", "base", "StructuralTrapTube-v0", "--tasks", 3, "--optimality"]
+    arguments += ["--purpose", "confirmation"]
     files = ["--output", tmp_path / "new/x.csv", "--gif", tmp_path / "new/x.gif"]
     output = run("agents.evaluate", *arguments, *files, PYTHONIOENCODING="ascii")
     with (tmp_path / "new/x.csv").open() as file:
         rows = list(csv.DictReader(file))
-    found = [(row["iteration"], row["task_set"], row["tasks"]) for row in rows]
-    assert found == [("30", "base", "1"), ("30", "st", "3")]
+    found = [(row["iteration"], row["purpose"], row["task_set"], row["tasks"]) for row in rows]
+    assert found == [("30", "confirmation", "base", "1"), ("30", "confirmation", "st", "3")]
     assert "{St}" in output
     assert str(tmp_path / "new/x.csv") in output
 

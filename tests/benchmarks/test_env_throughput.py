@@ -34,10 +34,10 @@ def test_measures_every_set_batch_and_pattern(timed, monkeypatch):
         sets=("base", "sy"), num_envs=(2, 4), num_steps=3, repeats=3, patterns=("sum", "last")
     )
     results = env_throughput.main(options)
-    measured = [(each.name, each.num_envs, each.pattern) for each in results]
+    measured = [(x.name, x.num_envs, x.pattern) for x in results]
     assert measured == list(itertools.product(("base", "sy"), (2, 4), ("sum", "last")))
-    assert {each.observation_bytes for each in results} == {3 * 4}
-    assert {each.timing for each in results} == {harness.Timing(7, 2, 1, 3)}
+    assert {x.observation_bytes for x in results} == {3 * 4}
+    assert {x.timing for x in results} == {harness.Timing(7, 2, 1, 3)}
     assert results[2].steps_per_s == 4 * 3 / 2
 
 

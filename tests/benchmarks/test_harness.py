@@ -102,19 +102,19 @@ def test_stated_speeds_are_of_their_records():
         head, _, *rows = [line.strip("| ").split(" | ") for line in table.splitlines()]
         shown = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
         for commit, results in map(results_of, names.split()):
-            for each in results:
-                if each["num_envs"] >= 4096:
-                    devices = f"{each['devices']} device" + "s" * (each["devices"] > 1)
-                    row = f"{devices}, {each['num_envs']:,} environments, commit `{commit}`"
-                    assert shown[row][each["name"]] == f"{each['steps_per_s'] / 1e6:.1f}"
+            for result in results:
+                if result["num_envs"] >= 4096:
+                    devices = f"{result['devices']} device" + "s" * (result["devices"] > 1)
+                    row = f"{devices}, {result['num_envs']:,} environments, commit `{commit}`"
+                    assert shown[row][result["name"]] == f"{result['steps_per_s'] / 1e6:.1f}"
     stated = [line.strip("| ").split(" | ") for line in page.splitlines()]
     parts = [results_of(f"train_throughput_{name}")[1] for name in ("base", "pstsy")]
     for base, pstsy in zip(*parts, strict=True):
-        seconds = [f"{each['timing']['median_s']:.1f}" for each in (base, pstsy)]
+        seconds = [f"{result['timing']['median_s']:.1f}" for result in (base, pstsy)]
         assert any(row[0].startswith(base["name"]) and row[1:] == seconds for row in stated)
     readme = (ROOT / "README.md").read_text()
     (sentence,) = re.findall(r"^\*\*Speed\*\*.*?\n\n", readme, re.MULTILINE | re.DOTALL)
     commit, results = results_of("peers_2_devices")
     assert f"Commit `{commit}`" in sentence
     speeds = re.findall(r"\b(\d+\.\d)\b", sentence)
-    assert set(speeds) == {f"{each['steps_per_s'] / 1e6:.1f}" for each in results}
+    assert set(speeds) == {f"{result['steps_per_s'] / 1e6:.1f}" for result in results}

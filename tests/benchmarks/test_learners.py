@@ -1,5 +1,6 @@
 """Throughput of training: parts, and the plain program next to ours."""
 
+import dataclasses
 import importlib
 from types import SimpleNamespace
 
@@ -29,6 +30,17 @@ def test_all_programs_play_an_iteration(monkeypatch, timed):
     assert [speed.program for speed in speeds] == ["ours", "plain", "plain-by-step"]
     steps = [speed.steps_per_s * speed.timing.median_s for speed in speeds]
     assert steps == pytest.approx([STEPS] * 3)
+
+
+@pytest.mark.interop
+@pytest.mark.filterwarnings("default")
+def test_rejax_plays_as_many_steps_as_we(monkeypatch, timed):
+    config = dataclasses.replace(CONFIG, **learner_peers.SETTINGS["feedforward"])
+    monkeypatch.setattr(learner_peers.Options, "config", lambda *given: config)
+    speeds = learner_peers.measure("base", "feedforward", learner_peers.Options(repeats=1))
+    assert [speed.program for speed in speeds] == ["ours", "rejax"]
+    steps = [speed.steps_per_s * speed.timing.median_s for speed in speeds]
+    assert steps == pytest.approx([STEPS] * 2)
 
 
 @pytest.mark.slow

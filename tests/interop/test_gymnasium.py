@@ -216,7 +216,7 @@ def test_masks_and_seeds_are_checked():
             envs.reset(seed=seed)
 
 
-def test_pictures(easy_env):
+def test_render_modes_show_what_the_package_renders(easy_env):
     env = TrapTubeEnv(easy_env, render_mode="rgb_array", cell_size=8)
     env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), tt.render(easy_env.base, 8))
@@ -269,13 +269,13 @@ def test_copies_continue_the_episode(make, duplicate):
 
 @pytest.mark.parametrize("context", ["spawn", "forkserver"])
 def test_processes_of_their_own_change_nothing(context):
-    own = tt.Environment((tt.perceptual,), max_steps=3)
-    functions = [functools.partial(TrapTubeEnv, own)] * 2
+    env = tt.Environment((tt.perceptual,), max_steps=3)
+    functions = [functools.partial(TrapTubeEnv, env)] * 2
     envs = [SyncVectorEnv(functions), AsyncVectorEnv(functions, context=context)]
-    np.testing.assert_array_equal(*(each.reset(seed=3)[0] for each in envs))
+    np.testing.assert_array_equal(*(vector.reset(seed=3)[0] for vector in envs))
     for _ in range(6):
         actions = envs[0].action_space.sample()
-        assert_same(*(each.step(actions) for each in envs))
+        assert_same(*(vector.step(actions) for vector in envs))
     envs[1].close()
 
 
@@ -291,12 +291,12 @@ def test_processes_of_their_own_change_nothing(context):
         ({"task_set": tt.Environment(), "max_steps": 9}, "do not apply"),
     ],
 )
-def test_refused_arguments(options, message):
+def test_invalid_arguments_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         TrapTubeVectorEnv(**options)
 
 
-def test_refused_actions(easy_env):
+def test_invalid_actions_are_refused(easy_env):
     flat = TrapTubeEnv(easy_env, flat_actions=True)
     pairs = TrapTubeVectorEnv(easy_env, 2)
     for env, allowed, refused in (

@@ -111,8 +111,8 @@ def test_pairs_as_actions_batches_and_copies(easy, easy_env):
     _, states = jax.vmap(flat.reset, in_axes=(0, None))(keys, params)
     indices = jnp.array([0, 7, 9])
     results = [
-        jax.vmap(each.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
-        for each, actions in ((flat, indices), (env, jnp.divmod(indices, 4)))
+        jax.vmap(adapter.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
+        for adapter, actions in ((flat, indices), (env, jnp.divmod(indices, 4)))
     ]
     jax.tree.map(np.testing.assert_array_equal, *results)
     assert results[0][0].shape == (3, 12, 12, 3)
@@ -125,20 +125,20 @@ def test_pairs_as_actions_batches_and_copies(easy, easy_env):
         ((tt.Environment(), {"num_features": 2}), "does not apply"),
     ],
 )
-def test_refused_arguments(arguments, message):
+def test_invalid_arguments_are_refused(arguments, message):
     task_set, options = arguments
     with pytest.raises(ValueError, match=message):
         to_gymnax.make(task_set, **options)
 
 
 @pytest.mark.parametrize("index", [16, -1, jnp.int32(99), np.int64(16)])
-def test_refused_indices(easy, easy_env, index):
+def test_indices_of_no_action_are_refused(easy, easy_env, index):
     env, params = easy
     key = jax.random.key(0)
     _, state = env.reset(key, params)
-    for each in (env, to_gymnax.SixValueTrapTube(easy_env)):
+    for adapter in (env, to_gymnax.SixValueTrapTube(easy_env)):
         with pytest.raises(ValueError, match=f"from 0 to 15, got .*{int(index)}"):
-            each.step_env(key, state, index, params)
+            adapter.step_env(key, state, index, params)
 
 
 def test_batches_of_purejaxrls_wrappers_scan(easy, easy_env):

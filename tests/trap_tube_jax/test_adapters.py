@@ -66,7 +66,7 @@ def test_a_solved_episode_ends_once():
     ):
         state, timestep = step(state, np.array(actions))
         found = (timestep.reward, timestep.terminated, timestep.discount)
-        assert tuple(each.tolist() for each in found) == expected
+        assert tuple(x.tolist() for x in found) == expected
     assert state.episodes.inner.agent.tolist() == [[0, 0], [0, 0]]
     assert state.episodes.inner.time.tolist() == [0, 2]
 

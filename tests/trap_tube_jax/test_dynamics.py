@@ -102,7 +102,7 @@ def _layouts(task: str, number: int) -> list[tt.State]:
         pytest.param("psy", 30, marks=pytest.mark.slow),
     ],
 )
-def test_every_state_and_action(task, number):
+def test_every_action_in_every_state_agrees_with_the_specification(task, number):
     for layout in _layouts(task, number):
         _assert_layout_agrees(layout)
 
@@ -168,7 +168,7 @@ def step():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_one_step(step, name):
+def test_a_step_changes_the_board_as_the_rules_say(step, name):
     case = CASES[name]
     after, timestep = step(_from_corner(case), jnp.array(case.action))
     picture = tt.render_ascii(after).splitlines()

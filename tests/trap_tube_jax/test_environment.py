@@ -150,7 +150,7 @@ def test_an_episode_ends_by_success_or_at_its_limit_and_stays_ended(state, actio
 
 
 def test_states_and_environments_may_be_made_within_a_traced_function():
-    """A layout written there is a constant, and own transfers are tried there."""
+    """A layout written there is a constant, and custom transfers are tried there."""
     made = jax.jit(lambda: tt.Environment(base=tt.base_state()).base.replace(time=jnp.int32(7)))()
     assert made == tt.base_state().replace(time=jnp.int32(7))
     key = jax.random.key(0)
@@ -216,13 +216,13 @@ def test_own_transfers_apply_in_order_to_what_the_ones_before_return():
 def test_own_transfers_get_keys_that_mix_with_own_keys(make_key):
     """Typed keys, whatever `reset` was given, and those that `compose` promises."""
 
-    def own(key, state):
+    def custom(key, state):
         jnp.stack([jax.random.clone(key), jax.random.key(1)])
         jax.lax.cond(state.time == 0, lambda: jax.random.clone(key), lambda: jax.random.key(2))
         return state.replace(agent=jax.random.randint(key, (2,), 8, 12))
 
     key = make_key(3)
-    state, _ = tt.Environment((tt.structural, own), base=EASY).reset(key)
+    state, _ = tt.Environment((tt.structural, custom), base=EASY).reset(key)
     expected = jax.random.fold_in(key, 1)
     np.testing.assert_array_equal(state.agent, jax.random.randint(expected, (2,), 8, 12))
 
@@ -340,7 +340,7 @@ BAD_ACTIONS: list[tuple[Any, list[str]]] = [
 
 
 @pytest.mark.parametrize(("action", "words"), BAD_ACTIONS)
-def test_step_refuses(action, words):
+def test_invalid_actions_are_refused(action, words):
     assert_refused(words, tt.Environment().step, tt.base_state(), action)
     if np.shape(action) == (2,):
         vector = tt.VectorEnvironment(tt.Environment())

@@ -68,7 +68,7 @@ def _within_episode(recorded) -> np.ndarray:
     return np.arange(50) < recorded["length"][:, None]
 
 
-def test_positions_rewards_and_flags(recorded, replay):
+def test_positions_rewards_and_flags_equal_the_recorded_ones(recorded, replay):
     within = _within_episode(recorded)
     for thing in ("agent", "tool", "food"):
         replayed = getattr(replay.state, thing)[within]
@@ -82,7 +82,7 @@ def test_positions_rewards_and_flags(recorded, replay):
     assert not np.any(timestep.terminated & timestep.truncated)
 
 
-def test_observations(recorded, starts, replay):
+def test_observations_equal_the_recorded_ones(recorded, starts, replay):
     first = np.asarray(jax.jit(jax.vmap(tt.observe))(starts))
     boards = np.concatenate([first[:, None], replay.timestep.observation], axis=1)
     for episode, length in enumerate(recorded["length"]):

@@ -73,7 +73,7 @@ def layouts(strength: float) -> Layout:
 
 
 @pytest.mark.parametrize("strength", STRENGTHS)
-def test_boards_and_food(strength):
+def test_boards_and_food_have_the_specified_distribution(strength):
     drawn = layouts(strength)
     chances = np.zeros((9, 8, 2, 144))
     for index, outline in enumerate(OUTLINES):
@@ -86,7 +86,7 @@ def test_boards_and_food(strength):
 
 
 @pytest.mark.parametrize("strength", STRENGTHS)
-def test_tool_and_agent(strength):
+def test_tool_and_agent_have_the_specified_distribution(strength):
     drawn = layouts(strength)
     chances = placements(strength)
     where = (drawn.outline, drawn.vertical, drawn.tool, drawn.agent)
@@ -114,7 +114,7 @@ def test_the_page_states_how_many_outcomes_each_choice_has(strength):
     frames = np.unique(tables.layout[:, 0])
     agents = np.concatenate([tables.num_agents[i, : tables.num_tools[i]] for i in frames])
     counts = [tables.num_food[frames], tables.num_tools[frames], agents]
-    cells = ["–".join(map(str, sorted({own.min(), own.max()}))) for own in counts]
+    cells = ["–".join(map(str, sorted({found.min(), found.max()}))) for found in counts]
     row = f"| {strength} | {len(tables.layout)} | {' | '.join(cells)} |"
     assert row in (ROOT / "trap_tube_jax" / "graded.md").read_text(encoding="utf-8")
 
@@ -154,10 +154,10 @@ def palettes(strength: float) -> np.ndarray:
 
 @pytest.mark.parametrize("strength", STRENGTHS)
 @pytest.mark.parametrize("code", POINTS_OF)
-def test_structural_angles(strength, code):
+def test_colours_turn_by_a_share_of_a_uniform_direction(strength, code):
     """An angle theta from 0 to pi has density sin(theta) / 2, and here it is scaled."""
-    own = directions(BASE.palette[code])
-    angles = np.arccos(directions(palettes(strength)[:, code]) @ own)
+    origin = directions(BASE.palette[code])
+    angles = np.arccos(directions(palettes(strength)[:, code]) @ origin)
     limit = strength * np.pi
     assert angles.max() < limit + 0.02
     edges = np.linspace(0, limit, 11)
@@ -167,9 +167,9 @@ def test_structural_angles(strength, code):
 
 @pytest.mark.parametrize("strength", STRENGTHS)
 def test_structural_goes_to_every_side(strength):
-    """Around the state's own point, no direction is preferred."""
-    own = directions(BASE.palette[spec.TOOL])
-    first = np.linalg.svd(own[None])[2][1:]  # two vectors orthogonal to it and each other
+    """Around the state's colour, no direction is preferred."""
+    origin = directions(BASE.palette[spec.TOOL])
+    first = np.linalg.svd(origin[None])[2][1:]  # two vectors orthogonal to it and each other
     sides = directions(palettes(strength)[:, spec.TOOL]) @ first.T
     turns = np.arctan2(sides[:, 0], sides[:, 1]) / (2 * np.pi) % 1
     assert_fits(np.bincount((turns * 12).astype(int), minlength=12), np.full(12, 1 / 12))
@@ -179,19 +179,19 @@ def test_structural_goes_to_every_side(strength):
 def test_structural_goes_along_the_great_circle(num_features):
     """Linear in the strength: the angle and the distance from the centre."""
     rng = np.random.default_rng(5)
-    own = rng.uniform(-1, 1, (50, num_features))
+    origin = rng.uniform(-1, 1, (50, num_features))
     drawn = rng.normal(size=(50, num_features))
     drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
-    radius = np.linalg.norm(own, axis=1)
-    whole = np.arccos((np.sum(own * drawn, axis=1) / radius).clip(-1, 1))
+    radius = np.linalg.norm(origin, axis=1)
+    whole = np.arccos((np.sum(origin * drawn, axis=1) / radius).clip(-1, 1))
     for strength in (0, 0.2, 0.6, 1):
-        points = np.asarray(points_between(jnp.asarray(own), jnp.asarray(drawn), strength))
+        points = np.asarray(points_between(jnp.asarray(origin), jnp.asarray(drawn), strength))
         if num_features == 1:
-            np.testing.assert_allclose(points, own + strength * (drawn - own), atol=1e-5)
+            np.testing.assert_allclose(points, origin + strength * (drawn - origin), atol=1e-5)
             continue
         length = np.linalg.norm(points, axis=1)
         np.testing.assert_allclose(length, radius + strength * (1 - radius), atol=1e-5)
-        turned = np.arccos((np.sum(own * points, axis=1) / radius / length).clip(-1, 1))
+        turned = np.arccos((np.sum(origin * points, axis=1) / radius / length).clip(-1, 1))
         rest = np.arccos((np.sum(drawn * points, axis=1) / length).clip(-1, 1))
         np.testing.assert_allclose(turned, strength * whole, atol=2e-3)
         np.testing.assert_allclose(turned + rest, whole, atol=2e-3)

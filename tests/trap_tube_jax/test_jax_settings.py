@@ -64,7 +64,7 @@ def expected() -> Any:
 
 
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
-def test_the_same_episodes(expected, settings):
+def test_episodes_do_not_depend_on_settings_of_jax(expected, settings):
     with contextlib.ExitStack() as stack:
         for context, value in settings.items():
             stack.enter_context(context(value))

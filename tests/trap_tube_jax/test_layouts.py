@@ -40,7 +40,7 @@ def test_number_of_layouts(layouts):
     np.testing.assert_allclose(np.sum(chance * count), 1)
 
 
-def test_layouts_that_a_run_meets(layouts):
+def test_the_share_of_layouts_that_training_meets_is_the_documented_one(layouts):
     """The chance that a layout of {P} has been drawn before is what protocol.md says."""
     chance, count = layouts
 

@@ -86,7 +86,7 @@ def test_the_limit_ends_the_episode(game):
         assert play.press(game, key) == game
 
 
-def test_a_hint_where_nothing_helps(game):
+def test_a_hint_says_if_nothing_helps(game):
     board = game.state.board
     walls = board.at[8:11, 0].set(3).at[8, 1].set(3).at[10, 1].set(3).at[8:11, 2].set(3)
     assert "out of reach" in play.press(having(game, board=walls), "?").message
@@ -161,7 +161,7 @@ def read_until(terminal, text):
     return shown
 
 
-def test_in_a_real_terminal():
+def test_a_game_starts_and_quits_in_a_real_terminal():
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "trap_tube_jax.play", "base"],

@@ -28,8 +28,8 @@ def own_transfer(key, state):
 @pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
 def test_tasks_of_rbg_keys_do_not_depend_on_the_batch(impl):
     keys = jax.random.split(jax.random.key(5, impl=impl), 4)
-    own = tt.Environment((own_transfer, tt.compose(tt.structural, own_transfer)))
-    for env in (tt.make("pstsy"), tt.AutoReset(tt.make("pstsy")), own):
+    custom = tt.Environment((own_transfer, tt.compose(tt.structural, own_transfer)))
+    for env in (tt.make("pstsy"), tt.AutoReset(tt.make("pstsy")), custom):
         batch = jax.jit(jax.vmap(env.reset))(keys)
         reset = jax.jit(env.reset)
         for index, key in enumerate(keys):

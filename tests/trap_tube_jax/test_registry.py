@@ -46,7 +46,7 @@ def test_register_adds_a_set(own_task_sets):
         return state.replace(agent=state.agent.at[0].set(0))
 
     transfers = (tt.structural, to_the_top)
-    entry = tt.register("Top-v0", (each for each in transfers))
+    entry = tt.register("Top-v0", iter(transfers))
     assert tt.registered_ids()[-1] == "Top-v0"
     assert (entry.short, entry.label) == ("Top-v0", "Top-v0")
     assert tt.task_set("Top-v0") is entry
@@ -138,7 +138,7 @@ def test_make_refuses_an_unknown_name_and_offers_the_nearest(name, meant):
         ({"max_steps": 0}, ["max_steps", ">= 1", "0"]),  # as `Environment` does
     ],
 )
-def test_make_refuses(options, words):
+def test_impossible_environments_are_refused(options, words):
     assert_refused(words, tt.make, "TrapTube-v0", **options)
 
 

@@ -216,5 +216,5 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
         (FRAMES, {"hold": np.inf}, "got inf"),
     ],
 )
-def test_gif_refuses(frames, options, message, tmp_path):
+def test_a_gif_of_impossible_frames_is_refused(frames, options, message, tmp_path):
     assert_refused([message], tt.save_gif, frames, tmp_path / "none.gif", **options)

@@ -124,7 +124,7 @@ BAD_ARRAYS = [
 
 
 @pytest.mark.parametrize(("changes", "words"), BAD_ARRAYS)
-def test_create_refuses(changes, words):
+def test_invalid_arrays_are_refused(changes, words):
     assert_refused(words, tt.State.create, **good_arrays(**changes))
 
 

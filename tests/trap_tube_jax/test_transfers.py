@@ -37,7 +37,7 @@ def _food_chances() -> np.ndarray:
     return chances
 
 
-def test_perceptual_boards_and_food(layout):
+def test_boards_and_food_have_the_specified_distribution(layout):
     chances = np.repeat(_food_chances()[:, None], 8, axis=1) / 8
     counts = tally((9, 8, 144), layout.outline, layout.variant, layout.food)
     assert np.count_nonzero(chances) == 128
@@ -46,7 +46,7 @@ def test_perceptual_boards_and_food(layout):
 
 
 @pytest.mark.parametrize("thing", ["tool", "agent"])
-def test_perceptual_places(layout, thing):
+def test_tool_and_agent_have_the_specified_distribution(layout, thing):
     chances = spec.placements().sum(axis=3 if thing == "tool" else 2)
     counts = tally((9, 2, 144), layout.outline, layout.vertical, getattr(layout, thing))
     assert np.all(counts[chances * SAMPLES > 20] > 0)
@@ -145,7 +145,7 @@ def test_structural_points_lie_on_the_sphere(num_features):
 
 
 @pytest.mark.parametrize("num_features", FEATURES)
-def test_structural_moments(num_features):
+def test_colours_are_uniform_on_the_sphere(num_features):
     """Mean 0; covariance I / N within a point and 0 between the five points."""
     points = _points(num_features).reshape(SAMPLES, -1)
     five_sigma = 5 / np.sqrt(SAMPLES)
@@ -201,7 +201,7 @@ def _assert_is_one_of(drawn: Any, outcomes: list[spec.Looks]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("palette", [spec.BASE_COLORS, DISTINCT_PALETTE], ids=["base", "distinct"])
-def test_symbolic_on_the_base_task(palette):
+def test_the_base_task_has_five_equally_likely_swaps(palette):
     start = tt.base_state().replace(palette=jnp.asarray(palette))
     drawn = draw(tt.symbolic, 4, start)
     outcomes = [spec.swapped(_looks(start), code) for code in SWAPPED]

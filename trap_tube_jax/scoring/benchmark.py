@@ -92,9 +92,21 @@ def score(
       optimality: number of tasks per set, the first ones, to compare with shortest plans.
       num_features: N, feature channels of the observation; see `make`.
 
+    Returns:
+      The scores by set; printed, a table.
+
     Raises:
       ValueError: an argument is invalid; the policy returns an action out of range, or its memory
         becomes NaN.
+
+    Example:
+      >>> class Still:
+      ...     def initial(self, batch):
+      ...         return jnp.zeros((batch, 2), int)
+      ...     def act(self, observation, carry, key):
+      ...         return carry, carry
+      >>> tt.score(Still(), sets=("base",), tasks=1)["base"].percent
+      0.0
     """
     for name in ("initial", "act"):
         if not callable(getattr(policy, name, None)):
@@ -150,9 +162,19 @@ def score_gymnasium(
       optimality: as for `score`.
       num_features: as for `score`.
 
+    Returns:
+      The scores by set; printed, a table.
+
     Raises:
       ValueError: an argument is invalid, the agent acts on observations of another dtype, or it
         returns an invalid action.
+
+    Example:
+      >>> class Still:
+      ...     def act(self, observation):
+      ...         return 0, 0
+      >>> tt.score_gymnasium(Still(), sets=("base",), tasks=1)["base"].percent
+      0.0
     """
     caller = PythonAgent(agent)
 

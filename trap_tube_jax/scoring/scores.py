@@ -80,6 +80,13 @@ class Score:
       mean_steps: mean steps of the solved episodes; None without any.
       layouts: the layouts solved; None unless the set has few.
       optimality: the comparison with shortest plans; None unless requested.
+
+    Example:
+      >>> class Still:
+      ...     act = lambda self, observation: (0, 0)
+      >>> score = tt.score_gymnasium(Still(), sets=("sy",), tasks=10)["sy"]
+      >>> score.label, score.tasks, score.solved
+      ('{Sy}', 10, 0)
     """
 
     set: str
@@ -132,6 +139,13 @@ class Scores:
       version: version of this package.
       seed: seed of the agent's actions; None for an agent in plain Python.
       sets: the score of every set.
+
+    Example:
+      >>> class Still:
+      ...     act = lambda self, observation: (0, 0)
+      >>> scores = tt.score_gymnasium(Still(), sets=("base", "sy"), tasks=10)
+      >>> {name: scores[name].percent for name in scores}
+      {'base': 0.0, 'sy': 0.0}
     """
 
     protocol: int

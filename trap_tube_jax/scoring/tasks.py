@@ -21,7 +21,7 @@ from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_s
 from trap_tube_jax.state import State
 from trap_tube_jax.transfers import Transfer, compose, perceptual
 
-Purpose = Literal["test", "validation"]
+Purpose = Literal["test", "validation", "confirmation"]
 
 # The version of the fixed tasks. Scores of different versions are not comparable.
 PROTOCOL = 1
@@ -29,11 +29,12 @@ ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
 FEW_LAYOUTS = 5  # a set with at most as many layouts, colours aside, has few
 SETS_OF_FEW = tuple(x.short for x in PAPER_TASK_SETS if perceptual not in x.transfers)
 
-# "trap" and "tube", or "trap" and "vali". The first word of `jax.random.key(seed)` is 0 for every
-# seed from 0 to 2**32 - 1, so no seed of training leads here.
+# "trap", and the first letters of "tube", "validation" and "confirmation". The first word of
+# `jax.random.key(seed)` is 0 for every seed from 0 to 2**32 - 1, so no seed of training leads here.
 _ROOTS: dict[Purpose, np.ndarray] = {
     "test": np.array([0x74726170, 0x74756265], np.uint32),
     "validation": np.array([0x74726170, 0x76616C69], np.uint32),
+    "confirmation": np.array([0x74726170, 0x636F6E66], np.uint32),
 }
 
 
@@ -49,10 +50,15 @@ def evaluation_tasks(
       num_tasks: 1 to 1,000,000.
       num_features: N, feature channels; see `make`.
       purpose: `test` for tasks that are reported, `validation` for early stopping and model
-        selection.
+        selection, `confirmation` for tasks that nobody has looked at before the work is done.
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
+
+    Example:
+      >>> tasks = tt.evaluation_tasks("sy", 100)
+      >>> tasks.agent.shape, tasks.board.shape
+      ((100, 2), (100, 12, 12))
     """
     return fixed_tasks(make(name, num_features=num_features), task_set(name).id, num_tasks, purpose)
 
@@ -83,7 +89,7 @@ def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax
     The first keys do not depend on `num_tasks`. Keys differ between sets and purposes.
 
     Raises:
-      ValueError: `purpose` is neither "test" nor "validation".
+      ValueError: `purpose` is unknown.
     """
     if purpose not in tuple(_ROOTS):
         raise ValueError(f"purpose must be one of {', '.join(_ROOTS)}, got {purpose!r}")

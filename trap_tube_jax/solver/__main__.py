@@ -22,9 +22,10 @@ from trap_tube_jax.solver.search import Plan, replay, solve, solve_batch
 from trap_tube_jax.state import State
 from trap_tube_jax.tables import markdown_table
 
-DESCRIPTION = """Find exact shortest plans of the trap-tube tasks. Without --show and --distances,
-print statistics of whole task sets and draw a histogram. Sets that differ in colours alone have
+DESCRIPTION = """Finds exact shortest plans of the trap-tube tasks. Without --show and --distances,
+prints statistics of whole task sets and draws a histogram. Sets that differ in colours alone have
 the same statistics. Only the pictures need the extra [pictures]."""
+SURVEYED = ("base", "sy", "p", "psy")
 QUANTILES = (5, 25, 50, 75, 95)
 
 
@@ -49,12 +50,12 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--sets",
         nargs="+",
-        default=["base", "sy", "p", "psy"],
+        default=SURVEYED,
         metavar="SET",
-        help="task sets, by default %(default)s",
+        help=f"task sets [{' '.join(SURVEYED)}]",
     )
-    add("--tasks", type=int, default=1000, help="tasks to solve per set, by default 1000")
-    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1, by default 0")
+    add("--tasks", type=int, default=1000, help="tasks to solve per set [%(default)s]")
+    add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1 [%(default)s]")
     modes = parser.add_mutually_exclusive_group()
     modes.add_argument("--show", metavar="SET", help="plan one task, as text and GIF")
     modes.add_argument("--distances", metavar="SET", help="draw distances to the goal in one task")

@@ -27,6 +27,12 @@ class Distances(ByValue, struct.PyTreeNode, eq=False):
         unreachable states.
       to_goal: i16[12, 12, 12, 12, 12, 12], fewest steps until the reward; 0 for solved states,
         -1 for states that are unreachable or have no way to the goal.
+
+    Example:
+      >>> state = tt.State.from_ascii(["A...F1....TT", "111111......", *["." * 12] * 10])
+      >>> to_goal = tt.distances(state).to_goal[(*state.food, *state.tool)]
+      >>> to_goal[0, :6].tolist()  # with the agent in the first cells of row 0
+      [4, 3, 2, 1, 0, -1]
     """
 
     from_start: np.ndarray
@@ -55,6 +61,12 @@ def distances(state: State) -> Distances:
 
     Raises:
       ValueError: see `solve`.
+
+    Example:
+      >>> state = tt.State.from_ascii(["A...F1....TT", "111111......", *["." * 12] * 10])
+      >>> found = tt.distances(state)
+      >>> found.num_reachable, int(found.lookup(state))
+      (5, 4)
     """
     from_start, nodes, successors = _explore(checked(state))
     to_goal = _distances_to_goal(from_start, nodes, successors)

@@ -38,6 +38,14 @@ class Plan(ByValue, struct.PyTreeNode, eq=False):
         `Environment.step` refuses this padding.
       length: i32[] or i32[B], number of steps, which may exceed a step limit; -1 if unsolvable.
       solvable: bool[] or bool[B], some sequence of actions leads to the goal.
+
+    Example:
+      >>> env = tt.make("base")
+      >>> state, timestep = env.reset(jax.random.key(0))
+      >>> for action in tt.solve(state).actions:
+      ...     state, timestep = env.step(state, action)
+      >>> float(timestep.reward)
+      1.0
     """
 
     actions: np.ndarray
@@ -75,6 +83,11 @@ def solve(state: State) -> Plan:
 
     Raises:
       ValueError: the state is invalid (see `validate`), done, batched or traced.
+
+    Example:
+      >>> plan = tt.solve(tt.base_state())
+      >>> int(plan.length), plan.actions[:2].tolist()
+      (11, [[0, 0], [0, 3]])
     """
     return _to_plan(_shortest_actions(checked(state)))
 
@@ -91,6 +104,11 @@ def solve_batch(states: State) -> Plan:
     Raises:
       ValueError: `states` is not a batch, or `solve` refuses a state, whose index the message
         names.
+
+    Example:
+      >>> plans = tt.solve_batch(tt.evaluation_tasks("sy", 3))
+      >>> plans.length.tolist(), plans.actions.shape
+      ([8, 11, 11], (3, 11, 2))
     """
     tasks = list(_unbatched(states))
     # Tasks of a set may recur, and are solved once.

@@ -47,7 +47,7 @@ def test_under_a_high_penalty_no_action_is_repeated():
             pictures, pairs = map(bytes, np.asarray(observation)), map(tuple, action.tolist())
             seen.append(list(zip(pictures, pairs, strict=True)))
         ends = np.asarray(state.time)
-        return [end - len(set(each[:end])) for end, *each in zip(ends, *seen, strict=True)]
+        return [end - len(set(rows[:end])) for end, *rows in zip(ends, *seen, strict=True)]
 
     assert sum(repeated(0.0)) > 0
     assert sum(repeated(1e6)) == 0

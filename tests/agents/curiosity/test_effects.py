@@ -1,4 +1,4 @@
-"""Effects: changes and grasps that are new to their episode, outside the agent's own body."""
+"""Effects: changes and grasps that are new to their episode, outside the agent's body."""
 
 import jax
 import jax.numpy as jnp
@@ -41,14 +41,14 @@ def random_episodes(env: tt.Environment) -> Episodes:
 
 
 def read_off(
-    boards: np.ndarray, grasps: np.ndarray, ground: np.ndarray, own: dict[str, np.ndarray]
+    boards: np.ndarray, grasps: np.ndarray, ground: np.ndarray, base_color: dict[str, np.ndarray]
 ) -> np.ndarray:
     """Finds new effects i64[3, T] from one episode's boards u8[T + 1, 12, 12, N] and grasps.
 
     Assumes that agent and food stand on ground.
     """
-    is_agent = np.asarray(np.all(boards == own["agent"], axis=-1))
-    is_food = np.asarray(np.all(boards == own["food"], axis=-1))
+    is_agent = np.asarray(np.all(boards == base_color["agent"], axis=-1))
+    is_food = np.asarray(np.all(boards == base_color["food"], axis=-1))
     rest = boards.copy()
     rest[is_agent | is_food] = ground
     found = []
@@ -59,8 +59,8 @@ def read_off(
             seen.add(view.tobytes())
         found.append(new[1:])
     met, new = set(), []
-    for board, place, grasp in zip(boards, is_agent, grasps, strict=False):
-        hand = np.argwhere(place)[0] + DIRECTIONS[grasp]
+    for board, body, grasp in zip(boards, is_agent, grasps, strict=False):
+        hand = np.argwhere(body)[0] + DIRECTIONS[grasp]
         color = board[tuple(hand)].tobytes() if np.all((hand >= 0) & (hand < 12)) else None
         new.append(color is not None and color not in met)
         met.add(color)
@@ -73,7 +73,7 @@ def test_effects_can_be_read_off_the_observations(short):
     episodes = random_episodes(env)
     boards = np.asarray(jax.jit(Episodes.observations)(episodes))
     found = np.asarray(jax.jit(new_effects)(episodes) * episodes.mask[None])
-    own = {"agent": np.asarray(env.base.palette[7]), "food": np.asarray(env.base.palette[5])}
+    base_color = {"agent": np.asarray(env.base.palette[7]), "food": np.asarray(env.base.palette[5])}
     checked = 0
     for index in range(BATCH):
         length = int(episodes.length[index])
@@ -81,7 +81,7 @@ def test_effects_can_be_read_off_the_observations(short):
             length -= 1  # the agent stands where the food was
         ground = np.asarray(episodes.layout.palette[index, 0])
         grasps = np.asarray(episodes.action[index, :length, 0])
-        expected = read_off(boards[index, : length + 1], grasps, ground, own)
+        expected = read_off(boards[index, : length + 1], grasps, ground, base_color)
         np.testing.assert_array_equal(found[:, index, :length], expected)
         checked += expected.sum()
     assert checked > 0

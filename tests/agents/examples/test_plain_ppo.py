@@ -86,7 +86,9 @@ def test_rewards_advantages_and_losses_are_those_of_the_learner():
     start = jax.jit(plain.init)(jax.random.key(0))
 
     def translated(params):  # in 64 bits where the plain program computes in these
-        return jax.tree.map(lambda x, own: x.astype(own.dtype), plain_params(params), start.params)
+        return jax.tree.map(
+            lambda x, like: x.astype(like.dtype), plain_params(params), start.params
+        )
 
     plain_state = start.replace(params=translated(state.params))
     variance, (episode, advantage, target) = jax.jit(plain.prepare)(

@@ -72,10 +72,11 @@ def assert_close(tree: Any, other: Any) -> None:
 
 @pytest.mark.parametrize("fn", [forgetful, remembering])
 @pytest.mark.parametrize("chunk", [1, 8, 37, 64])
-def test_map_rows_and_its_gradient(problem, fn, chunk, monkeypatch):
+def test_chunked_rows_have_the_value_and_gradient_of_whole_ones(problem, fn, chunk, monkeypatch):
     monkeypatch.setattr(chunks, "REMEMBERED_BYTES", 16 * 4 * WIDTH)
     got, want = (
-        jax.jit(jax.value_and_grad(partial(total, each, chunk, problem))) for each in (fn, None)
+        jax.jit(jax.value_and_grad(partial(total, function, chunk, problem)))
+        for function in (fn, None)
     )
     for count in (0, 1, 8, 9, ROWS):
         assert_close(got(problem[0], count), want(problem[0], count))

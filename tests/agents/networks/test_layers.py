@@ -61,8 +61,8 @@ def test_layers_of_flax_start_as_flax_initialises_them():
     one, other = (init_module(mixed, key, jnp.ones((1, 3)))["params"] for key in keys)
     np.testing.assert_array_equal(one["layers_1"]["scale"], 1)
     assert not np.any(np.isclose(one["layers_2"]["kernel"], other["layers_2"]["kernel"]))
-    own: Any = nn.Dense(4).init(keys[0], jnp.ones((1, 4)))["params"]["kernel"]
-    np.testing.assert_allclose(np.std(one["layers_2"]["kernel"]), np.std(own), rtol=0.5)
+    flax_dense: Any = nn.Dense(4).init(keys[0], jnp.ones((1, 4)))["params"]["kernel"]
+    np.testing.assert_allclose(np.std(one["layers_2"]["kernel"]), np.std(flax_dense), rtol=0.5)
 
 
 class Own(nn.Module):

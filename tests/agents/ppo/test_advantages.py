@@ -37,7 +37,7 @@ def normal(x, mask):
     return mask * x / np.sqrt(np.mean(x[mask > 0] ** 2) + 4e-4)
 
 
-def test_two_streams_step_by_step():
+def test_separate_heads_estimate_two_streams_of_rewards():
     """Of two episodes one is solved at its third step; the old moments have a variance of 4."""
     config = Config.preset("best")
     gamma, lambda_, rate = config.discount, config.gae_lambda, config.reward_ema_decay
@@ -52,10 +52,10 @@ def test_two_streams_step_by_step():
     for t in reversed(range(5)):
         returns_to_come[:, t] = novelty[:, t] + gamma * returns_to_come[:, t + 1]
     variance = rate * 4 + (1 - rate) * returns_to_come[:, :-1][mask > 0].var()
-    own = value[..., 1].copy()
-    own[0, 3:] = own[:, 5] = own[:, 0].mean()
+    bootstrapped = value[..., 1].copy()
+    bootstrapped[0, 3:] = bootstrapped[:, 5] = bootstrapped[:, 0].mean()
     paid, discount = 0.3 * novelty / np.sqrt(variance), np.full((2, 5), gamma)
-    curiosity = plain_advantages(paid, discount, own, mask, lambda_)
+    curiosity = plain_advantages(paid, discount, bootstrapped, mask, lambda_)
 
     arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
     zero = jnp.zeros(())
@@ -68,7 +68,7 @@ def test_two_streams_step_by_step():
     for found, expected in (
         (advantage, normal(task, mask) + 0.7 * normal(curiosity, mask)),
         (target[..., 0], task + value[:, :-1, 0]),
-        (target[..., 1], curiosity + own[:, :-1]),
+        (target[..., 1], curiosity + bootstrapped[:, :-1]),
         (moments[1], variance),
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)

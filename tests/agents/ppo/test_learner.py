@@ -254,7 +254,7 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     weights = {"value_coef": 0.5, "entropy_coef": 0.1, "motion_coef": 0.25, "curiosity_coef": 3.0}
     two_heads = {"curiosity": "effects", "value_heads": "separate", "bootstrap": "value"}
     made = make_learner(Config(**{**SETTINGS, **weights, **two_heads}))
-    own = Returning(losses={"own_loss": jnp.ones((1, 2))})
+    custom = Returning(losses={"own_loss": jnp.ones((1, 2))})
     params = jax.eval_shape(made.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
     mask, cells = jnp.array([[1.0, 0.0]]), jnp.zeros((1, 3, 3, 2), jnp.uint8)
@@ -262,7 +262,7 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     old = jnp.full((1, 2), -2 * np.log(4) - np.log(1.5), jnp.float32)  # clipped to 1.2
     target = jnp.array([[[3.0, 4.0], [9.0, 9.0]]])
     batch = learner.Batch(episodes, old, jnp.array([[2.0, 9.0]]), target)
-    total, found = Known(**{**vars(made), "curiosity": own}).loss(params, batch)
+    total, found = Known(**{**vars(made), "curiosity": custom}).loss(params, batch)
     expected = {
         "policy_loss": -1.2 * 2 / 2,
         "value_loss": 0.5 * (9 + 16) / 2,
@@ -299,9 +299,9 @@ def with_curiosity(monkeypatch):
     ],
 )
 def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returned, message):
-    own = with_curiosity(Returning(**returned))
+    custom = with_curiosity(Returning(**returned))
     with pytest.raises(ValueError, match=message):
-        jax.eval_shape(own.iterate, own.init(jax.random.key(0)))
+        jax.eval_shape(custom.iterate, custom.init(jax.random.key(0)))
 
 
 class Maps(nn.Module):

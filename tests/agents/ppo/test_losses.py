@@ -66,11 +66,11 @@ def test_entropy_of_certainty_is_zero_and_its_gradient_finite():
 @pytest.mark.parametrize(
     ("ratio", "advantage", "expected", "moves"),
     [
-        (1.5, 1.0, -1.2, False),
-        (1.5, -1.0, 1.5, True),
-        (0.5, 1.0, -0.5, True),
-        (0.5, -1.0, 0.8, False),
-        (1.1, 1.0, -1.1, True),
+        (1.5, 2.0, -2.4, False),
+        (1.5, -2.0, 3.0, True),
+        (0.5, 2.0, -1.0, True),
+        (0.5, -2.0, 1.6, False),
+        (1.1, 2.0, -2.2, True),
     ],
 )
 def test_clipping_stops_the_gradient_only_where_it_would_go_further(
@@ -81,3 +81,8 @@ def test_clipping_stops_the_gradient_only_where_it_would_go_further(
     value, gradient = surrogate(log_ratio, old, advantage, 0.2)
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     assert bool(gradient != 0) == moves
+
+
+def test_padding_counts_as_zeros_in_means():
+    x, mask = jnp.array([[1.0, 2.0], [4.0, 100.0]]), jnp.array([[1.0, 1.0], [1.0, 0.0]])
+    assert losses.padded_mean(x, mask) == 7 / 4

@@ -40,7 +40,7 @@ def test_the_rules_of_bootstrap_differ_at_the_end(bootstrap, end, advantage, tar
     np.testing.assert_allclose(found[1][0, : len(target)], target)
 
 
-def test_normalize():
+def test_normalized_steps_have_mean_0_and_deviation_1():
     """Episodes are masked after an end of their own, of 3 to STEPS steps."""
     rng = np.random.default_rng(0)
     length = rng.integers(3, STEPS + 1, CASES)

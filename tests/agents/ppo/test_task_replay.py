@@ -16,7 +16,7 @@ def replay() -> TaskReplay:
     return TaskReplay.untried(jax.random.key(0), LISTS, CAPACITY)
 
 
-def test_places_are_filled_in_turn(replay):
+def test_newer_failures_replace_the_oldest(replay):
     keys = jax.random.split(jax.random.key(1), 6)
     last = bits(keys[5])
     for pair in jax.random.clone(keys).reshape(3, 2):
@@ -25,7 +25,7 @@ def test_places_are_filled_in_turn(replay):
     np.testing.assert_array_equal(bits(replay.keys)[0, 0], last)
 
 
-def test_of_more_failures_than_places_the_last_are_kept(replay):
+def test_of_more_failures_than_fit_the_last_are_kept(replay):
     keys = jax.random.split(jax.random.key(1), 2 * CAPACITY + 3)
     failed = jnp.ones(len(keys), bool).at[-2].set(False)
     new = bits(keys)

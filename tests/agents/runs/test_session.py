@@ -285,6 +285,15 @@ def test_a_run_that_is_killed_before_its_first_iteration_begins_again(tmp_path, 
     assert len(untimed(tmp_path / "x")) == 1
 
 
+def test_a_run_trains_on_a_mixture_and_goes_on(tmp_path):
+    for iterations in (1, 2):
+        run = Run(small_config(iterations=iterations, env_id="base+{P}"))
+        train_run(tmp_path / "x", run, RunOptions(sets=("base+p",), test_tasks=3, report=False))
+    assert len(untimed(tmp_path / "x")) == 2
+    assert set(results(tmp_path)["task_set"]) == {"base+p"}
+    assert agents.load(tmp_path / "x").config.env_id == "TrapTube-v0+PerceptualTrapTube-v0"
+
+
 def test_a_path_may_begin_at_home(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     train_run("~/x", small_run(iterations=1), PLAIN)

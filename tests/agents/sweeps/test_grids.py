@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from agents.config import Config
 from agents.runs.folder import RunFolder
 from agents.runs.run import Run, RunOptions
 from agents.sweeps.grids import GRIDS, Grid, Options
@@ -63,7 +64,7 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, o
 @pytest.mark.parametrize(
     ("name", "short", "iterations"), [("exp1", "base", 250), ("exp2", "pstsy", 500)]
 )
-def test_the_papers_experiments(name, short, iterations):
+def test_grids_train_as_the_paper_says(name, short, iterations):
     grid = GRIDS[name]
     found = grid.configs(grid.options)
     assert {k: v.curiosity for k, v in found.items()} == {"ppo": "none", "ppo+icm": "icm"}
@@ -103,3 +104,15 @@ def test_the_arms_of_the_published_code_hold_the_papers_two():
     found = configs(grid=GRIDS["exp2-code"], preset="paper")
     assert found["ppo+bonus"].curiosity_coef == 0 < found["ppo+bonus"].intrinsic_coef
     assert not found["ppo+icm-blind"].previous_inputs
+
+
+def test_a_grid_leaves_out_one_ingredient_of_best_at_a_time():
+    grid = GRIDS["ingredients"]
+    best, *others = grid.configs(grid.options).values()
+    assert best == Config.preset("best", env_id="pstsy", **grid.settings)
+    changed = [
+        {name for name, value in config.to_dict().items() if value != best.to_dict()[name]}
+        for config in others
+    ]
+    assert all(changed)
+    assert sum(map(len, changed)) - len(set.union(*changed)) == 1, "curiosity alone changes twice"

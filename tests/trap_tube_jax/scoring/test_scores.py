@@ -25,7 +25,7 @@ def test_optimality_compares_with_shortest_plans():
     # R: binom::binom.confint(successes, trials, methods = "wilson").
     [(0, 10, 0.0, 0.27753), (5, 10, 0.23659, 0.76341), (10, 10, 0.72247, 1.0)],
 )
-def test_wilson_interval(successes, trials, low, high):
+def test_intervals_are_wilsons(successes, trials, low, high):
     np.testing.assert_allclose(wilson_interval(successes, trials), (low, high), atol=1e-5)
 
 

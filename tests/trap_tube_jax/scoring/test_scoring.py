@@ -232,7 +232,7 @@ def test_a_suite_plays_all_sets_in_equal_blocks_up_to_their_limits(near, monkeyp
 def test_scores_are_records(scores):
     values = json.loads(json.dumps(scores.to_dict()))
     assert (values["protocol"], values["version"], values["seed"]) == (PROTOCOL, tt.__version__, 0)
-    assert [each["set"] for each in values["sets"]] == ["near", "base"]
+    assert [score["set"] for score in values["sets"]] == ["near", "base"]
     assert {"tasks", "solved", "percent", "interval"} <= values["sets"][0].keys()
     lines = str(scores).splitlines()
     assert str(scores).isascii(), "any terminal shows it"
@@ -315,7 +315,7 @@ def test_a_model_trained_behind_vecnormalize_sees_what_it_was_trained_on(near, s
     np.testing.assert_allclose(trained.seen, np.asarray(plain.seen) / 255, rtol=1e-6)
 
 
-def test_refusals(near):
+def test_an_agent_that_cannot_be_scored_is_refused(near):
     words = ["num_features=5", "has 3"]  # before base, which an agent without action cannot play
     assert_refused(words, tt.score, Rightward(), ["near"], num_features=5)
     assert_refused(words, tt.score_gymnasium, Single(None), ["base", "near"], num_features=5)
@@ -340,7 +340,7 @@ def test_refusals(near):
         ),
     ):
         assert_refused(words, tt.score, Random(), sets, **options)
-    words = ["purpose", "test, validation", "'train'"]
+    words = ["purpose", "test, validation, confirmation", "'train'"]
     purpose: Any = "train"
     assert_refused(words, evaluation_tasks, "base", 1, purpose=purpose)
     assert_refused(words, evaluation_keys, "TrapTube-v0", 1, purpose)

@@ -1,5 +1,7 @@
 """The fixed tasks: draws of their environments, by keys that nothing else uses."""
 
+from typing import get_args
+
 import jax
 import numpy as np
 import pytest
@@ -7,7 +9,13 @@ import pytest
 import trap_tube_jax as tt
 from easy import assert_same
 from trap_tube_jax.registry import PAPER_TASK_SETS
-from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_keys, evaluation_tasks, layout_numbers
+from trap_tube_jax.scoring.tasks import (
+    ALL_SETS,
+    Purpose,
+    evaluation_keys,
+    evaluation_tasks,
+    layout_numbers,
+)
 
 
 def test_tasks_are_those_that_the_environment_draws():
@@ -22,13 +30,13 @@ def test_keys_differ_within_and_between_sets_and_purposes():
     keys = [
         jax.random.key_data(evaluation_keys(entry.id, 64, purpose))
         for entry in PAPER_TASK_SETS
-        for purpose in ("test", "validation")
+        for purpose in get_args(Purpose)
     ]
     assert len(np.unique(np.concatenate(keys), axis=0)) == 64 * len(keys)
 
 
 @pytest.mark.parametrize("name", ALL_SETS)
-def test_sets_of_few_layouts(name):
+def test_only_sets_without_p_have_few_layouts(name):
     layout = layout_numbers(name, evaluation_tasks(name, 64))
     number = {"base": 1, "st": 1, "sy": 5, "stsy": 5}.get(name)
     assert (None if layout is None else len(set(layout.tolist()))) == number

@@ -236,19 +236,19 @@ def test_distances_are_those_of_brute_force_and_count_down_along_the_plan(
 ):
     found = workshop_distances
     expected = brute_force.graph(workshop)
-    assert found.num_reachable == len(expected.places)
+    assert found.num_reachable == len(expected.positions)
     assert found.from_start.dtype == found.to_goal.dtype == np.int16
-    place = np.stack(np.divmod(expected.places[:, [2, 1, 0]], 12), axis=-1).reshape(-1, 6).T
-    np.testing.assert_array_equal(found.from_start[tuple(place)], expected.from_start)
+    index = np.stack(np.divmod(expected.positions[:, [2, 1, 0]], 12), axis=-1).reshape(-1, 6).T
+    np.testing.assert_array_equal(found.from_start[tuple(index)], expected.from_start)
     to_goal = np.where(np.isinf(expected.to_goal), -1, expected.to_goal)
-    np.testing.assert_array_equal(found.to_goal[tuple(place)], to_goal)
+    np.testing.assert_array_equal(found.to_goal[tuple(index)], to_goal)
     assert np.count_nonzero(found.to_goal >= 0) == np.count_nonzero(to_goal >= 0)
     plan = tt.solve(workshop)
     left = [int(found.lookup(state)) for state in replay(workshop, plan)]
     assert left == list(range(plan.length, -1, -1))
 
 
-def test_refused_states():
+def test_states_without_a_future_are_refused():
     base = tt.base_state()
     solved = base.replace(agent=base.food, terminated=jnp.array(True))
     trapped = base.replace(agent=jnp.array([4, 4], jnp.int32))
