@@ -15,12 +15,13 @@ from agents.runs import checkpoint, report
 from agents.runs.display import ProgressLine
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
-from agents.runs.loading import read_policy, save
+from agents.runs.loading import StoredPolicy, read_policy, save
 from agents.runs.loggers import open_loggers
 from agents.runs.metrics import (
     Row,
     Table,
     append_rows,
+    check_row,
     evaluation_rows,
     is_last,
     read_rows,
@@ -223,7 +224,7 @@ def restore(
 ) -> tuple[TrainState | None, Row | None]:
     """Returns the newest checkpoint's state and row of metrics; None for what there is not yet.
 
-    Raises ValueError for a checkpoint of other settings.
+    Raises ValueError for a checkpoint of other settings, or without the values of its row.
     """
     if not checkpoint.iterations(folder.checkpoints):
         return None, None
@@ -231,6 +232,8 @@ def restore(
     done = row["iteration"]
     try:
         state = from_arrays(arrays, shapes)
+        if done:
+            check_row(row)
     except ValueError as error:
         raise ValueError(
             f"checkpoint {done} in {folder.checkpoints} cannot be continued: {error}"
@@ -305,7 +308,9 @@ def validation_rows(folder: RunFolder) -> Table:
 
 def best_iteration(folder: RunFolder) -> int | None:
     """Returns the iteration of the best policy so far; None if there is none."""
-    return read_arrays(folder.best)[1]["iteration"] if folder.best.is_file() else None
+    if not folder.best.is_file():
+        return None
+    return read_arrays(folder.best, StoredPolicy)[1]["iteration"]
 
 
 def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:

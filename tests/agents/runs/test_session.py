@@ -16,6 +16,7 @@ from rich.console import Console
 
 import agents
 from agents.acting.evaluation import Evaluation
+from agents.arrays import read_arrays, write_arrays
 from agents.ppo.learner import Learner
 from agents.runs import checkpoint, program, progress, session
 from agents.runs.folder import RunFolder
@@ -209,6 +210,17 @@ def make_a_file(path):
     path.touch()
 
 
+def forget(key):
+    """Returns a function that removes one of the plain values of a file of arrays."""
+
+    def damage(path):
+        arrays, about = read_arrays(path)
+        del about[key]
+        write_arrays(path, arrays, about)
+
+    return damage
+
+
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
     [
@@ -219,6 +231,12 @@ def make_a_file(path):
         ("evaluations.csv", remove, "evaluations.csv lacks the evaluation of iteration"),
         ("best.safetensors", remove, "best.safetensors is missing"),
         ("best.safetensors", make_a_file, "best.safetensors cannot be read"),
+        ("best.safetensors", forget("iteration"), "cannot be read: it lacks 'iteration'"),
+        (
+            "checkpoints/6.safetensors",
+            forget("seconds"),
+            "cannot be continued: it has no 'seconds'",
+        ),
     ],
 )
 @pytest.mark.parametrize("more", [0, 1])
