@@ -18,7 +18,7 @@ import agents
 from agents.acting.evaluation import Evaluation
 from agents.arrays import read_arrays, write_arrays
 from agents.ppo.learner import Learner
-from agents.runs import checkpoint, program, progress, session
+from agents.runs import checkpoint, history, program, progress, session
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
@@ -320,9 +320,9 @@ def test_the_best_policy_has_the_highest_mean_over_the_sets_in_common(own, earli
         for i, shares in enumerate((earlier, later))
         for name, share in shares.items()
     )
-    assert progress.is_better(found, 1, 0, own) == better
-    assert progress.is_better(found, 1, None, own)
-    assert not progress.is_better(found, 2, 0, own), "not evaluated"
+    assert history.is_better(found, 1, 0, own) == better
+    assert history.is_better(found, 1, None, own)
+    assert not history.is_better(found, 2, 0, own), "not evaluated"
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
