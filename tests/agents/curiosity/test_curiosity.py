@@ -67,7 +67,7 @@ def test_rnd_predicts_the_features_of_its_target():
     curiosity = make("rnd")
     board = jax.random.randint(jax.random.key(0), (3, 12, 12, 3), 0, 256).astype(jnp.uint8)
     params = jax.jit(curiosity.init)(jax.random.key(1), board)["params"]
-    target = make_encoder(small_config()).apply({"params": params["target"]}, board)
+    target: Any = make_encoder(small_config()).apply({"params": params["target"]}, board)
     constant = jax.tree.map(jnp.zeros_like, params["output"]) | {"bias": jnp.array([1.0, 2.0])}
     difference = curiosity.encode({"params": params | {"output": constant}}, board)
     np.testing.assert_allclose(difference, jnp.array([[1.0, 2.0]]) - target, rtol=1e-5)
