@@ -9,7 +9,7 @@ import pandas as pd
 import trap_tube_jax as tt
 from agents.command_line import option, parse
 from agents.runs import compilation
-from agents.runs.evaluator import Evaluator, own_and_paper_sets
+from agents.runs.evaluator import Evaluator, default_sets
 from agents.runs.loading import load
 from agents.runs.metrics import evaluation_rows, write_rows
 from agents.runs.report import save_first_solved
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     policy = load(options.source, iteration=options.iteration, imports=options.imports)
     config = policy.config
     tasks = config.eval_episodes if options.tasks is None else options.tasks
-    sets = options.sets or own_and_paper_sets(config)
+    sets = options.sets or default_sets(config)
     evaluator = Evaluator.of_sets(config, sets, tasks, options.purpose)
     # An unknown training set is refused before anything is played.
     train_set = tt.task_set(config.env_id).short if options.gif else ""

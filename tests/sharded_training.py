@@ -111,7 +111,7 @@ def shared_rows():
     axis = placement.axis
 
     def both(rows, key):
-        device_keys = jax.random.key_data(axis.own_key(key))[-1:]
+        device_keys = jax.random.key_data(axis.device_key(key))[-1:]
         return axis.gather(axis.part(rows)), axis.gather(device_keys)
 
     given = placement.put((jnp.arange(6), jax.random.key(0)))

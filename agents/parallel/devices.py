@@ -47,7 +47,7 @@ class EpisodeAxis:
         """Returns the rows [B] of all devices; inverts `part`."""
         return x if self.size == 1 else jax.lax.all_gather(x, EPISODES, axis=1).reshape(-1)
 
-    def own_key(self, key: jax.Array) -> jax.Array:
+    def device_key(self, key: jax.Array) -> jax.Array:
         """Derives this device's PRNG key."""
         return key if self.size == 1 else jax.random.fold_in(key, jax.lax.axis_index(EPISODES))
 
@@ -104,8 +104,8 @@ class Placement:
             return tree
         same = NamedSharding(self.mesh, PartitionSpec())
         # Unlike `device_put`, takes keys to the devices of several processes.
-        place = jax.make_array_from_callback
-        return jax.tree.map(lambda x: place(x.shape, same, lambda index: x[index]), tree)
+        make = jax.make_array_from_callback
+        return jax.tree.map(lambda x: make(x.shape, same, lambda index: x[index]), tree)
 
     def local(self, tree: Tree) -> Tree:
         """Returns one device's copy of arrays that are on all."""

@@ -33,7 +33,7 @@ def join(distributed: Sequence[str] | None) -> None:
 
 
 def max_over_processes(number: int | None) -> int | None:
-    """Returns the maximum over processes, None if all pass None or 0; each process must call it."""
+    """Returns the maximum over processes, None if all pass None or 0; every process calls it."""
     if jax.process_count() == 1:
         return number
     return int(np.max(multihost_utils.process_allgather(np.int32(number or 0)))) or None

@@ -158,7 +158,7 @@ class Learner:
         reset_key, action_key, update_key, key = jax.random.split(state.key, 4)
         reset_keys = self.draw_tasks(state.task_replay, reset_key)
         trajectory = self.play(
-            state.params, self.axis.part(reset_keys), self.axis.own_key(action_key)
+            state.params, self.axis.part(reset_keys), self.axis.device_key(action_key)
         )
         intrinsic_reward, memory = self.intrinsic_reward(state, trajectory)
         batch, reward_variance = self.make_batch(state, trajectory, intrinsic_reward)

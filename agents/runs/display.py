@@ -1,9 +1,17 @@
 """Shows a run's progress on one terminal line, and its results on a few lines."""
 
 import shlex
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 import trap_tube_jax as tt
 from agents.runs.folder import RunFolder
@@ -12,22 +20,37 @@ from agents.runs.run import Run
 
 
 class ProgressLine(Progress):
-    """Shows training: one line that changes on a terminal, else a line per iteration.
+    """Shows progress: one line that changes on a terminal, else a line per call of `write`.
 
     A context manager. Nothing is drawn in the background.
     """
 
-    def __init__(self, console: Console, iterations: int):
+    def __init__(self, console: Console, total: float, *columns: ProgressColumn, **options: Any):
         super().__init__(
             BarColumn(bar_width=12),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(compact=True),
+            *columns,
             TextColumn("{task.description}", markup=False),  # cut off on a narrow terminal
             console=console,
             auto_refresh=False,
             disable=not console.is_terminal,
+            **options,
         )
-        self.add_task("", total=iterations)
+        self.add_task("", total=total)
+
+    def write(self, done: float, text: str, head: str = "") -> None:
+        """Shows that `done` of the total is done; `head` begins a line that does not change."""
+        if self.console.is_terminal:
+            self.update(self.task_ids[0], completed=done, description=text, refresh=True)
+        else:
+            self.console.out(f"{head}{text}")
+
+
+class TrainingLine(ProgressLine):
+    """Shows the progress of one run."""
+
+    def __init__(self, console: Console, iterations: int):
+        columns = (MofNCompleteColumn(), TimeRemainingColumn(compact=True))
+        super().__init__(console, iterations, *columns)
 
     def show(self, row: Row) -> None:
         """Shows an iteration, given its row of metrics."""
@@ -36,11 +59,7 @@ class ProgressLine(Progress):
             f"{row['validation_success']:.1%} greedily, "
             f"{row['transitions_per_second']:,.0f} steps/s"
         )
-        done = row["iteration"]
-        if self.console.is_terminal:
-            self.update(self.task_ids[0], completed=done, description=text, refresh=True)
-        else:
-            self.console.out(f"iteration {done}: {text}")
+        self.write(row["iteration"], text, head=f"iteration {row['iteration']}: ")
 
 
 def summary(folder: RunFolder, run: Run) -> list[str]:

@@ -65,6 +65,6 @@ class Evaluator:
         return self.suite.scores(played, shortest=shortest)
 
 
-def own_and_paper_sets(config: Config) -> tuple[str, ...]:
+def default_sets(config: Config) -> tuple[str, ...]:
     """Returns the short names of the paper's eight sets and of the training set."""
     return tuple(dict.fromkeys((*ALL_SETS, tt.task_set(config.env_id).short)))

@@ -99,12 +99,14 @@ SCHEMAS = {  # by the name of the file
 
 
 def append_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Appends rows to a CSV file; begins a new file with a header.
+    """Appends rows, if any, to a CSV file; begins a new file with a header.
 
     Raises:
       ValueError: the rows have other columns than the file.
       OSError: the file cannot be written.
     """
+    if not rows:
+        return
     table = pd.DataFrame(rows)
     lines = table.to_csv(index=False, header=False)
     append_text(path, lines, head=table[:0].to_csv(index=False))
@@ -169,6 +171,14 @@ def _parsed(parse: Callable[[str], Any], value: str, name: str) -> Any:
         return parse(value)
     except ValueError as error:
         raise ValueError(f"{name} cannot be {value[:40]!r}: {error}") from error
+
+
+def check_row(row: Row) -> None:
+    """Raises ValueError unless a row of metrics has the values that training goes on from."""
+    for name, parse in METRICS.items():
+        if name not in row:
+            raise ValueError(f"it has no {name!r}")
+        _parsed(parse, str(row[name]), name)
 
 
 def rewind_rows(path: Path, iteration: int) -> None:

@@ -13,7 +13,7 @@ from agents.acting.evaluation import evaluate
 from agents.config import Config
 from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_learner
-from agents.runs.evaluator import Evaluator, own_and_paper_sets
+from agents.runs.evaluator import Evaluator, default_sets
 from agents.runs.run import RunOptions
 from trap_tube_jax.scoring.tasks import evaluation_tasks
 
@@ -44,7 +44,7 @@ class Program:
         self.options = options
         self.placement = Placement.of(options.devices, config)
         self.learner = make_learner(config, axis=self.placement.axis)
-        names = options.sets or own_and_paper_sets(config)
+        names = options.sets or default_sets(config)
         self.sets = tuple(tt.task_set(name).short for name in names)
         self.validation = None
         if options.evaluate_every:
@@ -82,7 +82,8 @@ class Cohort:
         self.placement = program.placement
         advance = make_advance(program.learner)
         if self.size == 1:
-            advance, self.states = self.placement.shard(advance), self.placement.put(states[0])
+            advance = self.placement.shard(advance)
+            self.states = self.placement.put(states[0])
         else:
             advance = jax.vmap(advance)
             self.states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)

@@ -1,31 +1,30 @@
 """The files and the progress of one run: rows, checkpoints, best policy, evaluations, report."""
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from rich.console import Console
 
 import trap_tube_jax as tt
 from agents.acting.policy import Policy
-from agents.arrays import from_arrays, read_arrays
 from agents.networks.agent import PARTS
 from agents.ppo.learner import TrainState
 from agents.runs import checkpoint, report
-from agents.runs.display import ProgressLine
+from agents.runs.display import TrainingLine
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
+from agents.runs.history import (
+    best_iteration,
+    check_best,
+    check_rows,
+    is_better,
+    restore,
+    validation_rows,
+)
 from agents.runs.loading import read_policy, save
 from agents.runs.loggers import open_loggers
-from agents.runs.metrics import (
-    Row,
-    Table,
-    append_rows,
-    evaluation_rows,
-    is_last,
-    read_rows,
-    rewind_rows,
-)
+from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read_rows, rewind_rows
 from agents.runs.program import Metrics, Program
 from agents.runs.provenance import note_provenance
 from agents.runs.run import Run
@@ -102,7 +101,7 @@ class Progress:
         note_provenance(self.folder.provenance, str(self.program.placement))
         chosen = {"tensorboard": options.tensorboard, "wandb": options.wandb}
         self._log = stack.enter_context(open_loggers(self.folder.path, self.run, **chosen))
-        self._line = stack.enter_context(ProgressLine(self.console, config.iterations))
+        self._line = stack.enter_context(TrainingLine(self.console, config.iterations))
         together = f", with {seeds - 1} other seed(s)" if seeds > 1 else ""
         self.console.out(
             f"{self.folder.path}: {tt.task_set(config.env_id).id}, curiosity {config.curiosity}, "
@@ -216,110 +215,3 @@ class Progress:
         params = {part: state.params[part] for part in PARTS}
         name = f"seed {self.run.seed}"
         return Policy(name, self.run.config, self.program.placement.local(params), self.iteration)
-
-
-def restore(
-    folder: RunFolder, iterations: int, shapes: TrainState
-) -> tuple[TrainState | None, Row | None]:
-    """Returns the newest checkpoint's state and row of metrics; None for what there is not yet.
-
-    Raises ValueError for a checkpoint of other settings.
-    """
-    if not checkpoint.iterations(folder.checkpoints):
-        return None, None
-    arrays, row = checkpoint.load(folder.checkpoints)
-    done = row["iteration"]
-    try:
-        state = from_arrays(arrays, shapes)
-    except ValueError as error:
-        raise ValueError(
-            f"checkpoint {done} in {folder.checkpoints} cannot be continued: {error}"
-        ) from error
-    if done > iterations:
-        raise ValueError(f"iterations must be at least {done}, which are done, got {iterations}")
-    return state, row if done else None
-
-
-def check_rows(folder: RunFolder, iteration: int) -> None:
-    """Raises ValueError unless a run's rows lead up to its newest checkpoint, at `iteration`.
-
-    Rows may go on after the checkpoint: training makes them again. Without a checkpoint it would
-    make all of them again, in the place of results that may be the only ones.
-    """
-    rows = read_rows(folder.metrics)
-    evaluated = read_rows(folder.evaluations)
-    if not checkpoint.iterations(folder.checkpoints):
-        if len(rows) or len(evaluated) or folder.checkpoints.is_file():
-            raise ValueError(
-                f"{folder.path} holds results, but no checkpoint to continue from; restore "
-                f"{folder.checkpoints}, or train under another --name"
-            )
-    elif max(rows["iteration"], default=0) < iteration:
-        raise ValueError(
-            f"{folder.metrics} ends before the checkpoint of iteration {iteration}; restore it, or "
-            "train under another --name"
-        )
-
-
-def has_ended(folder: RunFolder, run: Run) -> bool:
-    """Returns whether a run's files hold its last iteration and the test of its policy."""
-    try:
-        rows = read_rows(folder.metrics)
-        tested = set(read_rows(folder.evaluations).query("purpose == 'test'")["iteration"])
-        if not len(rows) or not is_last(rows.iloc[-1], run.config):
-            return False
-        return bool(tested & {rows["iteration"].iloc[-1], best_iteration(folder)})
-    except (KeyError, ValueError, OSError):  # damaged, or being removed
-        return False
-
-
-def check_best(folder: RunFolder, iteration: int, sets: Sequence[str]) -> None:
-    """Raises ValueError unless a run's best policy can be compared with those to come on `sets`."""
-    rows = validation_rows(folder)
-    best = best_iteration(folder)
-    if best is None:
-        if min(rows["iteration"], default=iteration) < iteration:
-            raise ValueError(
-                f"{folder.best} is missing, although {folder.evaluations} has evaluations; restore "
-                "it, or continue with --evaluate-every 0"
-            )
-        return
-    read_policy(folder.best)  # or damage would be noticed only at the end
-    known = rows[rows["iteration"] == best]["task_set"]
-    if best <= iteration and not len(known):
-        raise ValueError(
-            f"{folder.evaluations} lacks the evaluation of iteration {best}, whose policy is in "
-            f"{folder.best}; restore it, or continue with --evaluate-every 0"
-        )
-    if len(known) and not set(known) & set(sets):
-        raise ValueError(
-            f"--sets must include one of {', '.join(known)}, on which the best policy so far was "
-            f"evaluated; got {', '.join(sets)}"
-        )
-
-
-def validation_rows(folder: RunFolder) -> Table:
-    """Returns the evaluations that select the best policy."""
-    return read_rows(folder.evaluations).query("purpose == 'validation'")
-
-
-def best_iteration(folder: RunFolder) -> int | None:
-    """Returns the iteration of the best policy so far; None if there is none."""
-    return read_arrays(folder.best)[1]["iteration"] if folder.best.is_file() else None
-
-
-def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:
-    """Returns whether an evaluation is better than that of the best iteration so far.
-
-    Compares the mean fractions of validation tasks solved, over the task sets that both have. Base,
-    a single task, counts only if it is the training set or the only set.
-    """
-    solved = rows.assign(share=rows["solved"] / rows["tasks"]).pivot_table(
-        index="task_set", columns="iteration", values="share", aggfunc="last"
-    )
-    if iteration not in solved or best not in solved or iteration == best:
-        return iteration in solved and iteration != best
-    both = solved[[best, iteration]].dropna()
-    ranked = both if train_set == "base" else both.drop(index="base", errors="ignore")
-    means = (ranked if len(ranked) else both).mean()
-    return bool(means[iteration] > means[best])

@@ -175,7 +175,8 @@ def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
         length = int(outcome.length[index])
         # Padded to one length, so that all replays share a compiled program.
         longest = max(outcome.action.shape[1], len(shortest))
-        actions, plan = np.full((2, longest, 2), NO_DIRECTION)
+        actions = np.full((longest, 2), NO_DIRECTION)
+        plan = actions.copy()
         actions[:length] = outcome.action[index, :length]
         plan[: len(shortest)] = shortest
         episodes.append(

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from agents.ppo import machine
 from agents.runs.folder import RunFolder
-from agents.runs.progress import has_ended
+from agents.runs.history import has_ended
 from agents.runs.run import Run, RunOptions
 from agents.sweeps.overview import Overview
 from agents.sweeps.workers import (
@@ -27,34 +27,29 @@ Group = Mapping[Path, Run]
 LOST = "its worker, or the scheduler of the cluster, was lost"
 
 
-def group_runs(runs: Group, sizes: Mapping[Path, int]) -> list[dict[Path, Run]]:
-    """Groups runs that one program trains: seeds of the same settings, `sizes` at most."""
+def group_runs(
+    runs: Group, options: RunOptions, executor: Executor, size: int | None = None
+) -> list[dict[Path, Run]]:
+    """Groups runs that one program trains: seeds of the same settings.
+
+    `size` is the largest number of seeds in a program, by default as many as pay on the devices of
+    the executor's workers.
+    """
+    several = len({run.seed for run in runs.values()}) > 1 and (options.devices or 1) == 1
+    backend = backend_of(executor) if several and size is None else ""
     groups: list[dict[Path, Run]] = []
     for path, run in runs.items():
+        pays = several and (size or machine.seeds_share_programs(run.config, backend))
+        limit = (size or len(runs)) if pays else 1
         for group in groups:
             first = next(iter(group.values()))
             same = (first.config, first.algorithm) == (run.config, run.algorithm)
-            if same and len(group) < sizes[path]:
+            if same and len(group) < limit:
                 group[path] = run
                 break
         else:
             groups.append({path: run})
     return groups
-
-
-def program_sizes(
-    runs: Group, options: RunOptions, executor: Executor, size: int | None
-) -> dict[Path, int]:
-    """Returns the largest number of seeds in the program of every run, by default what pays."""
-    if len({run.seed for run in runs.values()}) == 1 or (options.devices or 1) > 1:
-        return dict.fromkeys(runs, 1)
-    if size is not None:
-        return dict.fromkeys(runs, size)
-    backend = backend_of(executor)
-    return {
-        path: len(runs) if machine.seeds_share_programs(run.config, backend) else 1
-        for path, run in runs.items()
-    }
 
 
 def launch(
@@ -107,7 +102,7 @@ def _call(group: Group, options: RunOptions, present: Launch) -> tuple:
 
 
 def _outcomes(call: Future, group: Group, stopped: bool) -> dict[Path, str]:
-    """Returns how the runs of a call ended: `done`, `stopped` or an error.
+    """Returns the outcomes of the runs of a call: `done`, `stopped` or an error.
 
     Of a call that was lost, and of one that says `done`, the runs' files have the last word.
     """

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
 
+from agents.runs.display import ProgressLine
 from agents.runs.folder import RunFolder
 from agents.runs.run import Run
 
@@ -17,23 +17,15 @@ REFRESH = 5  # seconds between two readings of the runs' files
 LINE = 60  # seconds between two lines where there is no terminal
 
 
-class Overview(Progress):
+class Overview(ProgressLine):
     """Shows the share of all iterations that are done, and the time left.
 
-    A context manager. Reads the runs' files; nothing is drawn in the background.
+    Reads the runs' files.
     """
 
     def __init__(self, console: Console, runs: Mapping[Path, Run]):
-        super().__init__(
-            BarColumn(bar_width=12),
-            TextColumn("{task.description}", markup=False),
-            console=console,
-            auto_refresh=False,
-            transient=True,
-            disable=not console.is_terminal,
-        )
+        super().__init__(console, 1, transient=True)
         self.runs = runs
-        self.add_task("", total=1)
         self.began = self.shown = time.monotonic()
         self.share_before = self._share()
 
@@ -52,10 +44,7 @@ class Overview(Progress):
         self.shown = time.monotonic()
         share = self._share()
         text = f"{share:.0%} of {len(self.runs)} run(s), {self._time_left(share)}"
-        if self.console.is_terminal:
-            self.update(self.task_ids[0], completed=share, description=text, refresh=True)
-        else:
-            self.console.out(text)
+        self.write(share, text)
 
     def _share(self) -> float:
         """Returns the mean share of the iterations that runs may take, which is from 0 to 1."""

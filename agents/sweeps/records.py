@@ -13,8 +13,8 @@ from typing import NotRequired, TypedDict
 import agents
 from agents.files import is_file, read_json, write_bytes, write_json
 from agents.runs.folder import RunFolder, Settings, check_name
+from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
-from agents.runs.progress import has_ended
 from agents.runs.provenance import Machine, read_provenance
 from agents.runs.results import find_runs, metrics
 from agents.sweeps import figures, tables

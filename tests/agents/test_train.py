@@ -186,6 +186,14 @@ def test_a_run_is_not_overwritten(capsys, whole):
     assert "env_id=TrapTube-v0, not SymbolicTrapTube-v0" in message
 
 
+def test_a_run_is_continued_from_within_its_folder(whole, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(shutil.copytree(whole[0], tmp_path / "x"))
+    (tmp_path / "x" / "report.html").unlink()  # it is made again
+    main(["--resume", ".", "--report"])
+    assert "--resume . --iterations" in capsys.readouterr().out
+    assert "<title>x" in (tmp_path / "x" / "report.html").read_text()
+
+
 def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
     folder = RunFolder(tmp_path / "foreign")
     folder.note(Run(Config()))

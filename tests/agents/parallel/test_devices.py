@@ -39,7 +39,7 @@ def test_one_device_computes_as_it_is_told():
     alone, x = Placement(), jnp.arange(3)
     assert alone.shard(print) is print
     assert alone.put(x) is alone.local(x) is x
-    for method in (ONE_DEVICE.mean, ONE_DEVICE.part, ONE_DEVICE.gather, ONE_DEVICE.own_key):
+    for method in (ONE_DEVICE.mean, ONE_DEVICE.part, ONE_DEVICE.gather, ONE_DEVICE.device_key):
         assert method(x) is x
     assert str(alone) == "cpu"
 

@@ -11,7 +11,7 @@ import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.acting.evaluation import Evaluation
 from agents.ppo.learner import Learner
-from agents.runs.evaluator import Evaluator, own_and_paper_sets
+from agents.runs.evaluator import Evaluator, default_sets
 from easy import assert_same
 from tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
 from trap_tube_jax.registry import PAPER_TASK_SETS
@@ -81,8 +81,8 @@ def test_scores_use_the_papers_notation():
 def test_a_set_of_your_own_is_evaluated_after_the_papers(own_task_sets):
     tt.register("Own-v0", (), short="own")
     papers = tuple(entry.short for entry in PAPER_TASK_SETS)
-    assert own_and_paper_sets(Config(env_id="own")) == (*papers, "own")
-    assert own_and_paper_sets(Config(env_id="pst")) == papers
+    assert default_sets(Config(env_id="own")) == (*papers, "own")
+    assert default_sets(Config(env_id="pst")) == papers
 
 
 def test_values_of_states_are_of_the_extrinsic_head():

@@ -74,6 +74,13 @@ def test_a_folder_holds_a_run_and_its_options(tmp_path):
     assert_refused(["none holds no run; runs in", "x"], RunFolder(tmp_path / "none").read)
 
 
+def test_a_folder_has_its_title_however_its_path_is_given(tmp_path, monkeypatch):
+    (tmp_path / "x" / "y").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "x")
+    for path in (".", "../x", "y/..", tmp_path / "x"):
+        assert RunFolder(path).title == "x"
+
+
 def test_a_second_writer_is_refused(tmp_path):
     with RunFolder(tmp_path / "x").lock():
         words = [f"{tmp_path}/x is being written by another process"]

@@ -158,7 +158,7 @@ def test_a_solved_episode_becomes_a_gif(played, tmp_path):
 def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is_terminal):
     file = io.StringIO()
     console = Console(file=file, force_terminal=is_terminal, width=100)
-    with display.ProgressLine(console, 5) as progress:
+    with display.TrainingLine(console, 5) as progress:
         for iteration in (1, 2):
             progress.show(row(iteration))
     text = file.getvalue()

@@ -16,8 +16,9 @@ from rich.console import Console
 
 import agents
 from agents.acting.evaluation import Evaluation
+from agents.arrays import read_arrays, write_arrays
 from agents.ppo.learner import Learner
-from agents.runs import checkpoint, program, progress, session
+from agents.runs import checkpoint, history, program, progress, session
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
@@ -209,6 +210,17 @@ def make_a_file(path):
     path.touch()
 
 
+def forget(key):
+    """Returns a function that removes one of the plain values of a file of arrays."""
+
+    def damage(path):
+        arrays, about = read_arrays(path)
+        del about[key]
+        write_arrays(path, arrays, about)
+
+    return damage
+
+
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
     [
@@ -219,6 +231,12 @@ def make_a_file(path):
         ("evaluations.csv", remove, "evaluations.csv lacks the evaluation of iteration"),
         ("best.safetensors", remove, "best.safetensors is missing"),
         ("best.safetensors", make_a_file, "best.safetensors cannot be read"),
+        ("best.safetensors", forget("iteration"), "cannot be read: it lacks 'iteration'"),
+        (
+            "checkpoints/6.safetensors",
+            forget("seconds"),
+            "cannot be continued: it has no 'seconds'",
+        ),
     ],
 )
 @pytest.mark.parametrize("more", [0, 1])
@@ -302,9 +320,9 @@ def test_the_best_policy_has_the_highest_mean_over_the_sets_in_common(own, earli
         for i, shares in enumerate((earlier, later))
         for name, share in shares.items()
     )
-    assert progress.is_better(found, 1, 0, own) == better
-    assert progress.is_better(found, 1, None, own)
-    assert not progress.is_better(found, 2, 0, own), "not evaluated"
+    assert history.is_better(found, 1, 0, own) == better
+    assert history.is_better(found, 1, None, own)
+    assert not history.is_better(found, 2, 0, own), "not evaluated"
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
