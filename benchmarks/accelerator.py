@@ -23,7 +23,7 @@ MEASUREMENTS: dict[str, str] = {
     "gpu_fast": "seeds --preset fast --seeds 1 8",
     "gpu_best_first_start": "seeds --preset best --seeds 8 --cache",
     "gpu_best_second_start": "seeds --preset best --seeds 8 --cache",
-    "gpu_rejax": "learner_peers --sets base --networks dense",
+    "gpu_rejax": "learner_peers --sets base --networks dense feedforward",
     "gpu_peers": "peers --num-envs 4096 65536 524288",
 }
 # The same on the smallest scale, to try the command on a CPU.

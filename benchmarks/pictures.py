@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+import agents
 import trap_tube_jax as tt
 from agents.sweeps import figures, tables
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.scoring.tasks import label
+from trap_tube_jax.state import take
 
 with needs_extra("pictures"):
     import matplotlib as mpl
@@ -63,6 +65,11 @@ ROWS = (  # of the figure of Table 2
     "PPO, ours",
     "PPO, published",
 )
+GIFS = {  # by file: a shipped agent, a task set and the number of its evaluation task
+    "solved_base": ("fast-base", "base", 0),
+    "solved_sy": ("best-pstsy", "sy", 0),
+    "solved_pst": ("best-pstsy", "pst", 0),
+}
 SHOWN = slice(2 * CELL, 11 * CELL), slice(0, 10 * CELL)  # of the board, in the six steps
 
 
@@ -168,6 +175,31 @@ def _show(axis: Any, picture: np.ndarray) -> None:
     axis.set(xticks=[], yticks=[])
 
 
+def draw_episode(agent: str, name: str, task: int) -> np.ndarray:
+    """Draws the episode that a shipped agent plays, u8[T + 1, 288, 288, 3]."""
+    env = tt.make(name)
+    policy = agents.load(agent)
+    step = jax.jit(env.step)
+    act = jax.jit(policy.act)
+    first = take(tt.evaluation_tasks(name, task + 1), task)
+    state = first
+    carry = policy.initial(1)
+    actions = []
+    while not state.done:
+        action, carry = act(tt.observe(state)[None], carry)
+        state, _ = step(state, action[0])
+        actions.append(action[0])
+    return tt.episode_frames(_recolored(first), jnp.stack(actions), 24)
+
+
+def _recolored(state: tt.State) -> tt.State:
+    """Returns a state in colours of `PALETTE`, unless its task drew other colours."""
+    is_color = (np.asarray(state.palette)[:, None] == tt.base_palette()).all(axis=-1)
+    if not is_color.any(axis=1).all():
+        return state
+    return state.replace(palette=PALETTE[is_color.argmax(axis=1)])
+
+
 PICTURES = {"board": draw_board, "symbolic": draw_symbolic, "table2": draw_table_2}
 
 
@@ -183,6 +215,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name, draw in PICTURES.items():
             draw().savefig(options.output / f"{name}.png", dpi=DPI)
             print(options.output / f"{name}.png")
+        for name, episode in GIFS.items():
+            tt.save_gif(draw_episode(*episode), options.output / f"{name}.gif", fps=4)
+            print(options.output / f"{name}.gif")
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.objects import NUM_OBJECTS, OBJECT_NAMES
 from trap_tube_jax.observation import visible_objects
 from trap_tube_jax.registry import PAPER_TASK_SETS, TaskSet, make, task_set
-from trap_tube_jax.rendering import render
-from trap_tube_jax.state import base_state
+from trap_tube_jax.rendering import render, used_window
+from trap_tube_jax.state import base_state, take
 from trap_tube_jax.transfers import (
     Transfer,
     perceptual,
@@ -29,7 +29,7 @@ from trap_tube_jax.transfers import (
 CHANGES: dict[Transfer, str] = {
     perceptual: "layout",
     structural: "colours",
-    symbolic: "role of the tool",
+    symbolic: "tool",
 }
 DRAWS = 64  # tasks of which the first distinct ones are shown
 CELL_SIZE = 16  # pixels
@@ -64,8 +64,8 @@ def save_gallery(
         from matplotlib.figure import Figure  # noqa: PLC0415  importing stays light
 
     rows = -(-len(entries) // 2)
-    figure = Figure(figsize=(2.8 * tasks + 1, 2 * rows + 0.7), layout="constrained")
-    parts: Any = figure.subfigures(2, 1, height_ratios=(2 * rows, 0.7))
+    figure = Figure(figsize=(2.8 * tasks + 1, 1.8 * rows + 0.7), layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=(1.8 * rows, 0.7))
     sets, legend = parts
     for panel, entry in zip(sets.subfigures(rows, 2, squeeze=False).flat, entries, strict=False):
         panel.suptitle(_title(entry), x=0.02, ha="left")
@@ -74,7 +74,7 @@ def save_gallery(
     _draw(axes, _signs())
     for axis, name in zip(axes, OBJECT_NAMES, strict=True):
         axis.set_title(name, size="medium")
-    figure.savefig(path, format="png", dpi=130)
+    figure.savefig(path, format="png", dpi=160)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -98,7 +98,7 @@ def _title(entry: TaskSet) -> str:
     changes = ", ".join(
         CHANGES.get(transfer, transfer_name(transfer)) for transfer in entry.transfers
     )
-    return f"{entry.id}\n{entry.label}: {f'changes {changes}' if changes else 'the base task'}"
+    return f"{entry.label}: {changes}" if changes else entry.label
 
 
 def _draw(axes: np.ndarray, pictures: np.ndarray) -> None:
@@ -109,12 +109,17 @@ def _draw(axes: np.ndarray, pictures: np.ndarray) -> None:
 
 
 def _distinct_tasks(entry: TaskSet, tasks: int, seed: int) -> np.ndarray:
-    """Draws the first K <= `tasks` distinct tasks among `DRAWS`, u8[K, 12 s, 12 s, 3]."""
+    """Draws the first K <= `tasks` distinct tasks among `DRAWS`, u8[K, height, width, 3].
+
+    Leaves out rows and columns without objects.
+    """
     keys = jax.random.split(jax.random.key(seed), DRAWS)
     states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
     pictures = np.asarray(jax.vmap(lambda state: render(state, CELL_SIZE))(states))
     _, first = np.unique(pictures.reshape(DRAWS, -1), axis=0, return_index=True)
-    return pictures[np.sort(first)[:tasks]]
+    shown = np.sort(first)[:tasks]
+    rows, columns = used_window(take(states, shown), CELL_SIZE)
+    return pictures[shown, rows, columns]
 
 
 def _signs() -> np.ndarray:

@@ -27,6 +27,7 @@ from trap_tube_jax.objects import (
     BOARD_SIZE,
     EXIT,
     FOOD,
+    GROUND,
     LUMA,
     NO_DIRECTION,
     NUM_DIRECTIONS,
@@ -85,6 +86,20 @@ def render(
     check_state(state)
     cell_size = check_integer("cell_size", cell_size)
     return _render(state, grasp, cell_size=cell_size, grid=bool(grid))
+
+
+def used_window(states: State, cell_size: int) -> tuple[slice, slice]:
+    """Returns the part of pictures of B states that shows their objects, with a margin of a cell.
+
+    The slices are of the rows and columns of pixels that `render` draws with `cell_size`.
+    """
+    is_used = np.asarray(jax.vmap(visible_objects)(states)) != GROUND
+
+    def part(along: np.ndarray) -> slice:
+        cells = np.flatnonzero(along)
+        return slice(max(cells[0] - 1, 0) * cell_size, (cells[-1] + 2) * cell_size)
+
+    return part(is_used.any(axis=(0, 2))), part(is_used.any(axis=(0, 1)))
 
 
 def rgb(features: jax.Array) -> jax.Array:

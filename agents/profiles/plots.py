@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from agents.files import write_bytes
@@ -10,8 +11,7 @@ from agents.profiles.measure import Table
 from agents.profiles.tasks import control_layouts
 from agents.runs.drawing import drawing, to_png
 from agents.sweeps.figures import COLORS, WIDTH, make_panels
-from trap_tube_jax.objects import GROUND
-from trap_tube_jax.rendering import render
+from trap_tube_jax.rendering import render, used_window
 from trap_tube_jax.scoring.scores import wilson_interval
 from trap_tube_jax.state import State
 
@@ -97,14 +97,8 @@ def _draw_percentages(axis: Any, groups: Table, names: list[str]) -> None:
 
 def _cropped(state: State) -> np.ndarray:
     """Renders the rows and columns that hold objects, with a margin of one cell."""
-    is_used = np.asarray(state.board) != GROUND
-    for cell in (state.agent, state.food, state.tool, state.tool + state.tool_extent - 1):
-        is_used[tuple(np.asarray(cell))] = True
-    rows, columns = np.nonzero(is_used)
-    top = max(rows.min() - 1, 0)
-    left = max(columns.min() - 1, 0)
-    picture = np.asarray(render(state, CELL))
-    return picture[top * CELL : (rows.max() + 2) * CELL, left * CELL : (columns.max() + 2) * CELL]
+    batch = jax.tree.map(lambda x: np.asarray(x)[None], state)
+    return np.asarray(render(state, CELL))[used_window(batch, CELL)]
 
 
 def _margins(groups: Table) -> np.ndarray:

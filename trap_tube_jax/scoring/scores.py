@@ -174,6 +174,8 @@ class Scores:
             heads += ["of solvable %", "optimality"]
         rows = [heads, *(_cells(score)[: len(heads)] for score in self.sets)]
         end = f"Protocol {self.protocol}, trap-tube-jax {self.version}."
+        if any(score.layouts for score in self.sets):
+            end = f"A layout counts as solved if more than half of its draws are solved.\n{end}"
         return f"{markdown_table(rows)}\n\n{end}"
 
 

@@ -63,6 +63,16 @@ def test_an_episodes_reward_does_not_depend_on_other_episodes(name):
     assert np.std(whole) > 0
 
 
+def test_rnd_predicts_the_features_of_its_target():
+    curiosity = make("rnd")
+    board = jax.random.randint(jax.random.key(0), (3, 12, 12, 3), 0, 256).astype(jnp.uint8)
+    params = jax.jit(curiosity.init)(jax.random.key(1), board)["params"]
+    target: Any = make_encoder(small_config()).apply({"params": params["target"]}, board)
+    constant = jax.tree.map(jnp.zeros_like, params["output"]) | {"bias": jnp.array([1.0, 2.0])}
+    difference = curiosity.encode({"params": params | {"output": constant}}, board)
+    np.testing.assert_allclose(difference, jnp.array([[1.0, 2.0]]) - target, rtol=1e-5)
+
+
 def test_rnd_trains_the_predictor_alone():
     curiosity = make("rnd")
     board = jax.random.randint(jax.random.key(0), (3, 12, 12, 3), 0, 256).astype(jnp.uint8)

@@ -239,6 +239,7 @@ def test_scores_are_records(scores):
     assert lines[0].startswith("| set ")
     assert re.search(rf" {scores['near'].solved} \| +{scores['near'].percent:.1f} \|", lines[2])
     assert " 0 of 1 |" in lines[3]
+    assert "layout counts as solved" in lines[-2]
     assert lines[-1] == f"Protocol {PROTOCOL}, trap-tube-jax {tt.__version__}."
     assert list(scores) == ["near", "base"]
     assert "near" in scores
