@@ -1,17 +1,15 @@
 """Figures of a profile, 830 pixels wide as pages show them."""
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
+from agents.files import write_bytes
 from agents.profiles.measure import Table
 from agents.profiles.tasks import control_layouts
+from agents.runs.drawing import drawing, to_png
 from agents.sweeps.figures import COLORS, WIDTH, make_panels
 from trap_tube_jax.rendering import render, used_window
 from trap_tube_jax.scoring.scores import wilson_interval
@@ -36,7 +34,7 @@ def save_success(profile: Table, path: Path) -> None:
     """
     parts = [part for part in PANELS if part in set(profile["part"])]
     policies = list(profile["policy"].unique())
-    with _plain_style():
+    with drawing(path):
         titles = [PANELS[part][0] for part in parts]
         figure, axes = make_panels(titles, min(len(parts), 2), 2.9, sharex=False)
         for axis, part in zip(axes, parts, strict=True):
@@ -53,7 +51,7 @@ def save_success(profile: Table, path: Path) -> None:
             axis.set(xlabel=PANELS[part][1], ylim=(0, 100))
         figure.supylabel("solved, %", fontsize=10)
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        figure.savefig(path, format="png")
+        write_bytes(path, to_png(figure, dpi=100))
 
 
 def save_controls(profile: Table, path: Path) -> None:
@@ -66,7 +64,9 @@ def save_controls(profile: Table, path: Path) -> None:
     policies = list(rows["policy"].unique())
     lines = -(-len(layouts) // COLUMNS)
     height = 0.22 * len(policies) + 0.1
-    with _plain_style():
+    with drawing(path):
+        from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+
         figure = Figure(figsize=(WIDTH, lines * (height + 1.75)), layout="constrained")
         axes = figure.subplots(2 * lines, COLUMNS, height_ratios=lines * [1.4, height])
         boards = axes[::2].flatten()
@@ -78,7 +78,7 @@ def save_controls(profile: Table, path: Path) -> None:
             boards[index].set_title(level.replace(", ", ",\n"), fontsize="small")
             names = policies if index % COLUMNS == 0 else []
             _draw_percentages(cells[index], rows[rows["level"] == level], names)
-        figure.savefig(path, format="png")
+        write_bytes(path, to_png(figure, dpi=100))
 
 
 def _draw_percentages(axis: Any, groups: Table, names: list[str]) -> None:
@@ -111,10 +111,3 @@ def _margins(groups: Table) -> np.ndarray:
         for solved, tasks in zip(groups["solved"], groups["tasks"], strict=True)
     ]
     return 100 * np.abs(np.transpose(ends) - (groups["solved"] / groups["tasks"]).to_numpy())
-
-
-@contextlib.contextmanager
-def _plain_style() -> Iterator[None]:
-    """Draws under Matplotlib's defaults, and takes names of files with `$` for plain text."""
-    with mpl.rc_context({**mpl.rcParamsDefault, "text.parse_math": False}):
-        yield

@@ -210,3 +210,14 @@ def test_what_others_have_written_is_plain_text(tmp_path):
     assert r"\<b\>\[x\](y)\`" in text
     folder.path.rename(tmp_path / "=1+1")
     assert_refused(["got '=1+1'"], records.collect, tmp_path, [])
+
+
+def test_a_figure_that_fails_costs_a_line(tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise RuntimeError("no font")
+
+    monkeypatch.setattr(figures, "draw_success", fail)
+    (path,) = figures.save(tmp_path, pd.DataFrame(rows("ppo", [3])), curves(), ABOUT)
+    assert path.name == "curves.png"
+    warning = f"warning: {tmp_path / 'success.png'} was not drawn: no font\n"
+    assert capsys.readouterr().err == warning
