@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from paths import ROOT
+from helpers.paths import ROOT
 
 READ_ONLY = "/proc/self"  # a home in which nobody can write
 

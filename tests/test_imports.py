@@ -11,7 +11,7 @@ import sys
 import tomllib
 
 import trap_tube_jax as tt
-from paths import ROOT
+from helpers.paths import ROOT
 
 # Lower rooms never import higher ones. Modules of a package itself are rooms of their own.
 ENVIRONMENT = (

@@ -18,8 +18,8 @@ import pytest
 from scipy import stats
 
 from agents.sweeps import tables
-from paths import ROOT
-from settings import HAS_DEFAULT_DRAWS
+from helpers.jax_settings import HAS_DEFAULT_DRAWS
+from helpers.paths import ROOT
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
 PAGES = [*ROOT.glob("*.md")]

@@ -14,7 +14,7 @@ import pytest
 
 import agents
 import trap_tube_jax as tt
-from settings import HAS_DEFAULT_DRAWS
+from helpers.jax_settings import HAS_DEFAULT_DRAWS
 
 NAMES = {"jax": jax, "jnp": jnp, "np": np, "tt": tt, "agents": agents}
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE

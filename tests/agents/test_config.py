@@ -10,7 +10,7 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.config import PRESETS
-from refusal import assert_refused
+from helpers.refusal import assert_refused
 
 
 @pytest.mark.parametrize("name", PRESETS)

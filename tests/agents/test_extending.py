@@ -18,10 +18,10 @@ from agents.files import read_json
 from agents.runs.folder import RunFolder
 from agents.runs.run import Run, RunOptions
 from agents.train import main
-from paths import ROOT
-from refusal import assert_refused, refused
-from settings import HAS_DEFAULT_DRAWS
-from small_runs import final_state, options, small_config, untimed
+from helpers.jax_settings import HAS_DEFAULT_DRAWS
+from helpers.paths import ROOT
+from helpers.refusal import assert_refused, refused
+from helpers.small_runs import final_state, options, small_config, untimed
 from trap_tube_jax.imports import import_modules
 
 PAGE = (ROOT / "agents" / "extending.md").read_text()

@@ -5,9 +5,9 @@ import signal
 
 import pytest
 
-import small_runs
 from agents.runs.loading import save
-from tiny_policy import random_policy
+from helpers import small_runs
+from helpers.tiny_policy import random_policy
 
 ENDLESS = [*small_runs.options(), "--iterations", 1_000_000, "--sets", "base"]
 SHORT = [*small_runs.options(), "--iterations", 1]

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import probes
 from agents import Config, make_learner
 from agents.acting.rollout import Trajectory, rollout
 from agents.networks.core import Core
+from helpers import probes
 
 DISCOUNT, ITERATIONS = 0.5, 100
 CONFIG = Config(

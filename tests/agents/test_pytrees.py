@@ -10,9 +10,9 @@ import pytest
 
 import trap_tube_jax as tt
 from agents import make_learner
-from easy import assert_same, rows
-from small_runs import small_config
-from tiny_policy import food_next_to_agent, random_policy
+from helpers.small_runs import small_config
+from helpers.tiny_policy import food_next_to_agent, random_policy
+from helpers.trees import assert_same, rows
 
 BATCH = 4
 OBJECTS = {

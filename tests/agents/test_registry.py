@@ -5,7 +5,7 @@ import pytest
 from agents import Config
 from agents.curiosity import Curiosity, register
 from agents.registry import Registry, curiosities
-from refusal import assert_refused
+from helpers.refusal import assert_refused
 
 
 def test_a_name_of_yours_is_allowed_and_may_be_registered_again(own_names):

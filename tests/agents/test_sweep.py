@@ -13,7 +13,6 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-import small_runs
 from agents import experiments, sweep
 from agents.config import Config
 from agents.runs.folder import RunFolder
@@ -22,8 +21,9 @@ from agents.runs.run import Run, RunOptions
 from agents.sweeps import launcher, overview, workers
 from agents.sweeps.grids import GRIDS, Grid, Options
 from agents.sweeps.launcher import launch
-from paths import ROOT
-from refusal import refused
+from helpers import small_runs
+from helpers.paths import ROOT
+from helpers.refusal import refused
 from trap_tube_jax.interruptions import Stopped
 
 SETTINGS = [

@@ -19,9 +19,9 @@ from agents.runs.loading import save
 from agents.runs.provenance import commit
 from agents.runs.run import Run, RunOptions
 from agents.train import Options, main, parse, run_path
-from refusal import refused
-from small_runs import final_state, options, read_iterations, run, start, untimed
-from tiny_policy import random_policy
+from helpers.refusal import refused
+from helpers.small_runs import final_state, options, read_iterations, run, start, untimed
+from helpers.tiny_policy import random_policy
 from trap_tube_jax import interruptions
 
 ITERATIONS = 30

@@ -13,7 +13,7 @@ import pytest
 
 from agents.command_line import parse
 from benchmarks import env_throughput, harness, learner_peers, peers, seeds, train_throughput
-from paths import ROOT
+from helpers.paths import ROOT
 
 TIMING = harness.Timing(compile_s=7.0, median_s=2.0, fastest_s=1.0, slowest_s=3.0)
 RESULTS = ROOT / "benchmarks" / "results"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same, rows
-from settings import needs_threefry
+from helpers.jax_settings import needs_threefry
+from helpers.trees import assert_same, rows
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 SIZE = 20

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import COPIES, EASY
+from helpers.easy_task import EASY
+from helpers.trees import COPIES
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.controls import CONTROLS, LayoutDraw
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 import trap_tube_jax as tt
-from easy import rows
+from helpers.trees import rows
 from trap_tube_jax.controls import CONTROLS, LayoutDraw, food_outside, with_every_start
 from trap_tube_jax.solver.search import replay
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import spec_reference as spec
+import helpers.spec_reference as spec
 import trap_tube_jax as tt
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS, swap_with_tool
 

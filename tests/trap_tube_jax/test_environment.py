@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import DOWN, EASY, RIGHT, assert_same, enable_x64, rows
-from refusal import assert_refused
+from helpers.easy_task import DOWN, EASY, RIGHT
+from helpers.jax_settings import enable_x64
+from helpers.refusal import assert_refused
+from helpers.trees import assert_same, rows
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 OPTIMISED = False  # few steps

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import trap_tube_jax as tt
-from refusal import refused
+from helpers.refusal import refused
 from trap_tube_jax import gallery
 from trap_tube_jax.objects import OBJECT_NAMES
 

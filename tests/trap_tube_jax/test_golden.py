@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import spec_reference as spec
+import helpers.spec_reference as spec
 import trap_tube_jax as tt
-from paths import DATA
+from helpers.paths import DATA
 
 RECORDING = DATA / "reference_traces.npz"
 EPISODES = 1960

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import spec_reference as spec
+import helpers.spec_reference as spec
 import trap_tube_jax as tt
-from goodness_of_fit import assert_fits
-from paths import ROOT
-from refusal import assert_refused
-from samples import BOARDS, OUTLINES, Layout, draw, read_layouts, tally
+from helpers.goodness_of_fit import assert_fits
+from helpers.paths import ROOT
+from helpers.refusal import assert_refused
+from helpers.samples import BOARDS, OUTLINES, Layout, draw, read_layouts, tally
 from trap_tube_jax.graded import near_layouts, points_between
 
 DRAWS = 2**15

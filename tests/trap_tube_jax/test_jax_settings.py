@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same, bits, enable_x64
+from helpers.jax_settings import enable_x64
+from helpers.trees import assert_same, bits
 
 OPTIMISED = False  # few steps
 

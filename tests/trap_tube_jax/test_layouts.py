@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents import Config
-from paths import ROOT
+from helpers.paths import ROOT
 from trap_tube_jax.layouts import NUM_ASSIGNMENTS, NUM_OUTLINES, layout_tables
 from trap_tube_jax.objects import TUBE1, TUBE2
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS

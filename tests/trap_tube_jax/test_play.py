@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import pytest
 
 import trap_tube_jax as tt
-from refusal import refused
+from helpers.refusal import refused
 from trap_tube_jax import play
 
 UP = "\x1b[A"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same, rows
-from refusal import assert_refused
+from helpers.refusal import assert_refused
+from helpers.trees import assert_same, rows
 from trap_tube_jax.prng import typed_key
 
 OPTIMISED = False  # few draws

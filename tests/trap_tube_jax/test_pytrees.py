@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import EASY, assert_same, bits, rows
+from helpers.easy_task import EASY
+from helpers.trees import assert_same, bits, rows
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 OPTIMISED = False  # few steps

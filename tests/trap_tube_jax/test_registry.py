@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from refusal import assert_refused
+from helpers.refusal import assert_refused
 from trap_tube_jax import play
 from trap_tube_jax.state import take
 

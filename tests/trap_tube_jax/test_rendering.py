@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
-from refusal import assert_refused
+from helpers.refusal import assert_refused
 from trap_tube_jax import objects, rendering
 
 CELL = 16

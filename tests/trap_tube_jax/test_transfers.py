@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import spec_reference as spec
+import helpers.spec_reference as spec
 import trap_tube_jax as tt
-from goodness_of_fit import assert_fits
-from samples import SAMPLES, Layout, draw, flat, read_layouts, tally
+from helpers.goodness_of_fit import assert_fits
+from helpers.samples import SAMPLES, Layout, draw, flat, read_layouts, tally
 
 SWAPPED = (spec.TOOL, spec.TUBE1, spec.TUBE2, spec.TRAP, spec.EXIT)
 # Every object in a colour of its own, the tubes too.

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same
-from refusal import assert_refused
+from helpers.refusal import assert_refused
+from helpers.trees import assert_same
 from trap_tube_jax.vector import draw_movable, draw_static
 
 OPTIMISED = False  # few environments, few steps

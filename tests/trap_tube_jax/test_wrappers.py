@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import DOWN, EASY, RIGHT, assert_same, rows
-from refusal import assert_refused
+from helpers.easy_task import DOWN, EASY, RIGHT
+from helpers.refusal import assert_refused
+from helpers.trees import assert_same, rows
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 LIMIT = 6

@@ -8,8 +8,8 @@ import pytest
 import trap_tube_jax as tt
 from agents.networks.agent import Agent
 from agents.runs.evaluator import Evaluator
-from easy import COPIES, assert_same
-from tiny_policy import CONFIG, FOOD_CELLS, STEPS, food_next_to_agent, random_policy
+from helpers.tiny_policy import CONFIG, FOOD_CELLS, STEPS, food_next_to_agent, random_policy
+from helpers.trees import COPIES, assert_same
 from trap_tube_jax.scoring import Suite, evaluation_tasks
 
 

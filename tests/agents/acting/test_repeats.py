@@ -7,7 +7,7 @@ import numpy as np
 import trap_tube_jax as tt
 from agents.acting.repeats import MEMORY, Repeats
 from agents.networks.actions import ActionDistribution
-from tiny_policy import STEPS, food_next_to_agent, random_policy
+from helpers.tiny_policy import STEPS, food_next_to_agent, random_policy
 
 
 def test_an_action_is_avoided_where_it_was_taken_until_it_is_forgotten():

@@ -11,7 +11,7 @@ import trap_tube_jax as tt
 from agents.acting.rollout import rollout
 from agents.networks.actions import ActionDistribution
 from agents.networks.agent import Agent
-from small_runs import small_config
+from helpers.small_runs import small_config
 
 CONFIG = small_config(env_id="psy", episodes_per_iteration=12)
 

@@ -14,8 +14,8 @@ from agents.acting.episodes import Episodes
 from agents.curiosity import Curiosity, Experience
 from agents.networks import make_encoder
 from agents.registry import curiosities
-from easy import COPIES
-from small_runs import small_config
+from helpers.small_runs import small_config
+from helpers.trees import COPIES
 
 BOARD = jnp.zeros((1, 12, 12, 3), jnp.uint8)
 

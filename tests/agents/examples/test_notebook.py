@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from paths import ROOT
+from helpers.paths import ROOT
 
 NOTEBOOK = ROOT / "agents" / "examples" / "quickstart.ipynb"
 MAX_BYTES = 400_000

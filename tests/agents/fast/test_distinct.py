@@ -14,7 +14,7 @@ from agents.acting.encoding import Encoding
 from agents.acting.rollout import rollout
 from agents.fast import FastEncoding, chunks, distinct
 from agents.ppo.learner import Learner
-from small_runs import small_config
+from helpers.small_runs import small_config
 from trap_tube_jax.positions import layout_rows
 
 BATCH = 12

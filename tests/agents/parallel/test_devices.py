@@ -11,7 +11,7 @@ import pytest
 
 from agents.config import Config
 from agents.parallel.devices import ONE_DEVICE, Placement
-from paths import ROOT
+from helpers.paths import ROOT
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_two_devices_train_as_one():
     """By what `sharded_training` finds on two simulated devices."""
     environment = {k: v for k, v in os.environ.items() if k != "JAX_NUM_CPU_DEVICES"}
     done = subprocess.run(
-        [sys.executable, "-W", "error", ROOT / "tests" / "sharded_training.py"],
+        [sys.executable, "-W", "error", ROOT / "tests" / "helpers" / "sharded_training.py"],
         env={**environment, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,

@@ -9,8 +9,8 @@ import pytest
 from agents.runs import checkpoint
 from agents.runs.metrics import read_rows
 from agents.train import main
-from refusal import refused
-from small_runs import options, start
+from helpers.refusal import refused
+from helpers.small_runs import options, start
 
 
 def own(text):

@@ -8,7 +8,7 @@ import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.acting.episodes import Episodes
 from agents.ppo import advantages
-from easy import assert_same
+from helpers.trees import assert_same
 
 
 def test_the_intrinsic_weight_decays_geometrically():

@@ -26,8 +26,8 @@ from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
 from agents.registry import curiosities, encoders
-from easy import rows
-from small_runs import SETTINGS
+from helpers.small_runs import SETTINGS
+from helpers.trees import rows
 from trap_tube_jax.objects import AGENT
 
 BEST = Config.preset(

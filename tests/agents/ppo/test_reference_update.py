@@ -11,8 +11,8 @@ from agents import Config
 from agents.curiosity.icm import ICM
 from agents.ppo.learner import make_learner
 from agents.ppo.optimizer import BETA1
-from paths import DATA
-from reference_update import Recording, make_trajectory
+from helpers.paths import DATA
+from helpers.reference_update import Recording, make_trajectory
 
 CONFIG = Config.preset("paper", episodes_per_iteration=8, minibatch_size=8, epochs=5)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.ppo.task_replay import TaskReplay
-from easy import bits
+from helpers.trees import bits
 
 LISTS, CAPACITY = 2, 5
 

@@ -8,7 +8,7 @@ import pytest
 
 from agents.arrays import to_arrays
 from agents.runs import checkpoint
-from easy import assert_same
+from helpers.trees import assert_same
 
 
 def example(offset):

@@ -23,7 +23,7 @@ from agents.runs.provenance import Machine, note_provenance
 from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import records
-from tiny_policy import CONFIG, random_params, random_policy
+from helpers.tiny_policy import CONFIG, random_params, random_policy
 
 
 def without(row: dict[str, Any], key: str) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from agents import Config, make_learner
 from agents.acting.evaluation import Evaluation
 from agents.ppo.learner import Learner
 from agents.runs.evaluator import Evaluator, default_sets
-from easy import assert_same
-from tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
+from helpers.tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
+from helpers.trees import assert_same
 from trap_tube_jax.registry import PAPER_TASK_SETS
 from trap_tube_jax.scoring import Suite, suite
 from trap_tube_jax.scoring.scores import Optimality

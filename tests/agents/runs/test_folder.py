@@ -12,7 +12,7 @@ from agents.runs.folder import RunFolder, check_name
 from agents.runs.loading import load
 from agents.runs.results import results
 from agents.runs.run import Run, RunOptions
-from refusal import assert_refused
+from helpers.refusal import assert_refused
 
 
 def test_a_run_is_the_same_after_json():

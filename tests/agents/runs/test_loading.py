@@ -17,9 +17,10 @@ from agents.runs import checkpoint
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy, save
 from agents.runs.run import Run, RunOptions
-from easy import assert_same, enable_x64
-from refusal import assert_refused
-from tiny_policy import CONFIG, random_params, random_policy
+from helpers.jax_settings import enable_x64
+from helpers.refusal import assert_refused
+from helpers.tiny_policy import CONFIG, random_params, random_policy
+from helpers.trees import assert_same
 
 POLICY = random_policy()
 ARRAYS = to_arrays(POLICY.params)

@@ -10,7 +10,7 @@ from agents.runs.loggers import check_loggers, open_loggers
 from agents.runs.metrics import append_rows, read_rows, rewind_rows
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run
-from small_runs import small_config
+from helpers.small_runs import small_config
 
 
 def row(iteration, loss=0.5):

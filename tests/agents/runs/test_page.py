@@ -13,8 +13,8 @@ from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
 from agents.runs.run import Run
-from small_runs import small_config
-from tiny_policy import random_params
+from helpers.small_runs import small_config
+from helpers.tiny_policy import random_params
 from trap_tube_jax.scoring.tasks import ALL_SETS
 
 pytestmark = pytest.mark.slow

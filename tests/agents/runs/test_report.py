@@ -21,8 +21,8 @@ from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
 from agents.runs.provenance import commit, note_provenance
 from agents.runs.run import Run
-from small_runs import small_config
-from tiny_policy import food_next_to_agent, random_params
+from helpers.small_runs import small_config
+from helpers.tiny_policy import food_next_to_agent, random_params
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.scoring import Suite, evaluation_tasks
 

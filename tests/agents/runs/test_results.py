@@ -9,8 +9,8 @@ from agents.runs import results as module
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
 from agents.runs.run import Run
-from refusal import assert_refused
-from tiny_policy import CONFIG
+from helpers.refusal import assert_refused
+from helpers.tiny_policy import CONFIG
 
 EVALUATION = {
     "iteration": 4, "purpose": "test", "task_set": "NA", "tasks": 2, "solved": 1,

@@ -26,7 +26,7 @@ from agents.runs.progress import Progress
 from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run, train_runs
-from small_runs import final_state, small_config, untimed
+from helpers.small_runs import final_state, small_config, untimed
 from trap_tube_jax.interruptions import Stopped
 from trap_tube_jax.scoring import suite
 from trap_tube_jax.scoring.scores import Scores

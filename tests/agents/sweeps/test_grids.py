@@ -9,7 +9,7 @@ from agents.config import Config
 from agents.runs.folder import RunFolder
 from agents.runs.run import Run, RunOptions
 from agents.sweeps.grids import GRIDS, Grid, Options
-from refusal import assert_refused
+from helpers.refusal import assert_refused
 from trap_tube_jax.imports import import_modules
 
 

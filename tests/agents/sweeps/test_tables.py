@@ -14,9 +14,9 @@ from agents.runs.metrics import append_rows, read_rows
 from agents.runs.provenance import note_provenance
 from agents.runs.run import Run
 from agents.sweeps import figures, records, tables
-from paths import ROOT
-from refusal import assert_refused
-from small_runs import small_config
+from helpers.paths import ROOT
+from helpers.refusal import assert_refused
+from helpers.small_runs import small_config
 
 RESULTS = ROOT / "benchmarks" / "results"
 RECORDS = (

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from refusal import assert_refused
+from helpers.refusal import assert_refused
 from trap_tube_jax import registry
 from trap_tube_jax.positions import layout_rows
 from trap_tube_jax.scoring import Suite, suite

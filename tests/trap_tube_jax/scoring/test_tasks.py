@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from easy import assert_same
+from helpers.trees import assert_same
 from trap_tube_jax.registry import PAPER_TASK_SETS
 from trap_tube_jax.scoring.tasks import (
     ALL_SETS,

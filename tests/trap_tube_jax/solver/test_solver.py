@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import brute_force
 import trap_tube_jax as tt
-from paths import ROOT
-from refusal import assert_refused
+from helpers import brute_force
+from helpers.paths import ROOT
+from helpers.refusal import assert_refused
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver import pictures

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 import trap_tube_jax as tt
-from easy import EASY
-from refusal import refused
+from helpers.easy_task import EASY
+from helpers.refusal import refused
 from trap_tube_jax.solver.__main__ import main, row_of_lengths
 
 

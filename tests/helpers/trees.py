@@ -1,7 +1,6 @@
-"""A board on which random actions succeed soon, comparison and copies of values, 64-bit types."""
+"""Pytrees: comparison, rows and copies."""
 
 import copy
-import importlib
 import pickle
 from typing import Any
 
@@ -10,17 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import trap_tube_jax as tt
-
-EASY = tt.State.from_ascii(["TA.F........", *["." * 12] * 11])
-RIGHT, DOWN = jnp.array((3, 3)), jnp.array((3, 1))
-
-
-def enable_x64(enabled: bool) -> Any:
-    """The context manager of this name, which JAX before 0.8 keeps elsewhere."""
-    home: Any = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")
-    return home.enable_x64(enabled)
 
 
 def rows(tree: Any, index: Any) -> Any:

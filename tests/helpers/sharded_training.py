@@ -15,7 +15,7 @@ import trap_tube_jax as tt
 from agents.arrays import key_data, to_arrays
 from agents.parallel.devices import EPISODES, ONE_DEVICE, Placement, split_cpu
 from agents.ppo.learner import make_learner
-from small_runs import small_config
+from helpers.small_runs import small_config
 
 SIZES = {"episodes_per_iteration": 16, "minibatch_size": 8, "epochs": 2, "replay_capacity": 5}
 CONFIG = small_config(**SIZES, replay_fractions=(0.25, 0.25))

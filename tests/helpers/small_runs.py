@@ -7,7 +7,7 @@ import sys
 
 from agents.config import Config
 from agents.runs import checkpoint
-from paths import ROOT
+from helpers.paths import ROOT
 
 SETTINGS = {
     "episodes_per_iteration": 8,

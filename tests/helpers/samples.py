@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-import spec_reference as spec
+import helpers.spec_reference as spec
 import trap_tube_jax as tt
 
 SAMPLES = 2**17

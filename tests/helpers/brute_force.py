@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-import spec_reference as spec
+import helpers.spec_reference as spec
 
 GRASP, MOVE = np.divmod(np.arange(16), 4)
 SHIFTS = spec.DIRECTIONS[MOVE] @ (12, 1)
