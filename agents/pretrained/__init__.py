@@ -1,8 +1,9 @@
 """Trained agents that are shipped with the code, as files of safetensors.
 
-fast-base   the preset `fast` on base: the median of ten seeds
-icm-base    the preset `paper` on base, PPO + ICM
-best-pstsy  the preset `best` on {P, St, Sy}: the median of five seeds
+fast-base       the preset `fast` on base: the median of ten seeds
+icm-base        the preset `paper` on base, PPO + ICM
+best-pstsy      the preset `best` on {P, St, Sy}: the median of five seeds
+colors-p+pstsy  the preset `best` with `object_colors` on {P} and {P, St, Sy}: one seed
 """
 
 from pathlib import Path
