@@ -133,12 +133,13 @@ PRESETS_OF = {
     "fast-base": ("fast", {}),
     "icm-base": ("paper", {"stop_when_solved": 1.0}),
     "best-pstsy": ("best", {}),
+    "colors-p+pstsy": ("best", {"object_colors": True}),
 }
 
 
 @pytest.mark.parametrize("name", pretrained.names())
 def test_shipped_agents_have_the_presets_of_today_and_solve_their_tasks(name):
     policy, (preset, changes) = agents.load(name), PRESETS_OF[name]
-    own = tt.task_set(policy.config.env_id)
-    assert policy.config == Config.preset(preset, **changes, env_id=own.id)
-    assert tt.score(policy, [own.short], tasks=32)[own.short].percent > 85
+    train_set = tt.task_set(policy.config.env_id)
+    assert policy.config == Config.preset(preset, **changes, env_id=train_set.id)
+    assert tt.score(policy, [train_set.short], tasks=32)[train_set.short].percent > 85
