@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.command_line import option, parse
-from agents.files import write_json
+from agents.files import write_bytes, write_json
 from agents.profiles import plots
 from agents.profiles.measure import (
     Table,
@@ -67,12 +67,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "iterations": {name: policy.iteration for name, policy in policies.items()},
         **provenance(),
     }
-    output = options.output or Path("runs", f"profile-{'+'.join(Path(x).stem for x in policies)}")
+    names = "+".join(Path(source).resolve().stem for source in policies)  # a source may be "."
+    output = options.output or Path("runs", f"profile-{names}")
     output.mkdir(parents=True, exist_ok=True)
     found = profile(policies, options.parts, options.strengths, options.tasks)
     for figure in FIGURES:  # of an earlier profile
         (output / figure).unlink(missing_ok=True)
-    found.to_csv(output / "profile.csv", index=False, float_format="%.6g")
+    table = found.to_csv(index=False, float_format="%.6g")
+    write_bytes(output / "profile.csv", table.encode())
     write_json(output / "provenance.json", origin)
     _print_tables(found)
     if set(options.parts) & set(plots.PANELS):
