@@ -218,7 +218,7 @@ class PlainPPO:
     def loss(self, params: Any, batch: Batch) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Returns the loss f32[] and its terms, in whose means padding counts as zeros."""
         config = self.config
-        (episode, advantage, target) = batch
+        episode, advantage, target = batch
         logits, value, error, inferred = self.apply(params, episode)
         entropy = optax.softmax_cross_entropy(logits, jax.nn.softmax(logits)).sum(axis=-1)
         ratio = jnp.exp(log_prob(logits, episode.action) - episode.log_prob)

@@ -48,12 +48,12 @@ class ObjectEncoder(nn.Module):
         """Encodes u8[M, 12, 12, N] to f32[M, 2 * filters[1]]."""
         before, after = self.filters
         board = describe_board(observation)
-        x, exists, positions = board.features, board.exists[..., None], board.positions
+        x = board.features
+        exists = board.exists[..., None]
         if self.knows_colors:
             x = jnp.concatenate([x, board.looks_like.astype(jnp.float32)], axis=-1)
-        x = nn.swish(
-            dense(before, name="object1")(x) + dense(before, name="places")(positions)[:, None]
-        )
+        positions = dense(before, name="places")(board.positions)
+        x = nn.swish(dense(before, name="object1")(x) + positions[:, None])
         x = nn.swish(dense(before, name="object2")(x))
         scene = jnp.max(jnp.where(exists, x, NOWHERE), axis=1)
         x = nn.swish(dense(after, name="object3")(x) + dense(after, name="scene")(scene)[:, None])

@@ -15,8 +15,8 @@ import optax
 from agents.networks.layers import dense, output_dense
 
 UNITS = 128
-THINGS = 3
-AXES = 2
+THINGS = 3  # agent, tool and food
+AXES = 2  # rows and columns
 
 
 class MotionHead(nn.Module):

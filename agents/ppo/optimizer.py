@@ -9,8 +9,8 @@ import optax
 from agents.config import Config
 
 FINAL_LR_FRACTION = 1 / 50  # learning rate of the last gradient step of a decay, over the first
-BETA1 = 0.9
-BETA2 = 0.999
+BETA1 = 0.9  # decay of the first moment
+BETA2 = 0.999  # decay of the second moment
 
 
 def adam(learning_rate: optax.Schedule, epsilon: float) -> optax.GradientTransformation:

@@ -1,1 +1,1 @@
-"""What tests share."""
+"""Holds tasks, checks and references that several tests share."""
