@@ -333,11 +333,11 @@ class Learner:
 def make_learner(
     config: Config, env: Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
-    """Builds the learner of some settings, as it suits the machine (`agents.ppo.machine`).
+    """Builds the learner for some settings, with the path that suits the machine.
 
     Args:
       config: settings.
-      env: environment; by default that of `config.env_id`.
+      env: environment; by default the task set `config.env_id`.
       axis: devices that share the episodes; `Placement.axis` on several devices.
 
     Raises:
