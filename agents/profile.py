@@ -95,7 +95,7 @@ def _print_tables(found: Table) -> None:
     if parts & set(FIRST_PUSH_PARTS):
         tables["First pushes where the food could go either way"] = knowledge_table(found)
     for title, table in tables.items():
-        print(f"{title}\n\n{table.to_string()}\n")
+        print(f"{title}\n\n{table.to_string(line_width=80)}\n")
 
 
 if __name__ == "__main__":

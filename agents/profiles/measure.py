@@ -67,7 +67,7 @@ def profile(
     report("Drawing tasks")
     drawn = {part: PARTS[part](sampling) for part in parts}
     count = sum(len(part.tasks.time) for part in drawn.values())
-    report(f"Searching for the shortest plans of {count:,} tasks, a minute per few thousand")
+    report(f"Searching for the shortest plans of {count:,} tasks, up to a minute per 1,000")
     plans = _solve({name: part.tasks for name, part in drawn.items()})
     played = []
     for name, policy in policies.items():

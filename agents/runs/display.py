@@ -54,6 +54,7 @@ class TrainingLine(ProgressLine):
     def __init__(self, console: Console, iterations: int):
         columns = (MofNCompleteColumn(), TimeRemainingColumn(compact=True), TextColumn("left,"))
         super().__init__(console, iterations, *columns)
+        self.update(self.task_ids[0], description="compiling")
         self.iterations = iterations
 
     def show(self, row: Row) -> None:
