@@ -16,7 +16,6 @@ from agents.runs.report import save_first_solved
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.scoring.tasks import Purpose
-from trap_tube_jax.solver import solve_batch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     train_set = tt.task_set(config.env_id).short if options.gif else ""
     shortest = None
     if options.optimality:
-        shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
+        shortest = {name: tt.solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
     played = evaluator(policy.params)
     scores = evaluator.scores(played, shortest)
     if options.output is not None:

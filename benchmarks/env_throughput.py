@@ -20,7 +20,6 @@ from benchmarks import harness
 from trap_tube_jax.checks import check_integer
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
-from trap_tube_jax.vector import VectorEnvironment
 
 DENSE_UNITS = 64
 ONE_HOT_LEVELS = 8
@@ -176,7 +175,7 @@ def task_set_subject(task_set: str, *, plain: bool = False) -> Subject:
         reset = jax.vmap(auto_reset.reset)
         step = jax.vmap(auto_reset.step)
     else:
-        vector = VectorEnvironment(env)
+        vector = tt.VectorEnvironment(env)
         reset = vector.reset
         step = vector.step
     return Subject(task_set, reset, step, sample_actions, lambda timestep: timestep.observation)

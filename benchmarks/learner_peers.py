@@ -32,7 +32,6 @@ from agents.command_line import parse
 from agents.examples import plain_ppo
 from benchmarks import harness
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.state import State, TimeStep
 
 NetworkName = Literal["paper", "dense", "feedforward"]
 ProgramName = Literal["ours", "plain", "plain-by-step", "rejax"]
@@ -115,20 +114,20 @@ class ThroughGymnax:
         self.observation_spec = self._env.observation_space()
         self.max_steps = config.step_limit(config.env_id)
 
-    def reset(self, key: jax.Array) -> tuple[tuple[State, jax.Array], TimeStep]:
+    def reset(self, key: jax.Array) -> tuple[tuple[tt.State, jax.Array], tt.TimeStep]:
         """Draws a task."""
         key, reset_key = jax.random.split(key)
         observation, state = self._env.reset(reset_key, self._params)
         flags = (state.terminated, state.truncated)
-        return (state, key), TimeStep(observation, jnp.zeros(()), *flags, jnp.ones(()))
+        return (state, key), tt.TimeStep(observation, jnp.zeros(()), *flags, jnp.ones(()))
 
-    def step(self, state: tuple[State, jax.Array], action: jax.Array) -> tuple[Any, TimeStep]:
+    def step(self, state: tuple[tt.State, jax.Array], action: jax.Array) -> tuple[Any, tt.TimeStep]:
         """Takes one action; the next task follows the end of an episode."""
         key, step_key = jax.random.split(state[1])
         stepped = self._env.step(step_key, state[0], action, self._params)
         observation, inner, reward, _, info = stepped
         flags = (info["terminated"], info["truncated"], info["discount"])
-        return (inner, key), TimeStep(observation, reward, *flags)
+        return (inner, key), tt.TimeStep(observation, reward, *flags)
 
 
 @dataclasses.dataclass(frozen=True)

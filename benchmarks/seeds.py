@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
+import trap_tube_jax as tt
 from agents import Config, TrainState, make_learner
 from agents.command_line import parse
 from agents.runs import compilation
 from benchmarks import harness
-from trap_tube_jax import task_set
 from trap_tube_jax.command_line import plain_errors
 
 
@@ -104,7 +104,7 @@ def main(options: Options) -> list[Speed]:
     if options.cache:
         compilation.enable_cache()
     preset = Config.preset(options.preset)
-    names = [task_set(name).id for name in options.sets or (preset.env_id,)]
+    names = [tt.task_set(name).id for name in options.sets or (preset.env_id,)]
     configs = [Config.preset(options.preset, env_id=name) for name in names]
     console = Console()
     console.print(harness.machine())
@@ -115,7 +115,7 @@ def main(options: Options) -> list[Speed]:
         speed = measure(config, seeds, options)
         results.append(speed)
         table.add_row(
-            task_set(config.env_id).short,
+            tt.task_set(config.env_id).short,
             speed.path,
             str(seeds),
             f"{speed.seconds:.3f}",

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
+import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
@@ -22,7 +23,6 @@ from agents.curiosity import Experience
 from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
-from trap_tube_jax import task_set
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.state import take
 
@@ -85,7 +85,7 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         ("encoder", encoder, (params, batch)),
         ("recurrent part and heads", core, (params, batch, features)),
     ]
-    short = task_set(config.env_id).short
+    short = tt.task_set(config.env_id).short
     steps = float(jnp.sum(batch.episodes.mask))
     results = []
     for name, function, arguments in parts:
@@ -165,7 +165,7 @@ def _sum_over_minibatches(
 def main(options: Options) -> list[Part]:
     """Measures, prints a table and writes the record."""
     options.check()
-    configs = [Config.preset(options.preset, env_id=task_set(each).id) for each in options.sets]
+    configs = [Config.preset(options.preset, env_id=tt.task_set(each).id) for each in options.sets]
     console = Console()
     console.print(harness.machine())
     table = Table(

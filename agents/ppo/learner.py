@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+import trap_tube_jax as tt
 from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory, rollout
@@ -27,9 +28,7 @@ from agents.ppo.motion import MotionHead, motion_loss
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
 from agents.registry import contract, curiosities
-from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import BOARD_SIZE
-from trap_tube_jax.registry import make
 from trap_tube_jax.state import take
 
 Metrics = dict[str, jax.Array]
@@ -109,7 +108,7 @@ class Learner:
     """
 
     config: Config
-    env: Environment
+    env: tt.Environment
     agent: Agent
     encoding: Encoding
     curiosity: Curiosity
@@ -331,7 +330,7 @@ class Learner:
 
 
 def make_learner(
-    config: Config, env: Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
+    config: Config, env: tt.Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
     """Builds the learner of some settings, as it suits the machine (`agents.ppo.machine`).
 
@@ -350,7 +349,7 @@ def make_learner(
       Environment(transfers=(perceptual), max_steps=30)
     """
     if env is None:
-        env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
+        env = tt.make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
     config.validate(env)
     curiosity = curiosities.factory(config.curiosity)(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))

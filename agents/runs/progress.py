@@ -28,7 +28,6 @@ from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read
 from agents.runs.program import Metrics, Program
 from agents.runs.provenance import note_provenance
 from agents.runs.run import Run
-from trap_tube_jax.scoring.scores import Scores
 
 
 class Progress:
@@ -140,7 +139,7 @@ class Progress:
         state = self.program.placement.local(self.state())
         checkpoint.save(self.folder.checkpoints, self.iteration, state, dict(self.last or {}))
 
-    def finish(self) -> Scores | None:
+    def finish(self) -> tt.Scores | None:
         """Plays the test tasks with the final policy, or the best one; writes the results.
 
         Returns the scores; None if all are in the files.
