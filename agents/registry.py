@@ -15,7 +15,7 @@ class Registry(dict[str, Callable[..., Any]]):
     def __init__(self, kind: str):
         super().__init__()
         self.kind = kind  # in messages
-        self.own: set[str] = set()
+        self.registered: set[str] = set()
 
     def register(self, name: str, factory: Callable[..., Any]) -> None:
         """Registers a factory, or replaces one registered earlier under the same name.
@@ -25,10 +25,10 @@ class Registry(dict[str, Callable[..., Any]]):
             and "-".
         """
         check_registered_name(self.kind, name)
-        if name in self and name not in self.own:
+        if name in self and name not in self.registered:
             raise ValueError(f"{self.kind} {name!r} is built in; names taken: {', '.join(self)}")
         self[name] = factory
-        self.own.add(name)
+        self.registered.add(name)
 
     def factory(self, name: str) -> Callable[..., Any]:
         """Returns the factory of this name; ValueError lists the names if there is none."""

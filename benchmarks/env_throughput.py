@@ -239,15 +239,15 @@ def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]
     Arguments and results have an additional first axis for the devices.
     """
 
-    def own(*arrays: Any) -> Any:
+    def on_one(*arrays: Any) -> Any:
         result = function(*jax.tree.map(lambda x: x[0], arrays))
         return jax.tree.map(lambda x: x[None], result)
 
     if devices == 1:
-        return own
+        return on_one
     mesh = jax.make_mesh((devices,), ("devices",), axis_types=(jax.sharding.AxisType.Auto,))
     part = jax.sharding.PartitionSpec("devices")
-    return jax.shard_map(own, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+    return jax.shard_map(on_one, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
 
 
 def use_devices(number: int) -> None:

@@ -2,7 +2,7 @@
 
 Times a whole iteration, rollout and update, of `agents.ppo`, of the program in
 `agents/examples/plain_ppo.py` (recurrent PPO with ICM) and of rejax's PPO, in turn within one
-process. Settings are those of preset `paper`, with fewer episodes and epochs. There are three
+process. Settings follow preset `paper`, with fewer episodes and epochs. There are three
 networks; the others' programs play the last two through the gymnax adapter, which needs the extra
 `[interop]`:
 
@@ -166,7 +166,7 @@ def plain_program(learner: plain_ppo.PlainPPO) -> Program:
 
     def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
         state, batch, minibatches = learner.collect(state)
-        update = lambda state, places: learner.update(state, batch, places)  # noqa: E731
+        update = lambda state, chosen: learner.update(state, batch, chosen)  # noqa: E731
         state, _ = jax.lax.scan(update, state, minibatches)
         return state, jnp.sum(batch[0].mask)
 
@@ -179,13 +179,13 @@ def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
     state = jax.jit(learner.init)(jax.random.key(0))
     collect, collect_s = harness.compiled(learner.collect, state)
     _, batch, minibatches = jax.eval_shape(learner.collect, state)
-    places = jax.ShapeDtypeStruct(minibatches.shape[1:], minibatches.dtype)
-    update, update_s = harness.compiled(learner.update, state, batch, places)
+    chosen = jax.ShapeDtypeStruct(minibatches.shape[1:], minibatches.dtype)
+    update, update_s = harness.compiled(learner.update, state, batch, chosen)
 
     def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
         state, batch, minibatches = collect(state)
-        for places in minibatches:
-            state, _ = update(state, batch, places)
+        for chosen in minibatches:
+            state, _ = update(state, batch, chosen)
         return state, jnp.sum(batch[0].mask)
 
     return iterate, collect_s + update_s, state

@@ -119,8 +119,8 @@ def measure(options: Options) -> tuple[list[Throughput], dict[str, str]]:
     Raises:
       ValueError: a task set is unknown.
     """
-    own = [env_throughput.task_set_subject(name) for name in options.sets]
-    results = _measure(own, options)
+    ours = [env_throughput.task_set_subject(name) for name in options.sets]
+    results = _measure(ours, options)
     skipped = {}
     for name in options.peers:
         try:

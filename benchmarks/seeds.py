@@ -29,7 +29,7 @@ class Options(harness.Options):
       sets: task sets to train on, by id or short name; by default the preset's.
       seeds: numbers of seeds in one program; 1 trains without `jax.vmap`.
       iterations: iterations per timed call.
-      cache: keeps compiled programs, and uses those of earlier commands.
+      cache: keeps compiled programs for later commands, and uses earlier ones.
     """
 
     repeats: int = 3

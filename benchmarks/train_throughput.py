@@ -140,8 +140,8 @@ def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batc
     )
     actions = agent.embed_action(params, episodes.action)
     experience = Experience(episodes, features[..., :0], embedding, following, actions)
-    own = curiosity.losses(params["curiosity"], experience)
-    everything = jax.tree.leaves((agent.policy_and_value(params, embedding), own))
+    curiosity_losses = curiosity.losses(params["curiosity"], experience)
+    everything = jax.tree.leaves((agent.policy_and_value(params, embedding), curiosity_losses))
     return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 
 

@@ -336,7 +336,7 @@ def make_learner(
 
     Args:
       config: settings.
-      env: environment; by default that of `config.env_id`.
+      env: environment; by default the one that `config.env_id` names.
       axis: devices that share the episodes; `Placement.axis` on several devices.
 
     Raises:

@@ -48,7 +48,7 @@ def tool_moves(cells: Cells) -> np.ndarray:
 def last_subgoals(tasks: tt.State, actions: np.ndarray, cells: Cells) -> np.ndarray:
     """Returns i32[B], the index in `SUBGOALS` of the last subgoal of B episodes.
 
-    The arguments are those of `replay` and its result.
+    Takes the arguments of `replay`, and its result.
     """
     agent, tool, food = cells
     extent = np.asarray(tasks.tool_extent)[:, None]

@@ -106,7 +106,7 @@ def best_iteration(folder: RunFolder) -> int | None:
 
 
 def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:
-    """Returns whether an evaluation is better than that of the best iteration so far.
+    """Returns whether an evaluation is better than the best iteration's so far.
 
     Compares the mean fractions of validation tasks solved, over the task sets that both have. Base,
     a single task, counts only if it is the training set or the only set.

@@ -71,7 +71,7 @@ class Cohort:
     """The states of one or several seeds, which a compiled program advances together.
 
     The states of several are stacked along a first axis, and `jax.vmap` makes one program of them;
-    a single run's program is that of its learner. A member that has ended is advanced as before,
+    a single run uses its learner's program. A member that has ended is advanced as before,
     since another program would have to be compiled for fewer.
     """
 
