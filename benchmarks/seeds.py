@@ -70,7 +70,8 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
     init = learner.init
     iterate = learner.iterate
     if seeds > 1:
-        init, iterate = jax.vmap(init), jax.vmap(iterate)
+        init = jax.vmap(init)
+        iterate = jax.vmap(iterate)
     else:
         keys = keys[0]
 

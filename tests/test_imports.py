@@ -162,7 +162,8 @@ def modules_of(requirements: list[str]) -> set[str]:
 
 
 def test_the_wheel_holds_the_environment_and_what_it_imports():
-    project, build = SETTINGS["project"], SETTINGS["tool"]["hatch"]
+    project = SETTINGS["project"]
+    build = SETTINGS["tool"]["hatch"]
     assert build["build"]["targets"]["wheel"] == {"packages": ["trap_tube_jax"]}
     extras = project["optional-dependencies"]
     required = modules_of(project["dependencies"])

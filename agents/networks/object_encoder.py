@@ -125,7 +125,8 @@ def _objects(color: jax.Array, left: jax.Array) -> tuple[jax.Array, jax.Array]:
     u32[M, 6].
     """
     count = len(color)
-    color, left = color.reshape(count, -1), left.reshape(count, -1)
+    color = color.reshape(count, -1)
+    left = left.reshape(count, -1)
     cells = np.arange(color.shape[1], dtype=np.int32)[None]
     objects = []
     colors = []

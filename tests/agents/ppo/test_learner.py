@@ -40,7 +40,8 @@ BEST = Config.preset(
     intrinsic_anneal_fraction=0.8,
 )
 PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
-STEPS, EPISODES = 6, 8
+STEPS = 6
+EPISODES = 8
 OWN_COLORS = tt.Environment(base=tt.base_state().replace(palette=255 - tt.base_state().palette))
 
 
@@ -110,7 +111,8 @@ def test_new_tasks_are_new_and_others_are_of_the_lists():
     best = make_learner(BEST)
     task_replay = best.init(jax.random.key(0)).task_replay
     drawn = data(best.draw_tasks(task_replay, jax.random.key(1)))
-    once, twice = data(task_replay.keys[0]), data(task_replay.keys[1])
+    once = data(task_replay.keys[0])
+    twice = data(task_replay.keys[1])
     assert len(set(drawn[:4]) - {*once, *twice}) == 4
     assert set(drawn[4:6]) <= set(once)
     assert set(drawn[6:]) <= set(twice)
@@ -201,7 +203,8 @@ def test_seeds_side_by_side_are_those_alone():
     """With the cache of encodings and the loops of the real rollout; up to rounding."""
     plain = make_learner(dataclasses.replace(PLAIN, env_id="sy"))
     both = jax.vmap(plain.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))
-    together, alone = jax.jit(jax.vmap(plain.iterate))(both), jax.jit(plain.iterate)
+    together = jax.jit(jax.vmap(plain.iterate))(both)
+    alone = jax.jit(plain.iterate)
     for seed in range(2):
         expected = to_arrays(alone(rows(both, seed)))
         got = to_arrays(rows(together, seed))
@@ -219,7 +222,8 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
         after, metrics = iterate(state)
         iterate(after)
     assert all(np.isfinite(float(value)) for value in metrics.values())
-    before, after = to_arrays(state.params), to_arrays(after.params)
+    before = to_arrays(state.params)
+    after = to_arrays(after.params)
     same = [name for name in before if np.array_equal(before[name], after[name])]
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
 
@@ -244,7 +248,8 @@ class Known(Learner):
     """Has seen an episode of two steps, of which the second is padding."""
 
     def experience(self, params, episodes):
-        hidden, width = self.config.hidden, 2 * self.config.embedding
+        hidden = self.config.hidden
+        width = 2 * self.config.embedding
         outputs = (jnp.zeros((1, 2, hidden)), None, jnp.zeros((1, 2, width)))
         return Experience(episodes, jnp.zeros((1, 3, 0)), *outputs)
 
@@ -257,7 +262,8 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     custom = Returning(losses={"own_loss": jnp.ones((1, 2))})
     params = jax.eval_shape(made.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
-    mask, cells = jnp.array([[1.0, 0.0]]), jnp.zeros((1, 3, 3, 2), jnp.uint8)
+    mask = jnp.array([[1.0, 0.0]])
+    cells = jnp.zeros((1, 3, 3, 2), jnp.uint8)
     episodes = Episodes(tt.base_state(), cells, jnp.zeros((1, 2, 2), jnp.int32), *[mask] * 3)
     old = jnp.full((1, 2), -2 * np.log(4) - np.log(1.5), jnp.float32)  # clipped to 1.2
     target = jnp.array([[[3.0, 4.0], [9.0, 9.0]]])

@@ -116,7 +116,8 @@ def test_results_are_a_tidy_table(whole, tmp_path):
 
 def test_stopped_runs_continue_to_the_same_bits(whole, tmp_path, monkeypatch):
     """Stopped between two checkpoints; the rows and the best parameters are the same, too."""
-    path, record = tmp_path / "stopped", Progress.record
+    path = tmp_path / "stopped"
+    record = Progress.record
 
     def stop(self, metrics, seconds):
         record(self, metrics, seconds)
@@ -141,7 +142,8 @@ def _raise(error):
 
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(program, "make_advance", None)
-    before, output = (copy / "evaluations.csv").read_bytes(), io.StringIO()
+    before = (copy / "evaluations.csv").read_bytes()
+    output = io.StringIO()
     more = dataclasses.replace(TRACKED, test_tasks=9)
     assert train_run(copy, small_run(), more, console=Console(file=output)) is None
     assert (copy / "evaluations.csv").read_bytes() == before
