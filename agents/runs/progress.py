@@ -61,10 +61,13 @@ class Progress:
         self.folder = folder
         if stored.config.is_file():
             run.check_continues(stored.read()[0])
-        restored, self.last = restore(stored, run.config.iterations, program.state_shapes)
-        check_rows(stored, self.iteration)
+        restored, self.last = restore(stored, program.state_shapes)
+        done = self.iteration
+        if done > (limit := run.config.iterations):
+            raise ValueError(f"iterations must be at least {done}, which are done, got {limit}")
+        check_rows(stored, done)
         if program.validation:
-            check_best(stored, self.iteration, program.sets)
+            check_best(stored, done, program.sets)
         first = program.init(run.seed) if restored is None else restored
         self.state: Callable[[], TrainState] = lambda: first
 

@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 import agents
+import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.arrays import read_arrays, write_arrays
 from agents.ppo.learner import Learner
@@ -67,7 +68,7 @@ def whole(tmp_path_factory):
         return evaluation_tasks(name, number, features, purpose)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (suite, program):
+        for module in (suite, tt):
             patch.setattr(module, "evaluation_tasks", record)
         train_run(path, small_run(), TRACKED)
     return path
