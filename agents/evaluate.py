@@ -13,7 +13,7 @@ from agents.runs.evaluator import Evaluator, default_sets
 from agents.runs.loading import load
 from agents.runs.metrics import evaluation_rows, write_rows
 from agents.runs.report import save_first_solved
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.scoring.tasks import Purpose
 
@@ -59,7 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     train_set = tt.task_set(config.env_id).short if options.gif else ""
     shortest = None
     if options.optimality:
+        announce("Searching for shortest plans, which takes up to a minute")
         shortest = {name: tt.solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
+    announce(f"Playing {tasks:,} tasks of every set, which takes up to a minute per 1,000 tasks")
     played = evaluator(policy.params)
     scores = evaluator.scores(played, shortest)
     if options.output is not None:

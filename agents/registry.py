@@ -6,7 +6,7 @@ from typing import Any
 
 from flax.errors import FlaxError
 
-from trap_tube_jax.checks import check_registered_name
+from trap_tube_jax.checks import check_registered_name, did_you_mean
 
 
 class Registry(dict[str, Callable[..., Any]]):
@@ -34,8 +34,9 @@ class Registry(dict[str, Callable[..., Any]]):
         """Returns the factory of this name; ValueError lists the names if there is none."""
         if name not in self:
             raise ValueError(
-                f"unknown {self.kind} {name!r}; allowed: {', '.join(self)}. If a module of yours "
-                "registers it, name the module: --import MODULE, or imports=[...] in Python"
+                f"unknown {self.kind} {name!r}{did_you_mean(name, self)}; "
+                f"allowed: {', '.join(self)}. If a module of yours registers it, name the module: "
+                "--import MODULE, or imports=[...] in Python"
             )
         return self[name]
 

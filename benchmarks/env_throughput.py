@@ -11,7 +11,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 import trap_tube_jax as tt
@@ -277,10 +276,8 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
 
 def main(options: Options) -> list[Throughput]:
     """Measures, prints a table and writes the record."""
-    options.check()
     subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
-    console = Console()
-    console.print(harness.machine())
+    console = harness.begin(options)
     bandwidth = copy_bandwidth()
     console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
     results = [

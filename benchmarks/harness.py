@@ -20,9 +20,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import jax
+from rich.console import Console
 
 from agents.runs.provenance import commit, provenance
 from trap_tube_jax.checks import check_integer
+from trap_tube_jax.command_line import announce
 
 SCHEMA = "trap-tube-jax benchmark 2"
 
@@ -52,6 +54,19 @@ class Options:
                 f"a record needs committed code, in a git checkout; the commit is {name}: commit "
                 "the changes, or leave out --output"
             )
+
+
+def begin(options: Options) -> Console:
+    """Checks the options, and prints the machine and how long measuring takes.
+
+    Raises:
+      ValueError: see `Options.check`.
+    """
+    options.check()
+    console = Console()
+    console.print(machine())
+    announce("Compiling and measuring, up to a minute per row on an idle machine")
+    return console
 
 
 @dataclasses.dataclass(frozen=True)

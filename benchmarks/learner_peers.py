@@ -22,7 +22,6 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
 import agents.networks
@@ -256,14 +255,12 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
 
 def main(options: Options) -> list[Speed]:
     """Measures, prints a table and writes the record."""
-    options.check()
     cases: list[tuple[str, NetworkName]] = [
         (name, network) for name in options.sets for network in options.networks
     ]
     for case in cases:
         options.config(*case)  # checks the settings
-    console = Console()
-    console.print(harness.machine())
+    console = harness.begin(options)
     results = []
     columns = ("set", "network", "program", "s/iteration", "steps/s", "ratio", "compile, s")
     table = Table(*columns)

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
 from agents.command_line import parse
@@ -113,14 +112,11 @@ class Options(StepOptions):
     peers: tuple[PeerName, ...] = tuple(PEERS)
 
 
-def measure(options: Options) -> tuple[list[Throughput], dict[str, str]]:
-    """Measures the task sets and the peers; returns results, and reasons by skipped peer.
-
-    Raises:
-      ValueError: a task set is unknown.
-    """
-    ours = [env_throughput.task_set_subject(name) for name in options.sets]
-    results = _measure(ours, options)
+def measure(
+    options: Options, subjects: Sequence[Subject]
+) -> tuple[list[Throughput], dict[str, str]]:
+    """Measures our task sets and the peers; returns results, and reasons by skipped peer."""
+    results = _measure(subjects, options)
     skipped = {}
     for name in options.peers:
         try:
@@ -134,10 +130,9 @@ def measure(options: Options) -> tuple[list[Throughput], dict[str, str]]:
 
 def main(options: Options) -> None:
     """Measures, prints a table and the skipped peers, and writes the record."""
-    options.check()
-    console = Console()
-    console.print(harness.machine())
-    results, skipped = measure(options)
+    subjects = [env_throughput.task_set_subject(name) for name in options.sets]
+    console = harness.begin(options)
+    results, skipped = measure(options, subjects)
     first = {result.num_envs: result.steps_per_s for result in reversed(results)}
     columns = ("envs", "M steps/s", "ratio", "µs/step", "B/obs.", "GB/s")
     table = Table("subject", *columns, "compile, s")

@@ -9,7 +9,6 @@ import itertools
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
 import trap_tube_jax as tt
@@ -101,14 +100,12 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
 
 def main(options: Options) -> list[Speed]:
     """Measures, prints a table and writes the record."""
-    options.check()
     if options.cache:
         compilation.enable_cache()
     preset = Config.preset(options.preset)
     names = [tt.task_set(name).id for name in options.sets or (preset.env_id,)]
     configs = [Config.preset(options.preset, env_id=name) for name in names]
-    console = Console()
-    console.print(harness.machine())
+    console = harness.begin(options)
     columns = ("set", "path", "seeds", "s/iteration", "steps/s", "compile, s")
     table = Table(*columns, title=f"preset {options.preset}")
     results = []

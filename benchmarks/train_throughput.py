@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
 import trap_tube_jax as tt
@@ -164,10 +163,8 @@ def _sum_over_minibatches(
 
 def main(options: Options) -> list[Part]:
     """Measures, prints a table and writes the record."""
-    options.check()
     configs = [Config.preset(options.preset, env_id=tt.task_set(each).id) for each in options.sets]
-    console = Console()
-    console.print(harness.machine())
+    console = harness.begin(options)
     table = Table(
         "set", "part", "seconds", "steps/s", "compile, s", title=f"preset {options.preset}"
     )

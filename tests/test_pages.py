@@ -109,6 +109,7 @@ def help_of(module: str, *rest: str) -> str:
     output = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output):
         patch.setattr(sys, "argv", [module, *rest, "--help"])
+        patch.setenv("COLUMNS", "80")
         with contextlib.suppress(SystemExit):
             runpy.run_module(module, run_name="__main__", alter_sys=True)
     return output.getvalue()
@@ -126,6 +127,14 @@ def test_commands_exist_with_their_options(command):
         assert known
         for option in set(options) - {"--help"}:
             assert re.search(rf"{re.escape(option)}\b", known), option
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
+@pytest.mark.parametrize("module", sorted({command.split()[0] for command in commands()}))
+def test_help_fits_80_columns(module):
+    if module.startswith(("agents.examples.rejax", "agents.examples.sb3")):
+        pytest.skip("needs other libraries")
+    assert max(map(len, help_of(module).splitlines())) < 80
 
 
 def rows_of(record: str, name: str) -> Any:

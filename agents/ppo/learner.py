@@ -332,11 +332,11 @@ class Learner:
 def make_learner(
     config: Config, env: tt.Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
-    """Builds the learner of some settings, as it suits the machine (`agents.ppo.machine`).
+    """Builds the learner for some settings, with the path that suits the machine.
 
     Args:
       config: settings.
-      env: environment; by default the one that `config.env_id` names.
+      env: environment; by default the task set `config.env_id`.
       axis: devices that share the episodes; `Placement.axis` on several devices.
 
     Raises:

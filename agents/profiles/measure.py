@@ -1,6 +1,6 @@
 """Greedy play on the tasks of a profile, as a tidy table, and smaller tables made from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -34,6 +34,7 @@ def profile(
     parts: Sequence[str] = tuple(PARTS),
     strengths: Sequence[float] = STRENGTHS,
     num_tasks: int = 200,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Table:
     """Plays the tasks of a profile once with each policy, greedily.
 
@@ -42,6 +43,7 @@ def profile(
       parts: names of `tasks.PARTS`.
       strengths: of the graded transfers, from 0 (the base task) to 1 (the paper's transfer).
       num_tasks: tasks of each strength and symbolic swap, and of the other draws from {P}.
+      report: is told what is about to be done.
 
     Returns:
       One row per policy, part and level. Columns: the number of tasks, of tasks solved within 50
@@ -62,9 +64,15 @@ def profile(
     if len(channels) != 1:
         raise ValueError(f"profile policies of one num_features together, got {sorted(channels)}")
     sampling = Sampling(strengths, num_tasks, channels.pop())
+    report("Drawing tasks")
     drawn = {part: PARTS[part](sampling) for part in parts}
+    count = sum(len(part.tasks.time) for part in drawn.values())
+    report(f"Searching for the shortest plans of {count:,} tasks, a minute per few thousand")
     plans = _solve({name: part.tasks for name, part in drawn.items()})
-    played = [_play(policy, drawn, plans).assign(policy=name) for name, policy in policies.items()]
+    played = []
+    for name, policy in policies.items():
+        report(f"Playing {count:,} tasks with {name}, a minute or two")
+        played.append(_play(policy, drawn, plans).assign(policy=name))
     groups: Any = pd.concat(played).groupby(["policy", "part", "level"], sort=False)
     counts = groups[COUNTS].sum(min_count=1)  # a sum without numbers is unknown, not 0
     return counts.join(groups[MEANS].mean()).reset_index()

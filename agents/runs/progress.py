@@ -157,7 +157,7 @@ class Progress:
         if tested.issuperset(self.program.sets) and has_page:
             self.console.out("Already tested; to play other tasks, run python -m agents.evaluate.")
             return None
-        self.console.out("Evaluating ...")
+        self.console.out("Playing test tasks, which takes up to a minute ...")
         evaluator = self.program.test
         played = evaluator(policy.params)
         scores = evaluator.scores(played)
@@ -165,6 +165,7 @@ class Progress:
         append_rows(self.folder.evaluations, [row for row in rows if row["task_set"] not in tested])
         self.console.out(scores)
         if options.report:  # last, since a figure may fail
+            self.console.out("Drawing the report, which takes up to half a minute ...")
             report.write(self.folder, self.run, evaluator, played)
         return scores
 

@@ -101,6 +101,8 @@ class DeviceOptions:
 class RunOptions(DeviceOptions):
     """Options for carrying out a run; on one device, none of them changes what it learns.
 
+    `devices` share the run: by default one, or all if several processes train it.
+
     Attributes:
       checkpoint_every: iterations between checkpoints.
       evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation

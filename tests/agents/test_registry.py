@@ -32,5 +32,6 @@ def test_unusable_names_are_refused(name, words):
 @pytest.mark.parametrize("setting", ["curiosity", "encoder"])
 def test_unknown_names_are_refused_with_the_known_ones_and_the_way_to_add_more(setting):
     known = {"curiosity": "icm, rnd", "encoder": "paper, objects"}[setting]
-    words = [f"unknown {setting} 'rdn'; allowed: {known}", "--import MODULE", "imports="]
-    assert_refused(words, Config, **{setting: "rdn"})
+    words = [f"unknown {setting} 'xyz'; allowed: {known}", "--import MODULE", "imports="]
+    assert_refused(words, Config, **{setting: "xyz"})
+    assert_refused(["unknown curiosity 'rdn' (did you mean 'rnd'?)"], Config, curiosity="rdn")

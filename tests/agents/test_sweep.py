@@ -179,7 +179,8 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
     end(tmp_path / "a")
     with overview.Overview(console, runs):
         pass
-    assert console.export_text() == "12% of 2 run(s), time left not known yet\n"
+    text = "12% of 2 run(s), time left is known after the first iterations\n"
+    assert console.export_text() == text
 
 
 @pytest.mark.parametrize(

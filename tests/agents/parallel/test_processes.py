@@ -41,7 +41,7 @@ def test_two_processes_end_together_and_the_first_reports(tmp_path):
 def test_two_processes_stop_together_and_one_continues(tmp_path):
     first, second = start_two(tmp_path, 100_000)
     assert first.stdout is not None
-    while not re.match("iteration 2:", line := first.stdout.readline()):
+    while not re.match("iteration 2 of", line := first.stdout.readline()):
         assert line, first.communicate()
     second.send_signal(signal.SIGTERM)
     (output, errors) = first.communicate()

@@ -163,9 +163,17 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
         for iteration in (1, 2):
             progress.show(row(iteration))
     text = file.getvalue()
-    assert "16 episodes, 25.0% solved, 50.0% greedily, 6,000 steps/s" in text
-    assert ("iteration 2: " in text) != is_terminal
+    assert "25.0% solved, 50.0% greedily, 16 episodes, 6,000 steps/s" in text
+    assert ("iteration 2 of 5: " in text) != is_terminal
     assert ("2/5" in text) == is_terminal
+
+
+def test_a_narrow_terminal_shows_total_time_left_and_success():
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
+    with display.TrainingLine(console, 1150) as progress, console.capture() as shown:
+        numbers = {"success": 1.0, "validation_success": 1.0, "episodes": 1_177_600}
+        progress.show(row(1149, **numbers))
+    assert re.search(r"1149/1150 .* left, 100.0% solved, 100.0% greedily, ", shown.get())
 
 
 @pytest.mark.parametrize(
