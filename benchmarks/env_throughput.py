@@ -11,14 +11,12 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 import trap_tube_jax as tt
-from agents.command_line import parse
+from agents.runs.console import CommandConsole
 from benchmarks import harness
 from trap_tube_jax.checks import check_integer
-from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
 from trap_tube_jax.vector import VectorEnvironment
 
@@ -277,10 +275,10 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
 
 
 def main(options: Options) -> list[Throughput]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     options.check()
     subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
-    console = Console()
+    console = CommandConsole()
     console.print(harness.machine())
     bandwidth = copy_bandwidth()
     console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
@@ -300,11 +298,10 @@ def main(options: Options) -> list[Throughput]:
             f"{result.bytes_per_s / bandwidth:.0%}",
             f"{result.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("env_throughput", options, results, copy_bytes_per_s=bandwidth)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.env_throughput"))
+    harness.run(main, Options, "env_throughput")

@@ -21,8 +21,11 @@ from typing import Any, Self
 
 import jax
 
+from agents.command_line import parse
 from agents.runs.provenance import commit, provenance
 from trap_tube_jax.checks import check_integer
+from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.interruptions import run_command
 
 SCHEMA = "trap-tube-jax benchmark 2"
 
@@ -52,6 +55,16 @@ class Options:
                 f"a record needs committed code, in a git checkout; the commit is {name}: commit "
                 "the changes, or leave out --output"
             )
+
+
+def run(main: Callable[[Any], Any], options: type, benchmark: str) -> None:
+    """Runs the command line of a benchmark, a module of `benchmarks`; see `run_command`."""
+
+    @plain_errors()
+    def command_line() -> None:
+        main(parse(options, None, f"python -m benchmarks.{benchmark}"))
+
+    run_command(command_line)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,16 +22,14 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
 import agents.networks
 import trap_tube_jax as tt
 from agents import Config, make_learner
-from agents.command_line import parse
 from agents.examples import plain_ppo
+from agents.runs.console import CommandConsole
 from benchmarks import harness
-from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.state import State, TimeStep
 
 NetworkName = Literal["paper", "dense", "feedforward"]
@@ -256,14 +254,14 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     options.check()
     cases: list[tuple[str, NetworkName]] = [
         (name, network) for name in options.sets for network in options.networks
     ]
     for case in cases:
         options.config(*case)  # checks the settings
-    console = Console()
+    console = CommandConsole()
     console.print(harness.machine())
     results = []
     columns = ("set", "network", "program", "s/iteration", "steps/s", "ratio", "compile, s")
@@ -280,11 +278,10 @@ def main(options: Options) -> list[Speed]:
                 f"{speeds[0].steps_per_s / speed.steps_per_s:.1f}",
                 f"{speed.timing.compile_s:.1f}",
             )
-    console.print(table)
     harness.write_record("learner_peers", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.learner_peers"))
+    harness.run(main, Options, "learner_peers")

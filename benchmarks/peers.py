@@ -12,13 +12,11 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
-from agents.command_line import parse
+from agents.runs.console import CommandConsole
 from benchmarks import env_throughput, harness
 from benchmarks.env_throughput import StepOptions, Subject, Throughput
-from trap_tube_jax.command_line import plain_errors
 
 
 def gymnax_breakout() -> Subject:
@@ -133,9 +131,9 @@ def measure(options: Options) -> tuple[list[Throughput], dict[str, str]]:
 
 
 def main(options: Options) -> None:
-    """Measures, prints a table and the skipped peers, and writes the record."""
+    """Measures, writes the record, and prints a table and the skipped peers."""
     options.check()
-    console = Console()
+    console = CommandConsole()
     console.print(harness.machine())
     results, skipped = measure(options)
     first = {result.num_envs: result.steps_per_s for result in reversed(results)}
@@ -152,11 +150,11 @@ def main(options: Options) -> None:
             f"{result.bytes_per_s / 1e9:.2f}",
             f"{result.timing.compile_s:.1f}",
         )
+    harness.write_record("peers", options, results, skipped=skipped)
     console.print(table)
     console.print("ratio: speed of the first subject over this one; µs of one environment's step")
     for name, reason in skipped.items():
         console.print(f"skipped {name}: {reason}", markup=False)
-    harness.write_record("peers", options, results, skipped=skipped)
 
 
 def _measure(subjects: Sequence[Subject], options: StepOptions) -> list[Throughput]:
@@ -196,5 +194,4 @@ def _split(key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.peers"))
+    harness.run(main, Options, "peers")

@@ -9,15 +9,13 @@ import itertools
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
 from agents import Config, TrainState, make_learner
-from agents.command_line import parse
 from agents.runs import compilation
+from agents.runs.console import CommandConsole
 from benchmarks import harness
 from trap_tube_jax import task_set
-from trap_tube_jax.command_line import plain_errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,14 +97,14 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     options.check()
     if options.cache:
         compilation.enable_cache()
     preset = Config.preset(options.preset)
     names = [task_set(name).id for name in options.sets or (preset.env_id,)]
     configs = [Config.preset(options.preset, env_id=name) for name in names]
-    console = Console()
+    console = CommandConsole()
     console.print(harness.machine())
     columns = ("set", "path", "seeds", "s/iteration", "steps/s", "compile, s")
     table = Table(*columns, title=f"preset {options.preset}")
@@ -122,11 +120,10 @@ def main(options: Options) -> list[Speed]:
             f"{speed.steps_per_s:,.0f}",
             f"{speed.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("seeds", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.seeds"))
+    harness.run(main, Options, "seeds")

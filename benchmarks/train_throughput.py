@@ -11,19 +11,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
 from rich.table import Table
 
 from agents import Config, make_learner
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
-from agents.command_line import parse
 from agents.curiosity import Experience
 from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
+from agents.runs.console import CommandConsole
 from benchmarks import harness
 from trap_tube_jax import task_set
-from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.state import take
 
 
@@ -163,10 +161,10 @@ def _sum_over_minibatches(
 
 
 def main(options: Options) -> list[Part]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     options.check()
     configs = [Config.preset(options.preset, env_id=task_set(each).id) for each in options.sets]
-    console = Console()
+    console = CommandConsole()
     console.print(harness.machine())
     table = Table(
         "set", "part", "seconds", "steps/s", "compile, s", title=f"preset {options.preset}"
@@ -182,11 +180,10 @@ def main(options: Options) -> list[Part]:
             f"{part.steps_per_s:,.0f}",
             f"{part.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("train_throughput", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.train_throughput"))
+    harness.run(main, Options, "train_throughput")
