@@ -14,10 +14,8 @@ import numpy as np
 from rich.table import Table
 
 import trap_tube_jax as tt
-from agents.command_line import parse
 from benchmarks import harness
 from trap_tube_jax.checks import check_integer
-from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
 
 DENSE_UNITS = 64
@@ -275,7 +273,7 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
 
 
 def main(options: Options) -> list[Throughput]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
     console = harness.begin(options)
     bandwidth = copy_bandwidth()
@@ -296,11 +294,10 @@ def main(options: Options) -> list[Throughput]:
             f"{result.bytes_per_s / bandwidth:.0%}",
             f"{result.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("env_throughput", options, results, copy_bytes_per_s=bandwidth)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.env_throughput"))
+    harness.run(main, Options, "env_throughput")

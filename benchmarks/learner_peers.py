@@ -27,10 +27,8 @@ from rich.table import Table
 import agents.networks
 import trap_tube_jax as tt
 from agents import Config, make_learner
-from agents.command_line import parse
 from agents.examples import plain_ppo
 from benchmarks import harness
-from trap_tube_jax.command_line import plain_errors
 
 NetworkName = Literal["paper", "dense", "feedforward"]
 ProgramName = Literal["ours", "plain", "plain-by-step", "rejax"]
@@ -254,7 +252,7 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     cases: list[tuple[str, NetworkName]] = [
         (name, network) for name in options.sets for network in options.networks
     ]
@@ -276,11 +274,10 @@ def main(options: Options) -> list[Speed]:
                 f"{speeds[0].steps_per_s / speed.steps_per_s:.1f}",
                 f"{speed.timing.compile_s:.1f}",
             )
-    console.print(table)
     harness.write_record("learner_peers", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.learner_peers"))
+    harness.run(main, Options, "learner_peers")

@@ -13,10 +13,8 @@ from rich.table import Table
 
 import trap_tube_jax as tt
 from agents import Config, TrainState, make_learner
-from agents.command_line import parse
 from agents.runs import compilation
 from benchmarks import harness
-from trap_tube_jax.command_line import plain_errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +97,7 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     if options.cache:
         compilation.enable_cache()
     preset = Config.preset(options.preset)
@@ -120,11 +118,10 @@ def main(options: Options) -> list[Speed]:
             f"{speed.steps_per_s:,.0f}",
             f"{speed.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("seeds", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.seeds"))
+    harness.run(main, Options, "seeds")

@@ -17,12 +17,10 @@ import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
-from agents.command_line import parse
 from agents.curiosity import Experience
 from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
 from benchmarks import harness
-from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.state import take
 
 
@@ -162,7 +160,7 @@ def _sum_over_minibatches(
 
 
 def main(options: Options) -> list[Part]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     configs = [Config.preset(options.preset, env_id=tt.task_set(each).id) for each in options.sets]
     console = harness.begin(options)
     table = Table(
@@ -179,11 +177,10 @@ def main(options: Options) -> list[Part]:
             f"{part.steps_per_s:,.0f}",
             f"{part.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("train_throughput", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.train_throughput"))
+    harness.run(main, Options, "train_throughput")

@@ -135,6 +135,19 @@ def test_nothing_is_unpickled():
         assert not re.search("allow_pickle|read_pickle", ast.unparse(tree)), module
 
 
+def test_signals_end_every_command_alike():
+    """Examples are programs to copy, and no commands."""
+    commands = {
+        module: ast.unparse(tree.body[-1])
+        for module, tree in TREES.items()
+        if tree.body and "__main__" in ast.unparse(tree.body[-1])
+    }
+    assert {"agents.train", "trap_tube_jax.play", "benchmarks.peers"} <= commands.keys()
+    for module, code in commands.items():
+        if not module.startswith("agents.examples."):
+            assert re.search(r"\b(run_command|harness\.run)\(", code), module
+
+
 def test_the_environment_is_light(tmp_path):
     """Libraries that JAX, Flax and NumPy import themselves are free."""
     program = """

@@ -21,7 +21,7 @@ from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
 from agents.curiosity import Curiosity, Experience
 from agents.networks.agent import Agent, Params
-from agents.networks.layers import init_module
+from agents.networks.layers import assert_floats, init_module
 from agents.parallel.devices import ONE_DEVICE, EpisodeAxis
 from agents.ppo import advantages, losses, machine, returns
 from agents.ppo.motion import MotionHead, motion_loss
@@ -200,9 +200,11 @@ class Learner:
         experience = self.experience(state.params, trajectory.episodes)
         mask = trajectory.episodes.mask
         params = state.params["curiosity"]
-        reward, memory = self.curiosity.reward(params, state.memory, experience)
+        returned = self.curiosity.reward(params, state.memory, experience)
         with contract("curiosity", self.config.curiosity):
-            chex.assert_trees_all_equal_shapes_and_dtypes((reward, memory), (mask, state.memory))
+            shapes = jax.eval_shape(lambda: returned)
+            chex.assert_trees_all_equal_shapes_and_dtypes(shapes, (mask, state.memory))
+        reward, memory = returned
         return jnp.where(mask > 0, reward, 0.0), memory
 
     def make_batch(
@@ -287,14 +289,18 @@ class Learner:
             )
             motion = motion_loss(logits, batch.episodes.cells)
             terms["motion_loss"] = config.motion_coef * losses.padded_mean(motion, mask)
-        for name, term in self.curiosity.losses(params["curiosity"], experience).items():
+        found = self.curiosity.losses(params["curiosity"], experience)
+        with contract("curiosity", config.curiosity):
+            assert isinstance(found, dict), f"losses are {type(found).__name__}, not a dict"
+            shapes = jax.eval_shape(lambda: found)
+            chex.assert_trees_all_equal_shapes_and_dtypes(shapes, dict.fromkeys(found, mask))
+        for name, term in found.items():
             if name in terms or not name.endswith("_loss"):
                 raise ValueError(
                     f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
                     f"differ from {', '.join(terms)}; got {name!r}"
                 )
-            with contract("curiosity", config.curiosity):
-                terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
+            terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         total = sum(terms.values(), jnp.zeros((), jnp.float32))
         mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
         return total, {**terms, "loss": total, "entropy": mean_entropy}
@@ -329,6 +335,26 @@ class Learner:
         return metrics
 
 
+def make_curiosity(config: Config, env: tt.Environment) -> Curiosity:
+    """Builds the curiosity of some settings.
+
+    Raises:
+      ValueError: a registered curiosity breaks its contract.
+    """
+    curiosity = curiosities.factory(config.curiosity)(config, env)
+    with contract("curiosity", config.curiosity):
+        kind = type(curiosity).__name__
+        assert isinstance(curiosity, Curiosity), f"{kind} is no agents.curiosity.Curiosity"
+        boards = jnp.zeros((2, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
+        params = jax.eval_shape(curiosity.init, jax.random.key(0), boards[:1])
+        assert_floats(params)
+        features = jax.eval_shape(curiosity.encode, params, boards)
+        assert isinstance(features, jax.ShapeDtypeStruct), "encode must return an array"
+        chex.assert_shape(features, (len(boards), None))
+        chex.assert_type(features, jnp.float32)
+    return curiosity
+
+
 def make_learner(
     config: Config, env: tt.Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
@@ -351,7 +377,7 @@ def make_learner(
     if env is None:
         env = tt.make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
     config.validate(env)
-    curiosity = curiosities.factory(config.curiosity)(config, env)
+    curiosity = make_curiosity(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))
     if axis.size > 1 and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in memory):
         raise ValueError(

@@ -22,6 +22,7 @@ from agents.acting.symmetry import Symmetry
 from agents.arrays import to_arrays
 from agents.curiosity import Curiosity, Experience
 from agents.networks.encoder import Encoder
+from agents.networks.layers import init_module
 from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
@@ -310,6 +311,38 @@ def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returne
         jax.eval_shape(custom.iterate, custom.init(jax.random.key(0)))
 
 
+class Broken(Curiosity):
+    """Has other methods."""
+
+    def __init__(self, **methods):
+        vars(self).update(methods)
+
+
+@pytest.mark.parametrize(
+    ("curiosity", "message"),
+    [
+        (None, "NoneType is no agents.curiosity.Curiosity"),
+        (Broken(init=lambda *_: {"n": jnp.arange(3)}), r"parameter \['n'\] is int32"),
+        (Broken(init=lambda key, x: init_module(Normalised(), key, x)), "batch_stats"),
+        (Broken(encode=lambda *_: None), "encode must return an array"),
+        (Broken(encode=lambda *_: jnp.zeros((1, 4))), r"\(1, 4\)"),
+        (Broken(encode=lambda params, x: jnp.zeros((len(x), 4), int)), "int32"),
+        (Broken(reward=lambda *_: None), "'none' breaks its contract"),
+        (Broken(reward=lambda *_: (0.0, ())), r"\(\) != \(2, 6\)"),
+        (Broken(losses=lambda *_: None), "losses are NoneType, not a dict"),
+        (Broken(losses=lambda *_: {"my_loss": None}), "'none' breaks its contract"),
+    ],
+)
+def test_whatever_a_curiosity_returns_is_refused_in_one_line(curiosity, message, with_curiosity):
+    def train() -> None:
+        made = with_curiosity(curiosity)
+        jax.eval_shape(made.iterate, jax.eval_shape(made.init, jax.random.key(0)))
+
+    with pytest.raises(ValueError, match=message) as error:
+        train()
+    assert "\n" not in str(error.value)
+
+
 class Maps(nn.Module):
     """Returns maps instead of vectors."""
 
@@ -333,6 +366,15 @@ class Normalised(nn.Module):
         return nn.BatchNorm(use_running_average=False)(flat)
 
 
+class Integer(nn.Module):
+    """Has a parameter that no gradient trains."""
+
+    @nn.compact
+    def __call__(self, observation):
+        count = self.param("count", lambda key: 3)
+        return observation.reshape(len(observation), -1) * jnp.float32(count)
+
+
 class Noisy(nn.Module):
     """Draws at random."""
 
@@ -348,6 +390,7 @@ class Noisy(nn.Module):
         (Maps(), r"encoder 'mine' .*\(1, 12, 12, 3\)"),
         (Whole(), "encoder 'mine' .*uint8"),
         (Normalised(), "encoder 'mine' .*batch_stats"),
+        (Integer(), "encoder 'mine' .*count.* is int32"),
         (Noisy(), "encoder 'mine' .*dropout"),
         (nnx.Linear(3, 4, rngs=nnx.Rngs(0)), "must be a flax.linen.Module, got Linear"),
         (None, "must be a flax.linen.Module, got NoneType"),
