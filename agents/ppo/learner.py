@@ -9,7 +9,6 @@ Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO"
 import dataclasses
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -19,15 +18,14 @@ from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
-from agents.curiosity import Curiosity, Experience
+from agents.curiosity import Curiosity, Experience, make_curiosity
 from agents.networks.agent import Agent, Params
-from agents.networks.layers import assert_floats, init_module
+from agents.networks.layers import init_module
 from agents.parallel.devices import ONE_DEVICE, EpisodeAxis
 from agents.ppo import advantages, losses, machine, returns
 from agents.ppo.motion import MotionHead, motion_loss
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
-from agents.registry import contract, curiosities
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import take
 
@@ -200,11 +198,7 @@ class Learner:
         experience = self.experience(state.params, trajectory.episodes)
         mask = trajectory.episodes.mask
         params = state.params["curiosity"]
-        returned = self.curiosity.reward(params, state.memory, experience)
-        with contract("curiosity", self.config.curiosity):
-            shapes = jax.eval_shape(lambda: returned)
-            chex.assert_trees_all_equal_shapes_and_dtypes(shapes, (mask, state.memory))
-        reward, memory = returned
+        reward, memory = self.curiosity.reward(params, state.memory, experience)
         return jnp.where(mask > 0, reward, 0.0), memory
 
     def make_batch(
@@ -289,17 +283,7 @@ class Learner:
             )
             motion = motion_loss(logits, batch.episodes.cells)
             terms["motion_loss"] = config.motion_coef * losses.padded_mean(motion, mask)
-        found = self.curiosity.losses(params["curiosity"], experience)
-        with contract("curiosity", config.curiosity):
-            assert isinstance(found, dict), f"losses are {type(found).__name__}, not a dict"
-            shapes = jax.eval_shape(lambda: found)
-            chex.assert_trees_all_equal_shapes_and_dtypes(shapes, dict.fromkeys(found, mask))
-        for name, term in found.items():
-            if name in terms or not name.endswith("_loss"):
-                raise ValueError(
-                    f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
-                    f"differ from {', '.join(terms)}; got {name!r}"
-                )
+        for name, term in self.curiosity.losses(params["curiosity"], experience).items():
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         total = sum(terms.values(), jnp.zeros((), jnp.float32))
         mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
@@ -333,26 +317,6 @@ class Learner:
         if len(replayed):
             metrics["replayed_success"] = jnp.mean(replayed)
         return metrics
-
-
-def make_curiosity(config: Config, env: tt.Environment) -> Curiosity:
-    """Builds the curiosity of some settings.
-
-    Raises:
-      ValueError: a registered curiosity breaks its contract.
-    """
-    curiosity = curiosities.factory(config.curiosity)(config, env)
-    with contract("curiosity", config.curiosity):
-        kind = type(curiosity).__name__
-        assert isinstance(curiosity, Curiosity), f"{kind} is no agents.curiosity.Curiosity"
-        boards = jnp.zeros((2, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
-        params = jax.eval_shape(curiosity.init, jax.random.key(0), boards[:1])
-        assert_floats(params)
-        features = jax.eval_shape(curiosity.encode, params, boards)
-        assert isinstance(features, jax.ShapeDtypeStruct), "encode must return an array"
-        chex.assert_shape(features, (len(boards), None))
-        chex.assert_type(features, jnp.float32)
-    return curiosity
 
 
 def make_learner(

@@ -300,8 +300,8 @@ def with_curiosity(monkeypatch):
         ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(2, 6\)"),
         ({"reward": jnp.zeros((2, 6), jnp.int32)}, "'none' .*int32 != float32"),
         ({"given": jnp.zeros(2, jnp.int32)}, r"'none' .*\(2,\) != \(\)"),
-        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got 'policy_loss'"),
-        ({"losses": ["mine"]}, "'none': .* entropy_loss; got 'mine'"),
+        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got policy_loss"),
+        ({"losses": ["mine"]}, "'none' .* motion_loss; got mine"),
         ({"losses": {"my_loss": jnp.ones(3)}}, r"'none' .*\(3,\)"),
     ],
 )
