@@ -10,18 +10,16 @@ from typing import Any, Literal, Self, get_args, get_origin
 import jax
 import numpy as np
 
+import trap_tube_jax as tt
 from agents import registry
 from trap_tube_jax.checks import did_you_mean
-from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import AGENT, FOOD, base_palette
-from trap_tube_jax.registry import task_set
-from trap_tube_jax.transfers import perceptual, structural, symbolic
+from trap_tube_jax.objects import AGENT, FOOD
 
 MAX_INT32 = 2**31 - 1  # the largest i32, in which training counts
 KEEP_COLORS = {
-    perceptual,
-    structural,
-    symbolic,
+    tt.perceptual,
+    tt.structural,
+    tt.symbolic,
 }  # transfers after which agent and food look the same
 GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
@@ -218,9 +216,9 @@ class Config:
 
     def step_limit(self, name: str) -> int:
         """Returns the step limit of training episodes on a task set."""
-        return task_set(name).max_steps if self.max_steps is None else self.max_steps
+        return tt.task_set(name).max_steps if self.max_steps is None else self.max_steps
 
-    def validate(self, env: Environment) -> None:
+    def validate(self, env: tt.Environment) -> None:
         """Raises ValueError unless these settings can be trained with in an environment."""
         for name in ("num_features", "max_steps"):
             if getattr(self, name) not in (None, getattr(env, name)):
@@ -314,9 +312,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def _check_known_colors(env: Environment) -> None:
+def _check_known_colors(env: tt.Environment) -> None:
     """Raises ValueError if agent or food may have another colour than in the base task."""
-    known = base_palette(env.num_features)[[AGENT, FOOD]].tolist()
+    known = tt.base_palette(env.num_features)[[AGENT, FOOD]].tolist()
     palettes: Any = [env.base.palette]
     if not set(env.transfers) <= KEEP_COLORS:
         states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 16))

@@ -16,7 +16,6 @@ from agents.runs.report import save_first_solved
 from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.scoring.tasks import Purpose
-from trap_tube_jax.solver import solve_batch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     shortest = None
     if options.optimality:
         announce("Searching for shortest plans, up to a minute per 1,000 tasks")
-        shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
+        shortest = {name: tt.solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
     announce(f"Playing {tasks:,} tasks of every set, up to a minute per 1,000")
     played = evaluator(policy.params)
     scores = evaluator.scores(played, shortest)

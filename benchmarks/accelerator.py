@@ -11,8 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from agents.command_line import parse
-from trap_tube_jax.command_line import plain_errors
+from benchmarks import harness
 
 # The module and its options, by the name of the record. `gpu_best_second_start` finds the programs
 # that `gpu_best_first_start` has compiled.
@@ -85,5 +84,4 @@ def run(name: str, words: list[str], options: Options) -> bool:
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        sys.exit(bool(main(parse(Options, None, "python -m benchmarks.accelerator"))))
+    harness.run(lambda options: sys.exit(bool(main(options))), Options, "accelerator")

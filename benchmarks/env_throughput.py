@@ -14,12 +14,9 @@ import numpy as np
 from rich.table import Table
 
 import trap_tube_jax as tt
-from agents.command_line import parse
 from benchmarks import harness
 from trap_tube_jax.checks import check_integer
-from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.objects import NUM_DIRECTIONS
-from trap_tube_jax.vector import VectorEnvironment
 
 DENSE_UNITS = 64
 ONE_HOT_LEVELS = 8
@@ -175,7 +172,7 @@ def task_set_subject(task_set: str, *, plain: bool = False) -> Subject:
         reset = jax.vmap(auto_reset.reset)
         step = jax.vmap(auto_reset.step)
     else:
-        vector = VectorEnvironment(env)
+        vector = tt.VectorEnvironment(env)
         reset = vector.reset
         step = vector.step
     return Subject(task_set, reset, step, sample_actions, lambda timestep: timestep.observation)
@@ -239,15 +236,15 @@ def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]
     Arguments and results have an additional first axis for the devices.
     """
 
-    def own(*arrays: Any) -> Any:
+    def on_one(*arrays: Any) -> Any:
         result = function(*jax.tree.map(lambda x: x[0], arrays))
         return jax.tree.map(lambda x: x[None], result)
 
     if devices == 1:
-        return own
+        return on_one
     mesh = jax.make_mesh((devices,), ("devices",), axis_types=(jax.sharding.AxisType.Auto,))
     part = jax.sharding.PartitionSpec("devices")
-    return jax.shard_map(own, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+    return jax.shard_map(on_one, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
 
 
 def use_devices(number: int) -> None:
@@ -276,7 +273,7 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
 
 
 def main(options: Options) -> list[Throughput]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
     console = harness.begin(options)
     bandwidth = copy_bandwidth()
@@ -297,11 +294,10 @@ def main(options: Options) -> list[Throughput]:
             f"{result.bytes_per_s / bandwidth:.0%}",
             f"{result.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("env_throughput", options, results, copy_bytes_per_s=bandwidth)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.env_throughput"))
+    harness.run(main, Options, "env_throughput")

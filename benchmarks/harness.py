@@ -20,11 +20,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import jax
-from rich.console import Console
 
+from agents.command_line import parse
+from agents.runs.console import CommandConsole
 from agents.runs.provenance import commit, provenance
 from trap_tube_jax.checks import check_integer
-from trap_tube_jax.command_line import announce
+from trap_tube_jax.command_line import announce, plain_errors
+from trap_tube_jax.interruptions import run_command
 
 SCHEMA = "trap-tube-jax benchmark 2"
 
@@ -56,17 +58,27 @@ class Options:
             )
 
 
-def begin(options: Options) -> Console:
+def begin(options: Options) -> CommandConsole:
     """Checks the options, and prints the machine and how long measuring takes.
 
     Raises:
       ValueError: see `Options.check`.
     """
     options.check()
-    console = Console()
+    console = CommandConsole()
     console.print(machine())
     announce("Compiling and measuring, up to a minute per row on an idle machine")
     return console
+
+
+def run(main: Callable[[Any], Any], options: type, benchmark: str) -> None:
+    """Runs the command line of a benchmark, a module of `benchmarks`; see `run_command`."""
+
+    @plain_errors()
+    def command_line() -> None:
+        main(parse(options, None, f"python -m benchmarks.{benchmark}"))
+
+    run_command(command_line)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Times a whole iteration, rollout and update, of `agents.ppo`, of the program in
 `agents/examples/plain_ppo.py` (recurrent PPO with ICM) and of rejax's PPO, in turn within one
-process. Settings are those of preset `paper`, with fewer episodes and epochs. There are three
+process. Settings follow preset `paper`, with fewer episodes and epochs. There are three
 networks; the others' programs play the last two through the gymnax adapter, which needs the extra
 `[interop]`:
 
@@ -27,11 +27,8 @@ from rich.table import Table
 import agents.networks
 import trap_tube_jax as tt
 from agents import Config, make_learner
-from agents.command_line import parse
 from agents.examples import plain_ppo
 from benchmarks import harness
-from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.state import State, TimeStep
 
 NetworkName = Literal["paper", "dense", "feedforward"]
 ProgramName = Literal["ours", "plain", "plain-by-step", "rejax"]
@@ -114,20 +111,20 @@ class ThroughGymnax:
         self.observation_spec = self._env.observation_space()
         self.max_steps = config.step_limit(config.env_id)
 
-    def reset(self, key: jax.Array) -> tuple[tuple[State, jax.Array], TimeStep]:
+    def reset(self, key: jax.Array) -> tuple[tuple[tt.State, jax.Array], tt.TimeStep]:
         """Draws a task."""
         key, reset_key = jax.random.split(key)
         observation, state = self._env.reset(reset_key, self._params)
         flags = (state.terminated, state.truncated)
-        return (state, key), TimeStep(observation, jnp.zeros(()), *flags, jnp.ones(()))
+        return (state, key), tt.TimeStep(observation, jnp.zeros(()), *flags, jnp.ones(()))
 
-    def step(self, state: tuple[State, jax.Array], action: jax.Array) -> tuple[Any, TimeStep]:
+    def step(self, state: tuple[tt.State, jax.Array], action: jax.Array) -> tuple[Any, tt.TimeStep]:
         """Takes one action; the next task follows the end of an episode."""
         key, step_key = jax.random.split(state[1])
         stepped = self._env.step(step_key, state[0], action, self._params)
         observation, inner, reward, _, info = stepped
         flags = (info["terminated"], info["truncated"], info["discount"])
-        return (inner, key), TimeStep(observation, reward, *flags)
+        return (inner, key), tt.TimeStep(observation, reward, *flags)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +163,7 @@ def plain_program(learner: plain_ppo.PlainPPO) -> Program:
 
     def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
         state, batch, minibatches = learner.collect(state)
-        update = lambda state, places: learner.update(state, batch, places)  # noqa: E731
+        update = lambda state, chosen: learner.update(state, batch, chosen)  # noqa: E731
         state, _ = jax.lax.scan(update, state, minibatches)
         return state, jnp.sum(batch[0].mask)
 
@@ -179,13 +176,13 @@ def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
     state = jax.jit(learner.init)(jax.random.key(0))
     collect, collect_s = harness.compiled(learner.collect, state)
     _, batch, minibatches = jax.eval_shape(learner.collect, state)
-    places = jax.ShapeDtypeStruct(minibatches.shape[1:], minibatches.dtype)
-    update, update_s = harness.compiled(learner.update, state, batch, places)
+    chosen = jax.ShapeDtypeStruct(minibatches.shape[1:], minibatches.dtype)
+    update, update_s = harness.compiled(learner.update, state, batch, chosen)
 
     def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
         state, batch, minibatches = collect(state)
-        for places in minibatches:
-            state, _ = update(state, batch, places)
+        for chosen in minibatches:
+            state, _ = update(state, batch, chosen)
         return state, jnp.sum(batch[0].mask)
 
     return iterate, collect_s + update_s, state
@@ -255,7 +252,7 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     cases: list[tuple[str, NetworkName]] = [
         (name, network) for name in options.sets for network in options.networks
     ]
@@ -277,11 +274,10 @@ def main(options: Options) -> list[Speed]:
                 f"{speeds[0].steps_per_s / speed.steps_per_s:.1f}",
                 f"{speed.timing.compile_s:.1f}",
             )
-    console.print(table)
     harness.write_record("learner_peers", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.learner_peers"))
+    harness.run(main, Options, "learner_peers")

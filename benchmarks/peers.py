@@ -14,10 +14,8 @@ import jax
 import jax.numpy as jnp
 from rich.table import Table
 
-from agents.command_line import parse
 from benchmarks import env_throughput, harness
 from benchmarks.env_throughput import StepOptions, Subject, Throughput
-from trap_tube_jax.command_line import plain_errors
 
 
 def gymnax_breakout() -> Subject:
@@ -129,7 +127,7 @@ def measure(
 
 
 def main(options: Options) -> None:
-    """Measures, prints a table and the skipped peers, and writes the record."""
+    """Measures, writes the record, and prints a table and the skipped peers."""
     subjects = [env_throughput.task_set_subject(name) for name in options.sets]
     console = harness.begin(options)
     results, skipped = measure(options, subjects)
@@ -147,11 +145,11 @@ def main(options: Options) -> None:
             f"{result.bytes_per_s / 1e9:.2f}",
             f"{result.timing.compile_s:.1f}",
         )
+    harness.write_record("peers", options, results, skipped=skipped)
     console.print(table)
     console.print("ratio: speed of the first subject over this one; µs of one environment's step")
     for name, reason in skipped.items():
         console.print(f"skipped {name}: {reason}", markup=False)
-    harness.write_record("peers", options, results, skipped=skipped)
 
 
 def _measure(subjects: Sequence[Subject], options: StepOptions) -> list[Throughput]:
@@ -191,5 +189,4 @@ def _split(key: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.peers"))
+    harness.run(main, Options, "peers")

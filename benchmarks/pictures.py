@@ -15,6 +15,7 @@ import trap_tube_jax as tt
 from agents.sweeps import figures, tables
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
+from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.scoring.tasks import label
 from trap_tube_jax.state import take
 
@@ -221,4 +222,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -11,12 +11,10 @@ import jax
 import jax.numpy as jnp
 from rich.table import Table
 
+import trap_tube_jax as tt
 from agents import Config, TrainState, make_learner
-from agents.command_line import parse
 from agents.runs import compilation
 from benchmarks import harness
-from trap_tube_jax import task_set
-from trap_tube_jax.command_line import plain_errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Options(harness.Options):
       sets: task sets to train on, by id or short name; by default the preset's.
       seeds: numbers of seeds in one program; 1 trains without `jax.vmap`.
       iterations: iterations per timed call.
-      cache: keeps compiled programs, and uses those of earlier commands.
+      cache: keeps compiled programs for later commands, and uses earlier ones.
     """
 
     repeats: int = 3
@@ -69,7 +67,8 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
     init = learner.init
     iterate = learner.iterate
     if seeds > 1:
-        init, iterate = jax.vmap(init), jax.vmap(iterate)
+        init = jax.vmap(init)
+        iterate = jax.vmap(iterate)
     else:
         keys = keys[0]
 
@@ -98,11 +97,11 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, prints a table and writes the record."""
+    """Measures, writes the record and prints a table."""
     if options.cache:
         compilation.enable_cache()
     preset = Config.preset(options.preset)
-    names = [task_set(name).id for name in options.sets or (preset.env_id,)]
+    names = [tt.task_set(name).id for name in options.sets or (preset.env_id,)]
     configs = [Config.preset(options.preset, env_id=name) for name in names]
     console = harness.begin(options)
     columns = ("set", "path", "seeds", "s/iteration", "steps/s", "compile, s")
@@ -112,18 +111,17 @@ def main(options: Options) -> list[Speed]:
         speed = measure(config, seeds, options)
         results.append(speed)
         table.add_row(
-            task_set(config.env_id).short,
+            tt.task_set(config.env_id).short,
             speed.path,
             str(seeds),
             f"{speed.seconds:.3f}",
             f"{speed.steps_per_s:,.0f}",
             f"{speed.timing.compile_s:.1f}",
         )
-    console.print(table)
     harness.write_record("seeds", options, results)
+    console.print(table)
     return results
 
 
 if __name__ == "__main__":
-    with plain_errors():
-        main(parse(Options, None, "python -m benchmarks.seeds"))
+    harness.run(main, Options, "seeds")

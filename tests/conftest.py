@@ -85,4 +85,4 @@ def own_names(own_task_sets: None) -> Iterator[None]:
     for kind, names in zip(kinds, known, strict=True):
         for name in set(kind) - names:
             del kind[name]
-            kind.own.discard(name)
+            kind.registered.discard(name)

@@ -135,6 +135,19 @@ def test_nothing_is_unpickled():
         assert not re.search("allow_pickle|read_pickle", ast.unparse(tree)), module
 
 
+def test_signals_end_every_command_alike():
+    """Examples are programs to copy, and no commands."""
+    commands = {
+        module: ast.unparse(tree.body[-1])
+        for module, tree in TREES.items()
+        if tree.body and "__main__" in ast.unparse(tree.body[-1])
+    }
+    assert {"agents.train", "trap_tube_jax.play", "benchmarks.peers"} <= commands.keys()
+    for module, code in commands.items():
+        if not module.startswith("agents.examples."):
+            assert re.search(r"\b(run_command|harness\.run)\(", code), module
+
+
 def test_the_environment_is_light(tmp_path):
     """Libraries that JAX, Flax and NumPy import themselves are free."""
     program = """
@@ -162,7 +175,8 @@ def modules_of(requirements: list[str]) -> set[str]:
 
 
 def test_the_wheel_holds_the_environment_and_what_it_imports():
-    project, build = SETTINGS["project"], SETTINGS["tool"]["hatch"]
+    project = SETTINGS["project"]
+    build = SETTINGS["tool"]["hatch"]
     assert build["build"]["targets"]["wheel"] == {"packages": ["trap_tube_jax"]}
     extras = project["optional-dependencies"]
     required = modules_of(project["dependencies"])

@@ -45,6 +45,7 @@ class _Process:
 
     def __init__(self) -> None:
         self.is_command = False  # else the process is somebody's, as a notebook's
+        self.terminal_modes: Any = None  # before the command changes them
         self.hint: Callable[[], str] = lambda: "The same command starts again."
         self.blocks: list[_Block] = []  # the present `deferring`, within others
 
@@ -66,10 +67,11 @@ def receive(number: int) -> None:
         block.received = number
         block.on_first()
     elif _process.is_command:
-        if sys.stdout is not None and sys.stdout.isatty():
-            _write(SHOW_CURSOR, end="")
-        _write_stopped()
-        os._exit(128 + number)  # else the compiler's threads crash a process that takes leave
+        try:
+            _restore_terminal()
+            _write_stopped()
+        finally:
+            os._exit(128 + number)  # else the compiler's threads crash a process that takes leave
     else:
         raise KeyboardInterrupt
 
@@ -121,6 +123,7 @@ def run_command(main: Callable[[], Any]) -> None:
     Signals are read by a thread, since Python's handlers wait for a running compiler or program.
     """
     _process.is_command = True
+    _process.terminal_modes = _terminal_modes()
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -154,6 +157,25 @@ def _handle(handler: Any) -> dict[int, Any]:
     is_main = threading.current_thread() is threading.main_thread()
     handled = [n for n in SIGNALS if is_main and signal.getsignal(n) is not signal.SIG_IGN]
     return {number: signal.signal(number, handler) for number in handled}
+
+
+def _terminal_modes() -> Any:
+    """Returns the modes of the terminal that stdin is, such as echo; None if it is none."""
+    with contextlib.suppress(Exception):
+        import termios  # noqa: PLC0415  Windows has none
+
+        return termios.tcgetattr(0)
+
+
+def _restore_terminal() -> None:
+    """Shows the cursor, and restores the modes that a game or a prompt for a password changes."""
+    if sys.stdout is not None and sys.stdout.isatty():
+        _write(SHOW_CURSOR, end="")
+    with contextlib.suppress(Exception):  # there is no terminal, or it is closed
+        import termios  # noqa: PLC0415
+
+        if _process.terminal_modes and os.tcgetpgrp(0) == os.getpgrp():  # not in the background
+            termios.tcsetattr(0, termios.TCSANOW, _process.terminal_modes)
 
 
 def _write_stopped() -> None:

@@ -19,6 +19,7 @@ from trap_tube_jax.command_line import add_import_option, plain_errors
 from trap_tube_jax.dynamics import holds_tool
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.imports import import_modules
+from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.objects import (
     AGENT,
     BOARD_SIZE,
@@ -204,7 +205,7 @@ def _play(game: Game) -> None:
     """Draws and reads keys until the player quits; raises ValueError without a terminal."""
     if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout)):
         raise ValueError("play needs a terminal; its input or output is not one")
-    with _single_keys(sys.stdin.fileno()) as terminal, contextlib.suppress(KeyboardInterrupt):
+    with _single_keys(sys.stdin.fileno()) as terminal:
         while True:
             print(CLEAR_SCREEN + screen(game), flush=True)
             typed = os.read(terminal, 64).decode(errors="replace")
@@ -234,4 +235,4 @@ def _single_keys(terminal: int) -> Iterator[int]:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

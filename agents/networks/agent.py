@@ -10,7 +10,7 @@ from agents.config import Config
 from agents.networks import make_encoder
 from agents.networks.actions import ActionDistribution
 from agents.networks.core import Core, Heads
-from agents.networks.layers import draw
+from agents.networks.layers import assert_only_params, draw
 from agents.registry import contract
 from trap_tube_jax.objects import BOARD_SIZE
 
@@ -22,7 +22,7 @@ PARTS = ("encoder", "core", "heads")  # the policy network's parameters
 class Agent:
     """Functions of the policy network; their parameters are a dictionary of `PARTS`.
 
-    `scan_unroll` is that of `Core`.
+    `scan_unroll` is passed to `Core`.
     """
 
     def __init__(self, config: Config, scan_unroll: int = 1):
@@ -46,7 +46,7 @@ class Agent:
             features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
             chex.assert_shape(features, (1, None))  # [M, F]
             chex.assert_type(features, jnp.float32)
-            assert set(encoder) <= {"params"}, f"collections {', '.join(encoder)}, not params alone"
+            assert_only_params(encoder)
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action = jnp.zeros((1, 2), jnp.int32)
         reward = jnp.zeros(1, jnp.float32)

@@ -61,7 +61,7 @@ def variance_scaling(scale: float) -> Callable[..., Undrawn]:
 def draw(key: jax.Array, params: Any) -> Any:
     """Samples every `Undrawn` from a normal distribution truncated at two standard deviations."""
     leaves, structure = jax.tree.flatten(params, is_leaf=_is_undrawn)
-    ends = np.cumsum([nn.meta.unbox(leaf).size for leaf in leaves])
+    ends = np.cumsum([jnp.size(nn.meta.unbox(leaf)) for leaf in leaves])
     noise = jax.random.truncated_normal(key, -2, 2, (ends[-1],), jnp.float32) / TRUNCATED_STD
     drawn = [
         leaf.std * part.reshape(leaf.std.shape) if _is_undrawn(leaf) else leaf
@@ -71,9 +71,28 @@ def draw(key: jax.Array, params: Any) -> Any:
 
 
 def init_module(module: nn.Module, key: jax.Array, *inputs: Any) -> Any:
-    """Initialises the parameters of any module, given example inputs of its call."""
+    """Initialises the parameters of any module, given example inputs of its call.
+
+    Raises AssertionError if the module has other variables than parameters of floats.
+    """
     # Only layers of Flax use the folded key.
-    return draw(key, module.init(jax.random.fold_in(key, 0), *inputs))
+    variables = module.init(jax.random.fold_in(key, 0), *inputs)
+    assert_only_params(variables)
+    return draw(key, variables)
+
+
+def assert_only_params(variables: Any) -> None:
+    """Raises AssertionError unless the variables of a module are parameters of floats."""
+    assert set(variables) <= {"params"}, f"collections {', '.join(variables)}, not params alone"
+    assert_floats(variables)
+
+
+def assert_floats(params: Any) -> None:
+    """Raises AssertionError unless all parameters are floats, since gradients train them."""
+    shapes = jax.eval_shape(lambda: params)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
+        name = jax.tree_util.keystr(path)
+        assert jnp.issubdtype(leaf.dtype, jnp.floating), f"parameter {name} is {leaf.dtype}"
 
 
 def _is_undrawn(leaf: Any) -> bool:

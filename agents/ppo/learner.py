@@ -9,16 +9,16 @@ Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO"
 import dataclasses
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
 
+import trap_tube_jax as tt
 from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
-from agents.curiosity import Curiosity, Experience
+from agents.curiosity import Curiosity, Experience, make_curiosity
 from agents.networks.agent import Agent, Params
 from agents.networks.layers import init_module
 from agents.parallel.devices import ONE_DEVICE, EpisodeAxis
@@ -26,10 +26,7 @@ from agents.ppo import advantages, losses, machine, returns
 from agents.ppo.motion import MotionHead, motion_loss
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
-from agents.registry import contract, curiosities
-from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import BOARD_SIZE
-from trap_tube_jax.registry import make
 from trap_tube_jax.state import take
 
 Metrics = dict[str, jax.Array]
@@ -109,7 +106,7 @@ class Learner:
     """
 
     config: Config
-    env: Environment
+    env: tt.Environment
     agent: Agent
     encoding: Encoding
     curiosity: Curiosity
@@ -202,8 +199,6 @@ class Learner:
         mask = trajectory.episodes.mask
         params = state.params["curiosity"]
         reward, memory = self.curiosity.reward(params, state.memory, experience)
-        with contract("curiosity", self.config.curiosity):
-            chex.assert_trees_all_equal_shapes_and_dtypes((reward, memory), (mask, state.memory))
         return jnp.where(mask > 0, reward, 0.0), memory
 
     def make_batch(
@@ -289,13 +284,7 @@ class Learner:
             motion = motion_loss(logits, batch.episodes.cells)
             terms["motion_loss"] = config.motion_coef * losses.padded_mean(motion, mask)
         for name, term in self.curiosity.losses(params["curiosity"], experience).items():
-            if name in terms or not name.endswith("_loss"):
-                raise ValueError(
-                    f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
-                    f"differ from {', '.join(terms)}; got {name!r}"
-                )
-            with contract("curiosity", config.curiosity):
-                terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
+            terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         total = sum(terms.values(), jnp.zeros((), jnp.float32))
         mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
         return total, {**terms, "loss": total, "entropy": mean_entropy}
@@ -331,7 +320,7 @@ class Learner:
 
 
 def make_learner(
-    config: Config, env: Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
+    config: Config, env: tt.Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
     """Builds the learner for some settings, with the path that suits the machine.
 
@@ -350,9 +339,9 @@ def make_learner(
       Environment(transfers=(perceptual), max_steps=30)
     """
     if env is None:
-        env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
+        env = tt.make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
     config.validate(env)
-    curiosity = curiosities.factory(config.curiosity)(config, env)
+    curiosity = make_curiosity(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))
     if axis.size > 1 and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in memory):
         raise ValueError(

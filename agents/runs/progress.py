@@ -28,7 +28,6 @@ from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read
 from agents.runs.program import Metrics, Program
 from agents.runs.provenance import note_provenance
 from agents.runs.run import Run
-from trap_tube_jax.scoring.scores import Scores
 
 
 class Progress:
@@ -62,10 +61,13 @@ class Progress:
         self.folder = folder
         if stored.config.is_file():
             run.check_continues(stored.read()[0])
-        restored, self.last = restore(stored, run.config.iterations, program.state_shapes)
-        check_rows(stored, self.iteration)
+        restored, self.last = restore(stored, program.state_shapes)
+        done = self.iteration
+        if done > (limit := run.config.iterations):
+            raise ValueError(f"iterations must be at least {done}, which are done, got {limit}")
+        check_rows(stored, done)
         if program.validation:
-            check_best(stored, self.iteration, program.sets)
+            check_best(stored, done, program.sets)
         first = program.init(run.seed) if restored is None else restored
         self.state: Callable[[], TrainState] = lambda: first
 
@@ -140,7 +142,7 @@ class Progress:
         state = self.program.placement.local(self.state())
         checkpoint.save(self.folder.checkpoints, self.iteration, state, dict(self.last or {}))
 
-    def finish(self) -> Scores | None:
+    def finish(self) -> tt.Scores | None:
         """Plays the test tasks with the final policy, or the best one; writes the results.
 
         Returns the scores; None if all are in the files.

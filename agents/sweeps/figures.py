@@ -25,11 +25,13 @@ def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) ->
     See `tables.tables` for the arguments.
     """
     tested = tables.reported(results)
+    compared = tables.differences(tested)
     has_few = curves["algorithm"].nunique() <= len(COLORS)
     drawn = []
     for name, is_drawn, make in (
         ("curves.png", has_few, lambda: draw_curves(results, curves, about)),
         ("success.png", len(tested) > 0, lambda: draw_success(tested, about)),
+        ("differences.png", len(compared) > 0, lambda: draw_differences(compared, about)),
     ):
         path = root / name
         path.unlink(missing_ok=True)  # it may be of an earlier, smaller grid
@@ -99,6 +101,25 @@ def draw_success(tested: Table, about: Mapping[str, Any]) -> Any:
     axes[0].set_ylim(len(names) - 0.5, -0.5)
     what = "test tasks solved, %: mean, a point per seed"
     figure.supxlabel(f"{what}; paper: mean ± SD" if paper else what, fontsize=10)
+    return figure
+
+
+def draw_differences(compared: Table, about: Mapping[str, Any]) -> Any:
+    """Draws the differences of `tables.differences` by set, with their intervals."""
+    names = list(compared["algorithm"].unique())
+    sets = list(compared["task_set"].unique())
+    height = 0.25 * len(names) + 0.4
+    figure, axes = make_panels(list(map(label, sets)), 5, height, about["title"])
+    for axis, task_set in zip(axes, sets, strict=True):
+        rows = compared[compared["task_set"] == task_set].set_index("algorithm").loc[names]
+        axis.axvline(0, color="black", linewidth=0.8)
+        for row, (middle, low, high) in enumerate(rows[["difference", "low", "high"]].to_numpy()):
+            axis.plot([low, high], [row, row], color=COLORS[0])
+            axis.plot(middle, row, "o", color=COLORS[0], markersize=4)
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].set_ylim(len(names) - 0.5, -0.5)
+    what = f"test tasks solved, points above {compared['reference'].iloc[0]}"
+    figure.supxlabel(f"{what}: mean and 95 % interval", fontsize=10)
     return figure
 
 

@@ -23,7 +23,7 @@ COMMA = re.compile(r",(?![^\[]*\])")  # but not within a list
 class Options:
     """Trains every point of a grid of settings with every seed, several runs at a time.
 
-    Each run has a folder like those of agents.train. The grid's folder also holds results.csv, with
+    Each run has a folder, as with agents.train. The grid's folder also holds results.csv, with
     a row per run, evaluation and task set, table.md and figures. Ctrl-C saves all runs; repeating
     the command resumes them. Adding seeds or values of a setting extends the grid.
 

@@ -12,7 +12,8 @@ from agents.acting.rollout import Trajectory, rollout
 from agents.networks.core import Core
 from helpers import probes
 
-DISCOUNT, ITERATIONS = 0.5, 100
+DISCOUNT = 0.5
+ITERATIONS = 100
 CONFIG = Config(
     max_steps=probes.STEPS,
     episodes_per_iteration=64,

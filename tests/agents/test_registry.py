@@ -10,8 +10,8 @@ from helpers.refusal import assert_refused
 
 def test_a_name_of_yours_is_allowed_and_may_be_registered_again(own_names):
     register("mine", print)
-    register("mine", Curiosity)
-    assert curiosities.factory("mine") is Curiosity
+    register("mine", ours := lambda config, env: Curiosity())
+    assert curiosities.factory("mine") is ours
     assert Config(curiosity="mine").curiosity == "mine"
 
 
@@ -27,6 +27,13 @@ def test_unusable_names_are_refused(name, words):
     registry = Registry("reward")
     registry.update(a=Curiosity, b=Curiosity)
     assert_refused(words, registry.register, name, Curiosity)
+
+
+@pytest.mark.parametrize("factory", [Curiosity, Curiosity(), lambda config: Curiosity(), None])
+def test_a_factory_that_cannot_be_called_is_refused(factory):
+    words = ["curiosity 'mine' needs a function of (config, env): "]
+    assert_refused(words, register, "mine", factory)
+    assert "mine" not in curiosities
 
 
 @pytest.mark.parametrize("setting", ["curiosity", "encoder"])

@@ -80,6 +80,7 @@ def test_a_wrong_option_ends_in_one_line_before_measuring(
 
     monkeypatch.setattr(harness, "compiled", fail)
     monkeypatch.setattr(harness, "commit", lambda: "abc-dirty")
+    monkeypatch.setattr(harness, "run_command", lambda main: main())  # signals stay pytest's
     monkeypatch.setattr(sys, "argv", ["x", *arguments])
     with pytest.raises(SystemExit) as stopped:
         runpy.run_path(module.__file__, run_name="__main__")

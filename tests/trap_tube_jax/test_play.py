@@ -6,8 +6,10 @@ import os
 import pty
 import re
 import select
+import signal
 import subprocess
 import sys
+import termios
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ import pytest
 import trap_tube_jax as tt
 from helpers.refusal import refused
 from trap_tube_jax import play
+from trap_tube_jax.interruptions import SIGNALS
 
 UP = "\x1b[A"
 LEFT = "\x1b[D"
@@ -159,6 +162,37 @@ def read_until(terminal, text):
         assert ready, f"nothing more after {shown!r}"
         shown += os.read(terminal, 65536).decode()
     return shown
+
+
+# Plays as a shell's child, and says whether the terminal is as before.
+SHELL = """
+import os, signal, subprocess, sys, termios
+os.login_tty(0)
+before = termios.tcgetattr(0)
+game = subprocess.Popen([sys.executable, "-m", "trap_tube_jax.play"])
+signal.signal(signal.SIGUSR2, lambda *_: game.send_signal(int(sys.argv[1])))
+print("code", game.wait(), "restored", termios.tcgetattr(0) == before, "end")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_ends_a_game_and_leaves_the_terminal_as_before(number):
+    ours, theirs = pty.openpty()
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
+    process = subprocess.Popen([sys.executable, "-c", SHELL, str(number)], **streams)
+    os.close(theirs)
+    try:
+        read_until(ours, "quit")
+        assert not termios.tcgetattr(ours)[3] & termios.ECHO, "keys are unseen"
+        process.send_signal(signal.SIGUSR2)
+        shown = read_until(ours, "end")
+        assert "Stopped. The same command starts again.\r\n" in shown
+        assert f"code {128 + number} restored True" in shown
+    finally:
+        process.kill()
+        process.wait()
+        os.close(ours)
 
 
 def test_a_game_starts_and_quits_in_a_real_terminal():

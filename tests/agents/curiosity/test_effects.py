@@ -12,7 +12,8 @@ from agents.curiosity import Experience
 from agents.curiosity.effects import Effects, new_effects
 from trap_tube_jax.objects import DIRECTIONS
 
-STEPS, BATCH = 40, 48
+STEPS = 40
+BATCH = 48
 
 
 def random_episodes(env: tt.Environment) -> Episodes:
@@ -53,12 +54,14 @@ def read_off(
     rest[is_agent | is_food] = ground
     found = []
     for views in (is_food, rest):
-        seen, new = set(), []
+        seen = set()
+        new = []
         for view in views:
             new.append(view.tobytes() not in seen)
             seen.add(view.tobytes())
         found.append(new[1:])
-    met, new = set(), []
+    met = set()
+    new = []
     for board, body, grasp in zip(boards, is_agent, grasps, strict=False):
         hand = np.argwhere(body)[0] + DIRECTIONS[grasp]
         color = board[tuple(hand)].tobytes() if np.all((hand >= 0) & (hand < 12)) else None

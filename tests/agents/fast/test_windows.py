@@ -16,7 +16,8 @@ from agents.fast.windows import encode_rows
 from agents.networks.encoder import Encoder
 from agents.networks.layers import Conv, init_module
 
-EPISODES, STEPS = 3, 6
+EPISODES = 3
+STEPS = 6
 encoder = Encoder((4, 6))
 
 
@@ -109,7 +110,8 @@ def test_convolution_and_its_derivatives_are_those_of_jax(size):
 def test_layers_convolve_by_products_only_where_asked():
     """One layer of the paper's encoder, and one of another kind, which stays as it is."""
     x = jax.random.normal(jax.random.key(0), (2, 6, 6, 3))
-    ours, other = Conv(4, 3), nn.Conv(4, (3, 3), padding="VALID")
+    ours = Conv(4, 3)
+    other = nn.Conv(4, (3, 3), padding="VALID")
     for layer in (ours, other):
         params = init_module(layer, jax.random.key(1), x)
         plain: Any = layer.apply(params, x)

@@ -8,7 +8,8 @@ import pytest
 from agents import Config
 from agents.networks.agent import Agent
 
-STEPS, BATCH = 4, 3
+STEPS = 4
+BATCH = 3
 
 
 @pytest.mark.parametrize("recurrent", [True, False])
@@ -17,7 +18,8 @@ def test_a_step_depends_on_the_past_only_with_memory(recurrent):
     config = Config(filters=(2, 2), hidden=4, embedding=2, recurrent=recurrent)
     agent = Agent(config)
     params = jax.jit(agent.init)(jax.random.key(0))
-    action, reward = jnp.zeros((BATCH, STEPS, 2), jnp.int32), jnp.zeros((BATCH, STEPS), jnp.float32)
+    action = jnp.zeros((BATCH, STEPS, 2), jnp.int32)
+    reward = jnp.zeros((BATCH, STEPS), jnp.float32)
     features = jax.random.normal(jax.random.key(1), (BATCH, STEPS + 1, 2), jnp.float32)
     unroll = jax.jit(agent.unroll)
     one, _ = unroll(params, features, action, reward)

@@ -35,11 +35,13 @@ def scales(module: nn.Module, *inputs: Any) -> dict[str, float]:
 
 
 def test_every_layer_has_the_scale_of_the_table_in_agent_md():
-    h, a = jnp.zeros((1, 64)), jnp.zeros((1, 16))
+    h = jnp.zeros((1, 64))
+    a = jnp.zeros((1, 16))
     board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
     core = scales(Core(64, 8), h, h, jnp.zeros((1, 2), jnp.int32), jnp.zeros(1))
     encoder = scales(make_encoder(Config()), board)
-    icm, heads = scales(Models(64), h, h, a), scales(Heads(), h)
+    icm = scales(Models(64), h, h, a)
+    heads = scales(Heads(), h)
     biases = ("bias", "initial")
     for part in (core, encoder, icm, heads):
         for name in [name for name in part if name.endswith(biases)]:

@@ -79,7 +79,8 @@ def test_any_number_of_features_will_do(num_features):
         num_features=num_features, encoder="objects", filters=(4, 6), hidden=4, curiosity="none"
     )
     agent = Agent(config)
-    params, encode = jax.jit(agent.init)(jax.random.key(0)), jax.jit(agent.encode)
+    params = jax.jit(agent.init)(jax.random.key(0))
+    encode = jax.jit(agent.encode)
     board = tt.observe(tt.base_state(num_features))[None]
     features = encode(params, board)
     assert features.shape == (1, 12)

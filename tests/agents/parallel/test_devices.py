@@ -36,7 +36,8 @@ def test_devices_that_do_not_divide_the_minibatch_are_refused(twelve_devices, de
 
 
 def test_one_device_computes_as_it_is_told():
-    alone, x = Placement(), jnp.arange(3)
+    alone = Placement()
+    x = jnp.arange(3)
     assert alone.shard(print) is print
     assert alone.put(x) is alone.local(x) is x
     for method in (ONE_DEVICE.mean, ONE_DEVICE.part, ONE_DEVICE.gather, ONE_DEVICE.device_key):

@@ -44,7 +44,8 @@ def test_two_processes_stop_together_and_one_continues(tmp_path):
     while not re.match("iteration 2 of", line := first.stdout.readline()):
         assert line, first.communicate()
     second.send_signal(signal.SIGTERM)
-    (output, errors), (silence, complaints) = first.communicate(), second.communicate()
+    (output, errors) = first.communicate()
+    (silence, complaints) = second.communicate()
     assert (first.returncode, second.returncode) == (143, 143), errors + complaints
     assert own(silence + errors + complaints) == ""
     assert "Stopped. Continue with: " in output

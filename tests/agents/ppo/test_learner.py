@@ -22,6 +22,7 @@ from agents.acting.symmetry import Symmetry
 from agents.arrays import to_arrays
 from agents.curiosity import Curiosity, Experience
 from agents.networks.encoder import Encoder
+from agents.networks.layers import init_module
 from agents.parallel.devices import EpisodeAxis
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
@@ -40,7 +41,8 @@ BEST = Config.preset(
     intrinsic_anneal_fraction=0.8,
 )
 PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
-STEPS, EPISODES = 6, 8
+STEPS = 6
+EPISODES = 8
 OWN_COLORS = tt.Environment(base=tt.base_state().replace(palette=255 - tt.base_state().palette))
 
 
@@ -110,7 +112,8 @@ def test_new_tasks_are_new_and_others_are_of_the_lists():
     best = make_learner(BEST)
     task_replay = best.init(jax.random.key(0)).task_replay
     drawn = data(best.draw_tasks(task_replay, jax.random.key(1)))
-    once, twice = data(task_replay.keys[0]), data(task_replay.keys[1])
+    once = data(task_replay.keys[0])
+    twice = data(task_replay.keys[1])
     assert len(set(drawn[:4]) - {*once, *twice}) == 4
     assert set(drawn[4:6]) <= set(once)
     assert set(drawn[6:]) <= set(twice)
@@ -201,7 +204,8 @@ def test_seeds_side_by_side_are_those_alone():
     """With the cache of encodings and the loops of the real rollout; up to rounding."""
     plain = make_learner(dataclasses.replace(PLAIN, env_id="sy"))
     both = jax.vmap(plain.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))
-    together, alone = jax.jit(jax.vmap(plain.iterate))(both), jax.jit(plain.iterate)
+    together = jax.jit(jax.vmap(plain.iterate))(both)
+    alone = jax.jit(plain.iterate)
     for seed in range(2):
         expected = to_arrays(alone(rows(both, seed)))
         got = to_arrays(rows(together, seed))
@@ -219,7 +223,8 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
         after, metrics = iterate(state)
         iterate(after)
     assert all(np.isfinite(float(value)) for value in metrics.values())
-    before, after = to_arrays(state.params), to_arrays(after.params)
+    before = to_arrays(state.params)
+    after = to_arrays(after.params)
     same = [name for name in before if np.array_equal(before[name], after[name])]
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
 
@@ -244,7 +249,8 @@ class Known(Learner):
     """Has seen an episode of two steps, of which the second is padding."""
 
     def experience(self, params, episodes):
-        hidden, width = self.config.hidden, 2 * self.config.embedding
+        hidden = self.config.hidden
+        width = 2 * self.config.embedding
         outputs = (jnp.zeros((1, 2, hidden)), None, jnp.zeros((1, 2, width)))
         return Experience(episodes, jnp.zeros((1, 3, 0)), *outputs)
 
@@ -257,7 +263,8 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     custom = Returning(losses={"own_loss": jnp.ones((1, 2))})
     params = jax.eval_shape(made.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
-    mask, cells = jnp.array([[1.0, 0.0]]), jnp.zeros((1, 3, 3, 2), jnp.uint8)
+    mask = jnp.array([[1.0, 0.0]])
+    cells = jnp.zeros((1, 3, 3, 2), jnp.uint8)
     episodes = Episodes(tt.base_state(), cells, jnp.zeros((1, 2, 2), jnp.int32), *[mask] * 3)
     old = jnp.full((1, 2), -2 * np.log(4) - np.log(1.5), jnp.float32)  # clipped to 1.2
     target = jnp.array([[[3.0, 4.0], [9.0, 9.0]]])
@@ -293,8 +300,8 @@ def with_curiosity(monkeypatch):
         ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(2, 6\)"),
         ({"reward": jnp.zeros((2, 6), jnp.int32)}, "'none' .*int32 != float32"),
         ({"given": jnp.zeros(2, jnp.int32)}, r"'none' .*\(2,\) != \(\)"),
-        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got 'policy_loss'"),
-        ({"losses": ["mine"]}, "'none': .* entropy_loss; got 'mine'"),
+        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got policy_loss"),
+        ({"losses": ["mine"]}, "'none' .* motion_loss; got mine"),
         ({"losses": {"my_loss": jnp.ones(3)}}, r"'none' .*\(3,\)"),
     ],
 )
@@ -302,6 +309,38 @@ def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returne
     custom = with_curiosity(Returning(**returned))
     with pytest.raises(ValueError, match=message):
         jax.eval_shape(custom.iterate, custom.init(jax.random.key(0)))
+
+
+class Broken(Curiosity):
+    """Has other methods."""
+
+    def __init__(self, **methods):
+        vars(self).update(methods)
+
+
+@pytest.mark.parametrize(
+    ("curiosity", "message"),
+    [
+        (None, "NoneType is no agents.curiosity.Curiosity"),
+        (Broken(init=lambda *_: {"n": jnp.arange(3)}), r"parameter \['n'\] is int32"),
+        (Broken(init=lambda key, x: init_module(Normalised(), key, x)), "batch_stats"),
+        (Broken(encode=lambda *_: None), "encode must return an array"),
+        (Broken(encode=lambda *_: jnp.zeros((1, 4))), r"\(1, 4\)"),
+        (Broken(encode=lambda params, x: jnp.zeros((len(x), 4), int)), "int32"),
+        (Broken(reward=lambda *_: None), "'none' breaks its contract"),
+        (Broken(reward=lambda *_: (0.0, ())), r"\(\) != \(2, 6\)"),
+        (Broken(losses=lambda *_: None), "losses are NoneType, not a dict"),
+        (Broken(losses=lambda *_: {"my_loss": None}), "'none' breaks its contract"),
+    ],
+)
+def test_whatever_a_curiosity_returns_is_refused_in_one_line(curiosity, message, with_curiosity):
+    def train() -> None:
+        made = with_curiosity(curiosity)
+        jax.eval_shape(made.iterate, jax.eval_shape(made.init, jax.random.key(0)))
+
+    with pytest.raises(ValueError, match=message) as error:
+        train()
+    assert "\n" not in str(error.value)
 
 
 class Maps(nn.Module):
@@ -327,6 +366,15 @@ class Normalised(nn.Module):
         return nn.BatchNorm(use_running_average=False)(flat)
 
 
+class Integer(nn.Module):
+    """Has a parameter that no gradient trains."""
+
+    @nn.compact
+    def __call__(self, observation):
+        count = self.param("count", lambda key: 3)
+        return observation.reshape(len(observation), -1) * jnp.float32(count)
+
+
 class Noisy(nn.Module):
     """Draws at random."""
 
@@ -342,6 +390,7 @@ class Noisy(nn.Module):
         (Maps(), r"encoder 'mine' .*\(1, 12, 12, 3\)"),
         (Whole(), "encoder 'mine' .*uint8"),
         (Normalised(), "encoder 'mine' .*batch_stats"),
+        (Integer(), "encoder 'mine' .*count.* is int32"),
         (Noisy(), "encoder 'mine' .*dropout"),
         (nnx.Linear(3, 4, rngs=nnx.Rngs(0)), "must be a flax.linen.Module, got Linear"),
         (None, "must be a flax.linen.Module, got NoneType"),

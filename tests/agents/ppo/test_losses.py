@@ -8,7 +8,8 @@ import pytest
 from agents.networks.actions import ActionDistribution
 from agents.ppo import losses
 
-CASES, CHOICES = 1_000, 4
+CASES = 1_000
+CHOICES = 4
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +32,10 @@ def distribution(logits: jax.Array) -> ActionDistribution:
 
 
 def test_log_prob_and_entropy_of_actions(cases):
-    probs, everyone = softmax(cases["logits"]), np.arange(CASES)
-    grasp, move = cases["choice"], np.roll(cases["choice"], 1)
+    probs = softmax(cases["logits"])
+    everyone = np.arange(CASES)
+    grasp = cases["choice"]
+    move = np.roll(cases["choice"], 1)
     actions = distribution(jnp.asarray(cases["logits"]))
     expected = np.log(probs[everyone, grasp]) + np.log(probs[everyone, CHOICES - 1 - move])
     result = actions.log_prob(jnp.stack([grasp, move], axis=-1))
@@ -84,5 +87,6 @@ def test_clipping_stops_the_gradient_only_where_it_would_go_further(
 
 
 def test_padding_counts_as_zeros_in_means():
-    x, mask = jnp.array([[1.0, 2.0], [4.0, 100.0]]), jnp.array([[1.0, 1.0], [1.0, 0.0]])
+    x = jnp.array([[1.0, 2.0], [4.0, 100.0]])
+    mask = jnp.array([[1.0, 1.0], [1.0, 0.0]])
     assert losses.padded_mean(x, mask) == 7 / 4

@@ -8,7 +8,8 @@ import pytest
 from agents.ppo.task_replay import TaskReplay
 from helpers.trees import bits
 
-LISTS, CAPACITY = 2, 5
+LISTS = 2
+CAPACITY = 5
 
 
 @pytest.fixture

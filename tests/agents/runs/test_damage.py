@@ -283,7 +283,8 @@ def contents(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize(("name", "kind"), DAMAGES, ids=ascii)
 def test_damage_is_one_line_with_the_path(name, kind, whole, tmp_path, limits):
-    path, damage = tmp_path / "run" / name, DAMAGES[name, kind]
+    path = tmp_path / "run" / name
+    damage = DAMAGES[name, kind]
     shutil.copytree(whole, tmp_path / "run")
     path.unlink()
     path.write_bytes(damage) if isinstance(damage, bytes) else damage(path)

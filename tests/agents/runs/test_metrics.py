@@ -70,7 +70,8 @@ def test_other_columns_are_refused(tmp_path):
 
 
 def test_a_score_is_a_row():
-    solved, layout = np.array([True, True, False]), np.array([0, 0, 1])
+    solved = np.array([True, True, False])
+    layout = np.array([0, 0, 1])
     few = Score.of("sy", "{Sy}", solved, np.array([3, 6, 50]), layout=layout)
     none = Score.of("p", "{P}", np.zeros(4, bool), np.full(4, 50))
     policy: Any = SimpleNamespace(iteration=7)

@@ -54,7 +54,8 @@ def page(played, tmp_path_factory):
     append_rows(folder.metrics, [row(1), row(2, policy_loss=0.5)])
     note_provenance(folder.provenance, "cpu")
     report.write(folder, Run(CONFIG), evaluator, outcome)
-    start, end = '<script type="application/json" id="data">', "</script>"
+    start = '<script type="application/json" id="data">'
+    end = "</script>"
     return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
 
 
@@ -185,7 +186,8 @@ def test_a_narrow_terminal_shows_total_time_left_and_success():
     ],
 )
 def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
-    run, folder = Run(small_config(iterations=7, **settings)), RunFolder(tmp_path)
+    run = Run(small_config(iterations=7, **settings))
+    folder = RunFolder(tmp_path)
     solved = [row(2, validation_success=1.0, episodes=episodes)] if episodes else []
     rows = [row(1), *solved, row(3, validation_success=1.0, episodes=9999)] if solved else [row(1)]
     append_rows(folder.metrics, rows)
@@ -198,7 +200,8 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
 
 
 def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
-    run, folder = Run(small_config(stop_when_solved=0.995)), RunFolder(tmp_path)
+    run = Run(small_config(stop_when_solved=0.995))
+    folder = RunFolder(tmp_path)
     append_rows(folder.metrics, [row(1, validation_success=0.996)])
     solved = "First solved 99.5 % of base after 8 episodes; --stop-when-solved 0 trains on."
     assert display.summary(folder, run)[0] == solved

@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 import agents
+import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.arrays import read_arrays, write_arrays
 from agents.ppo.learner import Learner
@@ -67,7 +68,7 @@ def whole(tmp_path_factory):
         return evaluation_tasks(name, number, features, purpose)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (suite, program):
+        for module in (suite, tt):
             patch.setattr(module, "evaluation_tasks", record)
         train_run(path, small_run(), TRACKED)
     return path
@@ -116,7 +117,8 @@ def test_results_are_a_tidy_table(whole, tmp_path):
 
 def test_stopped_runs_continue_to_the_same_bits(whole, tmp_path, monkeypatch):
     """Stopped between two checkpoints; the rows and the best parameters are the same, too."""
-    path, record = tmp_path / "stopped", Progress.record
+    path = tmp_path / "stopped"
+    record = Progress.record
 
     def stop(self, metrics, seconds):
         record(self, metrics, seconds)
@@ -141,7 +143,8 @@ def _raise(error):
 
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(program, "make_advance", None)
-    before, output = (copy / "evaluations.csv").read_bytes(), io.StringIO()
+    before = (copy / "evaluations.csv").read_bytes()
+    output = io.StringIO()
     more = dataclasses.replace(TRACKED, test_tasks=9)
     assert train_run(copy, small_run(), more, console=Console(file=output)) is None
     assert (copy / "evaluations.csv").read_bytes() == before

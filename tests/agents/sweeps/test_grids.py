@@ -19,7 +19,8 @@ def configs(*settings, grid=None, **options):
 
 def test_a_grid_holds_every_combination_by_name():
     found = configs("learning_rate=1e-3,3e-4", "curiosity=icm,none", "clip_eps=0.3")
-    rates, names = ("1e-3", "3e-4"), ("icm", "none")
+    rates = ("1e-3", "3e-4")
+    names = ("icm", "none")
     assert list(found) == [f"learning_rate={x},curiosity={y}" for x in rates for y in names]
     last = found["learning_rate=3e-4,curiosity=none"]
     assert (last.learning_rate, last.curiosity, last.clip_eps) == (3e-4, "none", 0.3)

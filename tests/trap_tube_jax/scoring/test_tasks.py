@@ -14,6 +14,7 @@ from trap_tube_jax.scoring.tasks import (
     Purpose,
     evaluation_keys,
     evaluation_tasks,
+    label,
     layout_numbers,
 )
 
@@ -40,3 +41,11 @@ def test_only_sets_without_p_have_few_layouts(name):
     layout = layout_numbers(name, evaluation_tasks(name, 64))
     number = {"base": 1, "st": 1, "sy": 5, "stsy": 5}.get(name)
     assert (None if layout is None else len(set(layout.tolist()))) == number
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [("psy", "{P, Sy}"), ("p+pstsy", "{P} + {P, St, Sy}"), ("mine+p", "mine + {P}")],
+)
+def test_labels_are_in_the_papers_notation_as_far_as_sets_are_registered(name, shown):
+    assert label(name) == shown
