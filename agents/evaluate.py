@@ -10,6 +10,7 @@ import trap_tube_jax as tt
 from agents.command_line import option, parse
 from agents.runs import compilation
 from agents.runs.evaluator import Evaluator, default_sets
+from agents.runs.folder import check_output
 from agents.runs.loading import load
 from agents.runs.metrics import evaluation_rows, write_rows
 from agents.runs.report import save_first_solved
@@ -49,6 +50,8 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     options = parse(Options, arguments, "python -m agents.evaluate")
+    for path in filter(None, (options.output, options.gif)):
+        check_output(path)
     compilation.enable_cache()
     policy = load(options.source, iteration=options.iteration, imports=options.imports)
     config = policy.config

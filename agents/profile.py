@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.command_line import option, parse
-from agents.files import write_bytes, write_json
+from agents.files import is_file, read_json, write_bytes, write_json
 from agents.profiles import plots
 from agents.profiles.measure import (
     Table,
@@ -37,7 +37,8 @@ class Options:
 
     Attributes:
       runs: runs' folders, files of parameters, or names of shipped agents.
-      output: folder for the files, by default runs/profile-NAMES. A profile there is replaced.
+      output: folder for the files, by default runs/profile-NAMES. Only a profile of the same
+        policies is replaced.
       parts: some of structural, perceptual and both (success by strength), symbolic (by the object
         that is the tool), kind and plan-length (of the tasks of {P}), first-push-p and
         first-push-pst (towards the exit or away from it, in {P} and {P, St}) and control (from
@@ -62,13 +63,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(Options, arguments, "python -m agents.profile")
     compilation.enable_cache()
     policies = {str(Path(x)): load(x, imports=options.imports) for x in options.runs}
-    origin = {
-        "command": f"python -m agents.profile {shlex.join(arguments)}",
-        "iterations": {name: policy.iteration for name, policy in policies.items()},
-        **provenance(),
-    }
+    iterations = {name: policy.iteration for name, policy in policies.items()}
+    command = f"python -m agents.profile {shlex.join(arguments)}"
+    origin = {"command": command, "iterations": iterations, **provenance()}
     names = "+".join(Path(source).resolve().stem for source in policies)  # a source may be "."
     output = options.output or Path("runs", f"profile-{names}")
+    _check_free(output, iterations)
     output.mkdir(parents=True, exist_ok=True)
     found = profile(policies, options.parts, options.strengths, options.tasks, announce)
     for figure in FIGURES:  # of an earlier profile
@@ -82,6 +82,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if "control" in options.parts:
         plots.save_controls(found, output / "controls.png")
     print(f"results: {output}")
+
+
+def _check_free(folder: Path, iterations: dict[str, int]) -> None:
+    """Raises ValueError if a folder holds a run, or the profile of other policies."""
+    origin = folder / "provenance.json"
+    found = read_json(origin) if is_file(origin) else {"iterations": iterations}
+    if not isinstance(found, dict) or found.get("iterations") != iterations:
+        raise ValueError(
+            f"{folder} holds a run, or the profile of other policies; give another --output"
+        )
 
 
 def _print_tables(found: Table) -> None:

@@ -39,12 +39,12 @@ def main(
         with stopping(lambda: "The same command continues."):
             workers = make_executor(options.processes, options.cluster)
             with workers as executor, RunFolder(root).lock():
-                before = records.commands(root)
+                records.check(root)
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 groups = group_runs(runs, run_options, executor, options.seeds_per_program)
                 failed = launch(groups, run_options, executor, console)
                 if any(RunFolder(path).metrics.exists() for path in runs):
-                    records.collect(root, [*before, f"{program} {shlex.join(arguments)}".strip()])
+                    records.collect(root, f"{program} {shlex.join(arguments)}".strip())
                     console.out(records.write_tables(root))
                     files = [root / "results.csv", root / "table.md", *records.draw(root)]
                     console.out("", *files, sep="\n")

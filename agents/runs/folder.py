@@ -133,6 +133,13 @@ class RunFolder:
             ) from error
 
 
+def check_output(path: Path) -> None:
+    """Raises ValueError if a file to be written is one of a run's files."""
+    run = RunFolder(path.parent)
+    if run.config.is_file() and path in vars(run).values():
+        raise ValueError(f"{path} is a file of the run {run.path}; give another path")
+
+
 def runs_near(path: Path) -> str:
     """Says which runs a path that is none may have meant, for messages."""
     if inside := _runs_in(path):

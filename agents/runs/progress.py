@@ -98,8 +98,6 @@ class Progress:
         """
         config = self.run.config
         options = self.program.options
-        if options.report:
-            self.folder.page.unlink(missing_ok=True)  # it would show the run as it was
         note_provenance(self.folder.provenance, str(self.program.placement))
         chosen = {"tensorboard": options.tensorboard, "wandb": options.wandb}
         self._log = stack.enter_context(open_loggers(self.folder.path, self.run, **chosen))
@@ -162,6 +160,8 @@ class Progress:
         played = evaluator(policy.params)
         scores = evaluator.scores(played)
         rows = evaluation_rows(scores, policy, "test")
+        if options.report:
+            self.folder.page.unlink(missing_ok=True)  # from now on it shows other scores
         append_rows(self.folder.evaluations, [row for row in rows if row["task_set"] not in tested])
         self.console.out(scores)
         if options.report:  # last, since a figure may fail

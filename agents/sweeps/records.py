@@ -13,7 +13,7 @@ from typing import NotRequired, TypedDict
 import agents
 import trap_tube_jax as tt
 from agents.files import is_file, read_json, write_bytes, write_json
-from agents.runs.folder import RunFolder, Settings, check_name
+from agents.runs.folder import CONFIG_FILE, RunFolder, Settings, check_name
 from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.provenance import Machine, read_provenance
@@ -49,19 +49,52 @@ class About(TypedDict):
     note: NotRequired[str]
 
 
-def collect(root: Path, commands: Sequence[str]) -> None:
-    """Writes results.csv, curves.csv and grid.json from the runs in a folder.
+def check(root: Path) -> None:
+    """Checks that `collect` can make the files of a grid again.
 
     Raises:
-      ValueError: a run's file is damaged, or a folder has a name that no table can hold.
+      ValueError: a file is damaged, or has rows of a run whose folder is gone.
+    """
+    _read_about(root)
+    stored = [RunFolder(path.parent).stored() for path in root.rglob(CONFIG_FILE)]
+    here = {(run["algorithm"], run["seed"]) for run in stored}
+    for path in (root / "results.csv", root / "curves.csv"):
+        rows = read_rows(path)
+        gone = set(zip(rows["algorithm"], rows["seed"], strict=True)) - here
+        if gone:
+            names = ", ".join(f"{algorithm} seed {seed}" for algorithm, seed in sorted(gone))
+            raise ValueError(
+                f"{path} has rows of runs whose folders are gone: {names}; restore them, or train "
+                "under another --name"
+            )
+
+
+def collect(root: Path, command: str) -> None:
+    """Writes results.csv, curves.csv and grid.json from the runs in a folder.
+
+    Commands and the note that grid.json holds already stay in it.
+
+    Raises:
+      ValueError: a file is damaged, or a folder has a name that no table can hold.
     """
     folders = find_runs(root)
     for folder in folders:
         check_name(folder.title)
+    before = _read_about(root)
+    commands = [*(before["commands"] if before else []), command]
+    about = _about(root.name, folders, commands)
+    if before and "note" in before:
+        about["note"] = before["note"]
     results = agents.results(root)
     write_rows(root / "results.csv", results.assign(run=results["run"].map(lambda x: Path(x).name)))
     write_rows(root / "curves.csv", metrics(root)[CURVES])
-    write_json(root / "grid.json", _about(root.name, folders, commands))
+    write_json(root / "grid.json", about)
+
+
+def _read_about(root: Path) -> About | None:
+    """Reads grid.json; None if it is missing."""
+    path = root / "grid.json"
+    return read_json(path, About) if is_file(path) else None
 
 
 def _about(name: str, folders: Sequence[RunFolder], commands: Sequence[str]) -> About:
@@ -93,16 +126,6 @@ def is_unfinished(folder: RunFolder) -> bool:
     except ValueError:  # its modules are not imported, so its command was another one
         return False
     return not has_ended(folder, run)
-
-
-def commands(root: Path) -> list[str]:
-    """Returns the commands that have trained the runs of a folder.
-
-    Raises:
-      ValueError: grid.json is damaged.
-    """
-    path = root / "grid.json"
-    return read_json(path, About)["commands"] if is_file(path) else []
 
 
 def read(root: Path) -> tuple[Table, Table, About]:

@@ -11,6 +11,7 @@ from PIL import Image
 from agents import profile
 from agents.pretrained import FOLDER
 from agents.profiles import plots, tasks
+from helpers.refusal import refused
 
 
 @pytest.fixture
@@ -52,6 +53,16 @@ def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monk
     for name in profile.FIGURES:
         with Image.open(out / name) as picture:
             assert picture.width == 830
+
+
+@pytest.mark.parametrize(
+    "origin", [[], {"iterations": {"fast-base": 7}}, {"iterations": {"icm-base": 19}}]
+)
+def test_neither_a_run_nor_a_profile_of_other_policies_is_replaced(origin, tmp_path, capsys):
+    (tmp_path / "provenance.json").write_text(json.dumps(origin))
+    message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
+    assert "holds a run, or the profile of other policies; give another --output" in message
+    assert [path.name for path in tmp_path.iterdir()] == ["provenance.json"]
 
 
 @pytest.mark.parametrize(

@@ -215,6 +215,15 @@ def test_a_stop_before_the_first_file_promises_nothing(capfd, monkeypatch, tmp_p
     assert capfd.readouterr().err == f"Stopped. {tmp_path / 'x'} holds no run to continue.\n"
 
 
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [("--output", "evaluations.csv"), ("--output", "metrics.csv"), ("--gif", "best.safetensors")],
+)
+def test_an_evaluation_replaces_no_file_of_a_run(option, name, capsys, whole):
+    message = refused(capsys, evaluate.main, whole[0], option, whole[0] / name)
+    assert f"{name} is a file of the run {whole[0]}; give another path" in message
+
+
 def test_an_unknown_training_set_is_refused_before_anything_is_played(capsys, tmp_path):
     save(tmp_path / "x.safetensors", random_policy(env_id="Own-v0"))
     arguments = [tmp_path / "x.safetensors", "--sets", "base", "--output", tmp_path / "x.csv"]

@@ -51,6 +51,7 @@ GRID = {
 ABOUT = {"config": CONFIG.to_dict(), "iteration": 4}
 PARAMS = to_arrays(random_params())
 
+GRID_READERS = [lambda run: records.read(run.path), lambda run: records.check(run.path)]
 # What reads a file of a run or a grid, by the file's name.
 READERS: dict[str, list[Any]] = {
     "config.json": [RunFolder.read, RunFolder.devices, lambda run: results(run.path)],
@@ -73,9 +74,9 @@ READERS: dict[str, list[Any]] = {
         lambda run: load(run.path, iteration=4),
     ],
     "best.safetensors": [lambda run: load(run.path)],
-    "curves.csv": [lambda run: records.read(run.path)],
-    "results.csv": [lambda run: records.read(run.path)],
-    "grid.json": [lambda run: records.read(run.path), lambda run: records.commands(run.path)],
+    "curves.csv": GRID_READERS,
+    "results.csv": GRID_READERS,
+    "grid.json": GRID_READERS,
 }
 
 

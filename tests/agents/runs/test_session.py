@@ -189,8 +189,11 @@ def test_a_finished_run_is_extended(copy, monkeypatch):
     clock = SimpleNamespace(perf_counter=itertools.count().__next__)
     monkeypatch.setattr(session, "time", clock)
     monkeypatch.setattr(progress, "is_better", lambda *_: True)
+    rows = [path.read_text() for path in copy.glob("*.csv")]
     train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
     assert final_state(copy)[0] == ITERATIONS + 1
+    for path, before in zip(copy.glob("*.csv"), rows, strict=True):
+        assert path.read_text().startswith(before)
     assert RunFolder(copy).read()[0].config.iterations == ITERATIONS + 1
     tested = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
     assert tested["iteration"].tolist()[2:] == [ITERATIONS + 1] * 2
@@ -198,6 +201,15 @@ def test_a_finished_run_is_extended(copy, monkeypatch):
     assert after == pytest.approx(before + 1)
     with pytest.raises(ValueError, match="iterations must be at least 7, which are done, got 6"):
         train_run(copy, small_run(), TRACKED)
+
+
+def test_a_report_stays_until_there_are_other_scores(copy, monkeypatch):
+    RunFolder(copy).page.write_text("earlier")
+    monkeypatch.setattr(Progress, "record", lambda *_: _raise(Stopped(2)))
+    options = dataclasses.replace(TRACKED, report=True)
+    with pytest.raises(Stopped):
+        train_run(copy, small_run(iterations=ITERATIONS + 1), options)
+    assert RunFolder(copy).page.read_text() == "earlier"
 
 
 def cut(path):

@@ -230,7 +230,7 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
         tested = pd.DataFrame(rows("ppo", [1])).drop(columns=["algorithm", "seed"])
         append_rows(folder.evaluations, tested.to_dict("records"))
     for command in ("first", "second", "first"):
-        records.collect(tmp_path, [*records.commands(tmp_path), command])
+        records.collect(tmp_path, command)
     shown = records.write_tables(tmp_path)
     assert "2 of 2, 1 unfinished" in shown
     assert "Unfinished, so the table may change: ppo+effects seed 1." in shown
@@ -244,7 +244,7 @@ def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
         folder.note(Run(small_config(env_id=name, stop_when_solved=threshold)))
         metrics = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, metrics.to_dict("records"))
-    records.collect(tmp_path, [])
+    records.collect(tmp_path, "sweep")
     about = read_json(tmp_path / "grid.json")
     assert about["title"].endswith(": trained on base or {Sy}")
     assert about["train_set"] == "training set"
@@ -259,13 +259,32 @@ def test_what_others_have_written_is_plain_text(tmp_path):
     note_provenance(folder.provenance, "cpu")
     (machine,) = read_json(folder.provenance)
     write_json(folder.provenance, [{**machine, "processor": "<b>[x](y)`"}])
-    records.collect(tmp_path, ["sweep `<script>`"])
+    records.collect(tmp_path, "sweep `<script>`")
     records.write_tables(tmp_path)
     text = (tmp_path / "table.md").read_text()
     assert "\n    sweep `<script>`\n" in text, "a block of code"
     assert r"\<b\>\[x\](y)\`" in text
     folder.path.rename(tmp_path / "=1+1")
-    assert_refused(["got '=1+1'"], records.collect, tmp_path, [])
+    assert_refused(["got '=1+1'"], records.collect, tmp_path, "sweep")
+
+
+def test_what_cannot_be_made_again_is_kept(tmp_path):
+    """A note that is written by hand, and rows of runs whose folders are gone."""
+    for seed in (0, 1):
+        folder = RunFolder(tmp_path / f"seed{seed}")
+        folder.note(Run(small_config(), seed))
+        done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
+        append_rows(folder.metrics, done.to_dict("records"))
+    records.check(tmp_path)
+    records.collect(tmp_path, "first")
+    about = read_json(tmp_path / "grid.json")
+    write_json(tmp_path / "grid.json", {**about, "note": "mine"})
+    records.collect(tmp_path, "second")
+    assert read_json(tmp_path / "grid.json")["note"] == "mine"
+    records.check(tmp_path)
+    shutil.rmtree(tmp_path / "seed1")
+    words = ["curves.csv has rows of runs whose folders are gone: ppo+effects seed 1;"]
+    assert_refused(words, records.check, tmp_path)
 
 
 def test_a_figure_that_fails_costs_a_line(tmp_path, monkeypatch, capsys):
