@@ -56,7 +56,7 @@ def plain_params(params):
     }
 
 
-def test_rewards_advantages_and_losses_are_those_of_the_learner():
+def test_rewards_advantages_and_losses_equal_the_learners():
     learner, plain = make_learner(CONFIG), plain_ppo.PlainPPO(CONFIG)
     state = jax.jit(learner.init)(jax.random.key(0))
 
