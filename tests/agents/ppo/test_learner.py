@@ -4,6 +4,7 @@ Play and gradient steps are replaced where they are not tested.
 """
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import flax.linen as nn
@@ -314,6 +315,18 @@ def with_curiosity(monkeypatch):
         return make_learner(PLAIN, **arguments)
 
     return build
+
+
+def test_an_intrinsic_reward_is_zero_after_the_end_of_an_episode(with_curiosity):
+    nothing: Any = None
+    learner = Known(**vars(with_curiosity(Returning(reward=jnp.ones((1, 2))))))
+    mask = jnp.array([[1.0, 0.0]])
+    episodes = Episodes(nothing, nothing, nothing, nothing, nothing, mask)
+    state: Any = SimpleNamespace(params={"curiosity": {}}, memory=jnp.int32(7))
+    trajectory = Trajectory(nothing, episodes, nothing, nothing)
+    reward, memory = learner.intrinsic_reward(state, trajectory)
+    np.testing.assert_array_equal(reward, [[1, 0]])
+    assert memory == 7
 
 
 @pytest.mark.parametrize(
