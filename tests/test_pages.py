@@ -57,7 +57,7 @@ def blocks():
     return found
 
 
-@pytest.mark.usefixtures("own_names")
+@pytest.mark.usefixtures("fresh_names")
 @pytest.mark.parametrize(("code", "output"), blocks())
 def test_a_block_runs_by_itself_and_prints_what_stands_under_it(
     code, output, capsys, tmp_path, monkeypatch

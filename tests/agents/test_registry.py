@@ -8,7 +8,7 @@ from agents.registry import Registry, curiosities
 from helpers.refusal import assert_refused
 
 
-def test_a_name_of_yours_is_allowed_and_may_be_registered_again(own_names):
+def test_a_name_of_yours_is_allowed_and_may_be_registered_again(fresh_names):
     register("mine", print)
     register("mine", ours := lambda config, env: Curiosity())
     assert curiosities.factory("mine") is ours

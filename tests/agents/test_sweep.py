@@ -204,7 +204,7 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
     ],
 )
 def test_impossible_sweeps_are_refused_and_leave_nothing(
-    capsys, monkeypatch, own_task_sets, tmp_path, arguments, words
+    capsys, monkeypatch, fresh_task_sets, tmp_path, arguments, words
 ):
     monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
     out = tmp_path / "out"

@@ -66,7 +66,7 @@ def test_agents_start_from_every_cell_that_they_can_walk_to():
         )
 
 
-def test_ids_and_labels_are_those_of_the_functions():
+def test_ids_and_labels_follow_the_names_of_the_functions():
     entry = tt.CONTROL_TASK_SETS[0]
     names = (entry.id, entry.short, entry.label)
     assert names == ("TrapTurnedControl-v0", "trap-turned", "trap-turned")

@@ -62,7 +62,7 @@ def test_a_policy_reaches_the_evaluators_outcomes(seed, settings):
         assert not np.array_equal(actions, drive(plain, tasks)[2])
 
 
-def test_driving_scoring_and_evaluating_have_one_result(own_task_sets):
+def test_stepping_scoring_and_evaluating_have_one_result(fresh_task_sets):
     def near(key, state):
         cells = jnp.array(FOOD_CELLS, jnp.int32)
         return state.replace(food=cells[jax.random.randint(key, (), 0, 4)])

@@ -22,19 +22,7 @@ def test_an_action_is_avoided_where_it_was_taken_until_it_is_forgotten():
         assert action[0].tolist() == best, gap
 
 
-def test_a_penalty_changes_the_most_probable_action():
-    logits = jnp.array([[0.0, 4.0, 3.0, 0.0]])
-    # Grasp 1, move 2; then move 1.
-    actions = ActionDistribution(jnp.stack([logits, logits[:, ::-1]], axis=1))
-    penalty = jnp.zeros((1, 4, 4))
-    assert actions.mode(penalty).tolist() == actions.mode().tolist() == [[1, 2]]
-    penalty = penalty.at[0, 1, 2].set(0.9)
-    assert actions.mode(penalty).tolist() == [[1, 2]]
-    penalty = penalty.at[0, 1, 2].set(1.1)
-    assert actions.mode(penalty).tolist() == [[1, 1]], "the lower index of two equal ones"
-
-
-def test_under_a_high_penalty_no_action_is_repeated():
+def test_under_a_high_penalty_greedy_play_repeats_no_action():
     env = tt.Environment(base=tt.base_state(1), max_steps=STEPS)
     step = jax.jit(jax.vmap(env.step))
 

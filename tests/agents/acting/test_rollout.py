@@ -46,7 +46,7 @@ def played():
     return env, agent, params, initial, trajectory
 
 
-def test_values_and_log_probabilities_are_those_of_the_observations_in_order(played):
+def test_values_and_log_probabilities_belong_to_the_observations_in_order(played):
     """Values are of all observations, the last one included."""
     _, agent, params, _, trajectory = played
     episodes = trajectory.episodes

@@ -104,13 +104,13 @@ def by_hand() -> Episodes:
     return Episodes(layout, cells, action, zeros, zeros + 1, mask)
 
 
-def test_a_return_is_not_new(by_hand):
+def test_food_and_tool_that_return_are_no_new_effect(by_hand):
     food, tool, _ = np.asarray(new_effects(by_hand) * by_hand.mask[None])
     np.testing.assert_array_equal(tool, [[1, 0, 0, 1], [0, 1, 0, 0]])
     np.testing.assert_array_equal(food, [[0, 0, 1, 0], [0, 1, 0, 0]])
 
 
-def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
+def test_an_effect_pays_the_inverse_of_its_kinds_rate(by_hand):
     curiosity = Effects(Config(reward_ema_decay=0.75))
     experience = Experience(by_hand, jnp.zeros((2, 5, 0)))
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)

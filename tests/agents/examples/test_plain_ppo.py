@@ -57,7 +57,7 @@ def plain_params(params):
     }
 
 
-def test_rewards_advantages_and_losses_are_those_of_the_learner():
+def test_rewards_advantages_and_losses_equal_the_learners():
     learner = make_learner(CONFIG)
     plain = plain_ppo.PlainPPO(CONFIG)
     state = jax.jit(learner.init)(jax.random.key(0))

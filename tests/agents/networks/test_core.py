@@ -29,7 +29,7 @@ def test_a_step_depends_on_the_past_only_with_memory(recurrent):
     assert same_later == (not recurrent)
 
 
-def test_memory_changes_no_parameter():
+def test_the_gru_has_the_same_parameters_without_recurrence():
     shapes = [
         jax.eval_shape(Agent(Config(recurrent=recurrent)).init, jax.random.key(0))
         for recurrent in (True, False)
@@ -37,7 +37,7 @@ def test_memory_changes_no_parameter():
     assert jax.tree.all(jax.tree.map(lambda a, b: a.shape == b.shape, *shapes))
 
 
-def test_h_and_its_next_are_two_unrolls_of_the_gru():
+def test_h_and_next_h_are_two_unrolls_of_the_gru():
     """h' starts again at the second observation, with the action and reward before it."""
     config = Config(filters=(2, 2), hidden=4, embedding=2)
     agent = Agent(config)

@@ -77,7 +77,7 @@ class Own(nn.Module):
 
 
 @pytest.mark.parametrize("module", [Own(), nn.remat(Own)()])
-def test_only_kernels_of_our_layers_are_drawn_whatever_surrounds_them(module):
+def test_only_kernels_of_our_layers_are_drawn_in_any_module(module):
     params = init_module(module, jax.random.key(0), jnp.ones((1, 3)))["params"]
     np.testing.assert_array_equal(params["scale"], 1)
     assert len(np.unique(params["Dense_0"]["kernel"])) == 12

@@ -38,7 +38,7 @@ def normal(x, mask):
     return mask * x / np.sqrt(np.mean(x[mask > 0] ** 2) + 4e-4)
 
 
-def test_separate_heads_estimate_two_streams_of_rewards():
+def test_separate_heads_estimate_the_advantages_of_both_rewards():
     """Of two episodes one is solved at its third step; the old moments have a variance of 4."""
     config = Config.preset("best")
     gamma = config.discount
@@ -84,7 +84,7 @@ def test_separate_heads_estimate_two_streams_of_rewards():
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_without_curiosity_the_task_has_the_only_value():
+def test_without_curiosity_separate_heads_are_one():
     config = Config.preset("best", hidden=4, filters=(4, 4), curiosity="none")
     params = jax.eval_shape(make_learner(config).init, jax.random.key(0)).params
     assert params["heads"]["params"]["value"]["kernel"].shape == (4, 1)

@@ -4,6 +4,7 @@ Play and gradient steps are replaced where they are not tested.
 """
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import flax.linen as nn
@@ -28,7 +29,7 @@ from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
 from agents.registry import curiosities, encoders
 from helpers.small_runs import SETTINGS
-from helpers.trees import rows
+from helpers.trees import assert_same, rows
 from trap_tube_jax.objects import AGENT
 
 BEST = Config.preset(
@@ -56,8 +57,12 @@ RECOLOURED = tt.Environment((tt.perceptual, recolour))
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
 
+def plus_one(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x + jnp.ones((), x.dtype), tree)
+
+
 class Scripted(Learner):
-    """Plays tasks of known keys, solves those of `SOLVED`, and does not learn."""
+    """Plays tasks of known keys, solves those of `SOLVED`, and adds 1 to all that is learned."""
 
     def draw_tasks(self, task_replay, key):
         return reset_keys()
@@ -81,10 +86,11 @@ class Scripted(Learner):
         return Trajectory(symmetry, episodes, jnp.zeros(shape), value)
 
     def intrinsic_reward(self, state, trajectory):
-        return jax.random.uniform(jax.random.key(4), (EPISODES, STEPS)), state.memory
+        return jax.random.uniform(jax.random.key(4), (EPISODES, STEPS)), plus_one(state.memory)
 
     def update(self, state, batch, key):
-        return state.params, state.opt_state, {"advantage": batch.advantage}
+        metrics = {"advantage": batch.advantage}
+        return plus_one(state.params), plus_one(state.opt_state), metrics
 
 
 def reset_keys() -> jax.Array:
@@ -108,7 +114,7 @@ def scripted() -> tuple[Learner, TrainState, Any]:
     return scripted, scripted.init(jax.random.key(0)), jax.jit(iterate)
 
 
-def test_new_tasks_are_new_and_others_are_of_the_lists():
+def test_replayed_tasks_are_of_their_list_and_the_others_new():
     best = make_learner(BEST)
     task_replay = best.init(jax.random.key(0)).task_replay
     drawn = data(best.draw_tasks(task_replay, jax.random.key(1)))
@@ -119,7 +125,7 @@ def test_new_tasks_are_new_and_others_are_of_the_lists():
     assert set(drawn[6:]) <= set(twice)
 
 
-def test_an_iteration_remembers_failed_tasks_and_counts_what_was_played(scripted):
+def test_an_iteration_remembers_failed_tasks_and_counts_successes_and_steps(scripted):
     """Success is that on new tasks."""
     _, state, iterate = scripted
     after, metrics = iterate(state)
@@ -134,8 +140,30 @@ def test_an_iteration_remembers_failed_tasks_and_counts_what_was_played(scripted
     assert (int(after.iteration), int(after.transitions)) == (2, 2 * EPISODES * STEPS)
 
 
+def test_the_next_iteration_gets_what_this_one_has_learned(scripted):
+    """Variances move by a tenth, after an iteration in which they were 4 and 9."""
+    _, state, iterate = scripted
+    first, _ = iterate(state)
+    later, _ = iterate(
+        state._replace(iteration=jnp.int32(1), reward_variance=jnp.array([4.0, 9.0]))
+    )
+    expected = 0.9 * np.array([4, 9]) + 0.1 * np.asarray(first.reward_variance)
+    np.testing.assert_allclose(later.reward_variance, expected, rtol=1e-5)
+    for name in ("params", "opt_state", "memory"):
+        assert_same(getattr(first, name), plus_one(getattr(state, name)))
+
+
+def test_metrics_of_play_are_means_over_episodes_and_over_steps_taken():
+    nothing: Any = None
+    mask = jnp.array([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    episodes = Episodes(nothing, nothing, nothing, nothing, nothing, mask)
+    reward = jnp.array([[1.0, 3.0, 0.0], [2.0, 0.0, 0.0]])
+    metrics = make_learner(PLAIN).play_metrics(episodes, reward, jnp.array([True, False]))
+    assert metrics == {"episode_length": 1.5, "intrinsic_reward": 2, "success": 0.5}
+
+
 @pytest.mark.parametrize(("iteration", "coef"), [(0, 3.0), (4, 0.3), (8, 0.03), (9, 0.03)])
-def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, coef):
+def test_the_intrinsic_coefficient_is_the_iterations(scripted, iteration, coef):
     scripted, state, iterate = scripted
     _, metrics = iterate(state._replace(iteration=jnp.int32(iteration)))
     trajectory = scripted.play(None, reset_keys(), None)
@@ -164,43 +192,45 @@ def test_episodes_are_played_facing_the_food():
 
 
 def recorder(updates: int) -> optax.GradientTransformation:
-    """Plain gradient descent, whose state holds all gradients [updates, EPISODES]."""
+    """Gradient descent of rate 0.5, whose state holds all gradients [updates, EPISODES]."""
 
     def init(params: Any) -> Any:
         return jnp.zeros((), jnp.int32), jnp.zeros((updates, *params.shape))
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
         count, seen = state
-        return -updates, (count + 1, seen.at[count].set(updates))
+        return -0.5 * updates, (count + 1, seen.at[count].set(updates))
 
     return optax.GradientTransformation(init, update)
 
 
 class Counting(Learner):
-    """Its gradient is 1 at the episodes of the minibatch."""
+    """Its gradient is 1 at the episodes of the minibatch, and its metric their mean number."""
 
     def loss(self, params: Any, batch: Any):
-        return jnp.sum(params[batch.log_prob]), {}
+        return jnp.sum(params[batch.log_prob]), {"number": jnp.mean(batch.log_prob)}
 
 
-def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
+def test_every_epoch_takes_every_episode_once_in_a_new_order():
+    """The metrics are means over all gradient steps."""
     updates = BEST.gradient_steps
     counting = Counting(**{**vars(make_learner(BEST)), "optimizer": recorder(updates)})
     params = jnp.zeros(EPISODES)
     state = TrainState(params, counting.optimizer.init(params), *[None] * 6)  # pyright: ignore
     index: Any = jnp.arange(EPISODES)
     batch = learner.Batch(*[index] * 4)
-    after, (count, seen), _ = counting.update(state, batch, jax.random.key(0))
+    after, (count, seen), metrics = counting.update(state, batch, jax.random.key(0))
     assert count == updates == 3 * 2
-    np.testing.assert_array_equal(after, -3)
+    np.testing.assert_array_equal(after, -1.5)
     epochs = np.asarray(seen).reshape(3, 2, EPISODES)
     np.testing.assert_array_equal(epochs.sum(axis=2), 4)
     np.testing.assert_array_equal(epochs.sum(axis=1), 1)
     assert len({epoch[0].tobytes() for epoch in epochs}) > 1
+    assert metrics == {"number": 3.5, "gradient_norm": 2}
 
 
 @pytest.mark.slow
-def test_seeds_side_by_side_are_those_alone():
+def test_seeds_trained_by_vmap_equal_seeds_trained_alone():
     """With the cache of encodings and the loops of the real rollout; up to rounding."""
     plain = make_learner(dataclasses.replace(PLAIN, env_id="sy"))
     both = jax.vmap(plain.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))
@@ -292,6 +322,18 @@ def with_curiosity(monkeypatch):
         return make_learner(PLAIN, **arguments)
 
     return build
+
+
+def test_an_intrinsic_reward_is_zero_after_the_end_of_an_episode(with_curiosity):
+    nothing: Any = None
+    learner = Known(**vars(with_curiosity(Returning(reward=jnp.ones((1, 2))))))
+    mask = jnp.array([[1.0, 0.0]])
+    episodes = Episodes(nothing, nothing, nothing, nothing, nothing, mask)
+    state: Any = SimpleNamespace(params={"curiosity": {}}, memory=jnp.int32(7))
+    trajectory = Trajectory(nothing, episodes, nothing, nothing)
+    reward, memory = learner.intrinsic_reward(state, trajectory)
+    np.testing.assert_array_equal(reward, [[1, 0]])
+    assert memory == 7
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ AFTER = [[4, 3], [5, 5], [7, 8]]
 CELLS = jnp.array([[[[3, 3], [5, 5], [7, 7]], AFTER, AFTER]], jnp.uint8)
 
 
-def test_motion_is_a_change_of_row_or_column():
+def test_the_motion_loss_is_a_cross_entropy_of_changed_rows_and_columns():
     moving = [[9.0, -9.0], [-9.0, -9.0], [-9.0, 9.0]]
     confident = jnp.array([[moving, [[-9.0, -9.0]] * 3]])
     right = motion_loss(confident, CELLS)

@@ -58,7 +58,7 @@ def test_each_episode_is_solved_or_failed_after_one_last_subgoal(measured):
     assert (measured["solved"] <= measured["solved_100"]).all()
 
 
-def test_means_are_of_the_solved_tasks(measured):
+def test_means_are_over_solved_tasks(measured):
     base = row(measured, "structural", "0")
     assert base["optimality"] == pytest.approx(11 / base["steps"])
     failed = row(measured, "control", "food-outside, near")

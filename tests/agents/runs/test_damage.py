@@ -302,7 +302,3 @@ def test_damage_is_one_line_with_the_path(name, kind, whole, tmp_path, limits):
         assert message.isprintable(), "one line, which no terminal takes for a command"
         assert len(message) < 2000
     assert contents(tmp_path) == before
-
-
-def test_there_are_enough_kinds_of_damage():
-    assert len(DAMAGES) >= 100

@@ -129,20 +129,6 @@ def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
     )
 
 
-def test_damaged_options_are_named(tmp_path):
-    for options in ({}, {"options": {"sets": None, "more": 1}}):
-        write_json(tmp_path / "config.json", {**Run(Config()).to_dict(), **options})
-        assert_refused(["config.json", "cannot be read"], RunFolder(tmp_path).read)
-
-
-@pytest.mark.parametrize(
-    "text", ["", "[]", "{", '{"config": 3}', '{"version": "0", "config": {"hidden": "x"}}']
-)
-def test_damaged_settings_are_named(tmp_path, text):
-    (tmp_path / "config.json").write_text(text)
-    assert_refused([str(tmp_path / "config.json")], RunFolder(tmp_path).read)
-
-
 def test_files_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "new" / "x.json"
     write = Path.write_bytes

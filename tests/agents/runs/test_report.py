@@ -72,27 +72,27 @@ def test_a_page_needs_no_network_and_holds_the_settings(page):
 def test_a_page_shows_solved_and_unsolved_episodes(played, page):
     outcome = played[1]["mine"]
     solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
-    mine = [each for each in page[1] if each["title"].startswith("mine")]
-    assert [each["title"] for each in mine] == [
+    mine = [episode for episode in page[1] if episode["title"].startswith("mine")]
+    assert [episode["title"] for episode in mine] == [
         f"mine, task {solved}: solved",
         f"mine, task {unsolved}: not solved",
     ]
-    for index, each in zip((solved, unsolved), mine, strict=True):
+    for index, episode in zip((solved, unsolved), mine, strict=True):
         length = outcome.length[index]
-        assert len(each["agent"]["frames"]) == length + 1
-        assert len(each["agent"]["actions"]) == length
-        np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
-        for frame in each["agent"]["frames"]:
+        assert len(episode["agent"]["frames"]) == length + 1
+        assert len(episode["agent"]["actions"]) == length
+        np.testing.assert_allclose(episode["values"], outcome.value[index, :length], atol=1e-4)
+        for frame in episode["agent"]["frames"]:
             with Image.open(io.BytesIO(base64.b64decode(frame))) as picture:
                 assert picture.size == (192, 192)
 
 
 def test_a_page_shows_shortest_plans(played, page):
     """From the same board as the episode, and with as many steps as are needed."""
-    for each in page[1]:
-        name, _, number = each["title"].partition(":")[0].partition(", task ")
+    for episode in page[1]:
+        name, _, number = episode["title"].partition(":")[0].partition(", task ")
         steps = {"base": 11, "mine": 1}.get(name)
-        plan = each["plan"]
+        plan = episode["plan"]
         assert len(plan["frames"]) == len(plan["actions"]) + 1
         if steps is not None:
             assert len(plan["actions"]) == steps
@@ -103,8 +103,7 @@ def test_a_page_shows_shortest_plans(played, page):
         assert plan["frames"][0] == report._png(shown)
 
 
-def test_curves_of_a_run_that_solves_nothing_say_so():
-    """As many panels as if it did."""
+def test_curves_have_as_many_panels_where_nothing_is_solved():
     heights = []
     for share in (0.0, 0.5):
         rows = pd.DataFrame([row(i, success=share, validation_success=share) for i in (1, 2)])

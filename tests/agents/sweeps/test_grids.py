@@ -46,7 +46,7 @@ def test_a_setting_may_have_no_effect_at_some_points():
     assert {config.intrinsic_coef for config in found.values()} == {0.5}
 
 
-def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, own_task_sets):
+def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, fresh_task_sets):
     monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
     given = Options(("curiosity=none,icm",), ("agents.examples.near_food",), seeds=2, seed=3)
     given = dataclasses.replace(given, env="near-food", out=tmp_path)

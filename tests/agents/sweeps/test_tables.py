@@ -208,7 +208,7 @@ def test_the_tables_of_the_records_fit_a_terminal(record, tmp_path):
     assert max(map(len, shown.splitlines())) <= records.WIDTH
 
 
-def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path, own_task_sets):
+def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path, fresh_task_sets):
     for short in ("NA", "other"):
         tt.register(f"{short}-v0", (tt.symbolic,), short=short)
     tested = rows("ppo", [3], task_set="NA") + rows("ppo", [4], task_set="other")
