@@ -103,10 +103,11 @@ class Progress:
         self._log = stack.enter_context(open_loggers(self.folder.path, self.run, **chosen))
         self._line = stack.enter_context(TrainingLine(self.console, config.iterations))
         together = f", with {seeds - 1} other seed(s)" if seeds > 1 else ""
+        train_set = tt.task_set(config.env_id).label
         self.console.out(
-            f"{self.folder.path}: {tt.task_set(config.env_id).id}, curiosity {config.curiosity}, "
-            f"seed {self.run.seed}, {self.program.num_parameters:,} parameters, on "
-            f"{self.program.placement}, {self.program.learner.path} path{together}. "
+            f"{self.folder.path}: {train_set}, curiosity {config.curiosity}, "
+            f"seed {self.run.seed}, {self.program.num_parameters:,} parameters\n"
+            f"On {self.program.placement}, {self.program.learner.path} path{together}. "
             "Compiling, which takes up to a minute ..."
         )
 
