@@ -1,6 +1,6 @@
 """Uses an extra as the page that names it does: `extra_user.py EXTRA FOLDER`, in the checkout.
 
-Runs in FOLDER. The wheel is used as installed, `agents` from the checkout.
+Runs in FOLDER. The wheel is used as installed, `agents` and `benchmarks` from the checkout.
 """
 
 import os
@@ -21,6 +21,14 @@ with LocalCluster(n_workers=1, threads_per_worker=1) as cluster:
     address = ["--cluster", cluster.scheduler_address]
     subprocess.run([sys.executable, *command, *address], check=True)
 """
+COMPARE_PEERS = """
+from benchmarks import peers
+
+options = peers.Options(sets=("base",), num_envs=(2,), num_steps=2, repeats=1)
+_, skipped = peers.measure(options)
+assert not skipped, skipped
+"""
+WHEEL_ALONE = ("pictures", "gymnasium", "gymnax")
 
 
 def block(page: str, mark: str) -> str:
@@ -41,13 +49,16 @@ USES = {
     "agents": [["-c", block("README.md", "from agents")]],
     "agents,logging": [[*TRAIN, "--tensorboard", "--wandb"]],
     "agents,cluster": [["-c", SWEEP_ON_A_CLUSTER]],
+    "docs": [["-m", "pdoc", "--docformat", "google", "-o", "reference", "trap_tube_jax", "agents"]],
+    "bench": [["-c", COMPARE_PEERS]],
+    "interop": [["-m", "agents.examples.rejax_agent"], ["-m", "agents.examples.sb3_agent"]],
 }
 
 
 def main(extra: str, folder: pathlib.Path) -> None:
     """Runs the uses of an extra."""
     environment = os.environ | {"WANDB_MODE": "offline"}
-    if "agents" in extra:
+    if extra not in WHEEL_ALONE:
         environment["PYTHONPATH"] = str(pathlib.Path.cwd())
     folder.mkdir(parents=True)
     for arguments in USES[extra]:

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from agents.files import expand
-from trap_tube_jax.checks import did_you_mean
+from trap_tube_jax.checks import did_you_mean, expand
 from trap_tube_jax.imports import import_modules
 
 Options = TypeVar("Options")

@@ -19,22 +19,6 @@ Plain = bool | int | float | str | None
 LARGEST = 2**26  # bytes of a text file
 
 
-def expand(path: str | os.PathLike[str]) -> Path:
-    """Returns a path, in which a leading `~` stands for the home folder.
-
-    Shells expand `--out ~/x`, but not `--out=~/x`; Python expands neither.
-
-    Raises:
-      ValueError: there is no such home folder, or a terminal would take the path for a command.
-    """
-    if not str(path).isprintable():
-        raise ValueError(f"paths must be printable, got {str(path)!r}; rename it")
-    try:
-        return Path(path).expanduser()
-    except RuntimeError as error:
-        raise ValueError(f"{path} cannot be expanded: {error}") from error
-
-
 def is_file(path: Path) -> bool:
     """Returns whether a path names a regular file; False if it names nothing.
 

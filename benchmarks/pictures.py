@@ -13,6 +13,7 @@ import pandas as pd
 import agents
 import trap_tube_jax as tt
 from agents.sweeps import figures, tables
+from trap_tube_jax.checks import expand
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import run_command
@@ -210,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks.pictures",
         description="Draws the pictures of README.md and other pages.",
     )
-    parser.add_argument("--output", type=Path, default=FIGURES, help="folder of the pictures")
+    parser.add_argument("--output", type=expand, default=FIGURES, help="folder of the pictures")
     options = parser.parse_args(arguments)
     with plain_errors(), mpl.rc_context({"font.size": 10}):
         options.output.mkdir(parents=True, exist_ok=True)

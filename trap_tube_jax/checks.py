@@ -3,9 +3,11 @@
 import difflib
 import functools
 import inspect
+import os
 import re
 import reprlib
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -30,6 +32,22 @@ def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None =
         upper = "" if maximum is None else f" and <= {maximum}"
         raise ValueError(f"{name} must be an integer >= {minimum}{upper}, got {value!r}")
     return int(value)
+
+
+def expand(path: str | os.PathLike[str]) -> Path:
+    """Returns a path, in which a leading `~` stands for the home folder.
+
+    Shells expand `--out ~/x`, but not `--out=~/x`; Python expands neither.
+
+    Raises:
+      ValueError: there is no such home folder, or a terminal would take the path for a command.
+    """
+    if not str(path).isprintable():
+        raise ValueError(f"paths must be printable, got {str(path)!r}; rename it")
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"{path} cannot be expanded: {error}") from error
 
 
 def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:

@@ -2,14 +2,13 @@
 
 import argparse
 import os
-import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from trap_tube_jax.checks import check_integer, check_seed
+from trap_tube_jax.checks import check_integer, check_seed, expand
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import run_command
@@ -74,7 +73,7 @@ def save_gallery(
     _draw(axes, _signs())
     for axis, name in zip(axes, OBJECT_NAMES, strict=True):
         axis.set_title(name, size="medium")
-    figure.savefig(path, format="png", dpi=160)
+    figure.savefig(expand(path), format="png", dpi=160)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -84,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description="Draws tasks of the eight task sets.",
     )
     add = parser.add_argument
-    add("--output", type=pathlib.Path, default=".", help="folder of gallery.png [%(default)s]")
+    add("--output", type=expand, default=".", help="folder of gallery.png [%(default)s]")
     add("--tasks", type=int, default=4, help="distinct tasks per set, 2 to 64 [%(default)s]")
     add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1 [%(default)s]")
     options = parser.parse_args(arguments)

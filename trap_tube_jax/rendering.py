@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.checks import check_integer, integer_array
+from trap_tube_jax.checks import check_integer, expand, integer_array
 from trap_tube_jax.dynamics import holds_tool, step
 from trap_tube_jax.environment import check_actions
 from trap_tube_jax.geometry import unit_vector
@@ -182,7 +182,7 @@ def save_gif(
     pictures, durations = _distinct_pictures(pictures, _durations(len(pictures), fps, hold))
     first, *rest = map(Image.fromarray, pictures)
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
-    first.save(path, format="GIF", duration=(10 * durations).tolist(), loop=0, **options)
+    first.save(expand(path), format="GIF", duration=(10 * durations).tolist(), loop=0, **options)
 
 
 def _durations(num_frames: int, fps: float, hold: float) -> np.ndarray:

@@ -9,10 +9,10 @@ from typing import Any, NotRequired, TypedDict
 
 import filelock
 
-from agents.files import Plain, damage_named, expand, is_file, read_json, write_json
+from agents.files import Plain, damage_named, is_file, read_json, write_json
 from agents.runs.run import DeviceOptions, Run, RunOptions, check_algorithm
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import check_seed, check_stored_name
+from trap_tube_jax.checks import check_seed, check_stored_name, expand
 from trap_tube_jax.imports import import_modules
 
 CONFIG_FILE = "config.json"

@@ -10,11 +10,11 @@ from agents import pretrained
 from agents.acting.policy import Policy
 from agents.arrays import SUFFIX, Arrays, from_arrays, read_arrays, to_arrays, write_arrays
 from agents.config import Config
-from agents.files import expand, is_file
+from agents.files import is_file
 from agents.networks.agent import PARTS, Agent, Params
 from agents.runs import checkpoint
 from agents.runs.folder import CONFIG_FILE, RunFolder, Settings, runs_near
-from trap_tube_jax.checks import check_integer
+from trap_tube_jax.checks import check_integer, expand
 from trap_tube_jax.imports import import_modules
 
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import pandas as pd
 
-from agents.files import expand
 from agents.runs.folder import CONFIG_FILE, RunFolder, runs_near
 from agents.runs.metrics import read_rows
 from agents.runs.provenance import read_provenance
+from trap_tube_jax.checks import expand
 
 Paths = str | Path | Iterable[str | Path]
 

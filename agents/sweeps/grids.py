@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ from agents.runs.folder import RunFolder, check_name
 from agents.runs.run import Run, RunOptions
 from trap_tube_jax.checks import check_integer
 
+MAX_RUNS = 10_000  # a folder each
 COMMA = re.compile(r",(?![^\[]*\])")  # but not within a list
 
 
@@ -77,8 +79,7 @@ class Grid:
 
     def make_runs(self, name: str, options: Options) -> dict[Path, Run]:
         """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
-        if options.seeds < 1:
-            raise ValueError(f"seeds must be >= 1, got {options.seeds}")
+        check_integer("seeds", options.seeds, maximum=MAX_RUNS)
         if options.seeds_per_program is not None:
             check_integer("seeds_per_program", options.seeds_per_program)
         configs = self.configs(options)
@@ -108,6 +109,11 @@ class Grid:
         fixed = sorted({name for point in self.points.values() for name in point} & given.keys())
         if fixed:
             raise ValueError(f"the grid's points decide {', '.join(fixed)}; use --only")
+        points = len(self.points) * math.prod(map(len, given.values()))
+        if points * options.seeds > MAX_RUNS:
+            raise ValueError(
+                f"a grid has at most {MAX_RUNS:,} runs, got {points * options.seeds:,}"
+            )
         common = {**self.settings, **({} if options.env is None else {"env_id": options.env})}
         configs = {}
         for name, *labels in itertools.product(self.points, *given.values()):

@@ -5,10 +5,14 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+import trap_tube_jax as tt
+from trap_tube_jax import gallery
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
+from trap_tube_jax.solver import __main__ as solver_command
 
 
 @pytest.mark.parametrize(
@@ -23,6 +27,19 @@ def test_commands_end_with_one_line(error, code, capsys):
     with pytest.raises(SystemExit, match=str(code)), plain_errors():
         raise error
     assert capsys.readouterr().err == f"error: {error}\n"
+
+
+def test_a_leading_tilde_is_the_home_folder(monkeypatch, tmp_path):
+    """Also where no shell expands it, as in --output=~/x and in Python."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gallery, "save_gallery", lambda path, **_: path.touch())
+    gallery.main(["--output=~"])
+    solver_command.main(["--sets", "base", "--tasks", "1", "--output=~/plans.png"])
+    tt.save_gif(np.zeros((1, 4, 4, 3), np.uint8), "~/black.gif")
+    found = {path.name for path in (tmp_path / "home").iterdir()}
+    assert found == {"gallery.png", "plans.png", "black.gif"}
 
 
 def test_an_error_is_no_command_to_the_terminal(capsys):

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
+from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed, expand
 from trap_tube_jax.command_line import add_import_option, announce, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.interruptions import run_command
@@ -61,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     modes.add_argument("--distances", metavar="SET", help="draw distances to the goal in one task")
     add(
         "--output",
-        type=Path,
+        type=expand,
         help="file to write, by default shortest_plans.png, plan.gif or distances.png",
     )
     add_import_option(parser)
