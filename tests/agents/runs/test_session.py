@@ -71,6 +71,11 @@ def outcome(solved):
     return Evaluation(solved, *jnp.ones((3, len(solved))))
 
 
+def count_up(state, metrics):
+    """Adds 1 to all parameters."""
+    return state._replace(params=jax.tree.map(lambda x: x + 1, state.params)), metrics
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A run that nothing interrupts, evaluated as it goes. Not to be changed."""
@@ -425,10 +430,7 @@ def test_validation_success_is_of_the_policy_after_the_iteration(tmp_path, monke
     def play(agent, params, *_):
         return outcome(params["heads"]["params"]["value"]["bias"][:1] == 2)
 
-    def learn(state, metrics):
-        return state._replace(params=jax.tree.map(lambda x: x + 1, state.params)), metrics
-
-    replace_training(monkeypatch, learn, play)
+    replace_training(monkeypatch, count_up, play)
     train_run(tmp_path / "x", small_run(iterations=2), PLAIN)
     assert [row["validation_success"] for row in untimed(tmp_path / "x")] == ["0.0", "1.0"]
 
@@ -512,6 +514,7 @@ def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
         tested.append(params)
         return play(evaluator, params)
 
+    replace_training(monkeypatch, count_up)
     monkeypatch.setattr(program.Cohort, "advance", end)
     monkeypatch.setattr(Evaluator, "__call__", record)
     config = small_config(iterations=3, stop_when_solved=1.0)
