@@ -20,7 +20,7 @@ CONTINUES = "Stopped. The same command continues."
 PHASES = {
     "compiling": ("agents.train", [*ENDLESS, "--name", "x"], "", "stdout", RESUME),
     "training": ("agents.train", [*ENDLESS, "--name", "x"], "iteration 1", "stdout", RESUME),
-    "evaluation": ("agents.train", [*SHORT, "--name", "x"], "Evaluating", "stdout", RESUME),
+    "evaluation": ("agents.train", [*SHORT, "--name", "x"], "Playing", "stdout", RESUME),
     "start of a sweep": ("agents.sweep", GRID, "1 run(s)", "stdout", CONTINUES),
     "table of a sweep": (
         "agents.sweep",
@@ -30,7 +30,7 @@ PHASES = {
         CONTINUES,
     ),
     "evaluate": ("agents.evaluate", ["POLICY", "--import", "says_ready"], "ready", "stdout", AGAIN),
-    "solver": ("trap_tube_jax.solver", ["--tasks", 100_000], "solving", "stderr", AGAIN),
+    "solver": ("trap_tube_jax.solver", ["--tasks", 100_000], "Solving", "stderr", AGAIN),
 }
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
