@@ -1,5 +1,7 @@
 """The recurrent core of the network, with and without its memory."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from agents import Config
 from agents.networks.agent import Agent
+from agents.networks.core import Core
 
 STEPS = 4
 BATCH = 3
@@ -27,6 +30,29 @@ def test_a_step_depends_on_the_past_only_with_memory(recurrent):
     assert np.all(np.asarray(one[:, 0]) != np.asarray(other[:, 0]))
     same_later = np.array_equal(one[:, 1:], other[:, 1:])
     assert same_later == (not recurrent)
+
+
+@pytest.mark.parametrize(
+    ("update", "reset", "candidate", "expected"),
+    [
+        (99, 0, 5, 2),  # keeps the state
+        (-99, -99, 0.5, np.tanh(0.5)),  # forgets it
+        (-99, 99, 0.5, np.tanh(0.5 + 2 * 0.25 + 1)),
+        (0, 0, 0, (2 + np.tanh((2 * 0.25 + 1) / 2)) / 2),
+    ],
+)
+def test_gates_of_the_gru_keep_and_reset_the_state(update, reset, candidate, expected):
+    """Of one unit in state 2, whose candidate has the recurrent weight 0.25 and bias 1."""
+    params = {
+        "input_kernel": jnp.zeros((1, 3)),
+        "state_kernel": jnp.array([[0, 0, 0.25]]),
+        "bias": jnp.array([[7.0, 7.0, 7.0], [0.0, 0.0, 1.0]]),  # the first is of the inputs
+        "initial": jnp.full(1, 7.0),
+    }
+    inputs = jnp.array([update, reset, candidate], jnp.float32)
+    core: Any = Core(1, 1)
+    state = core.apply({"params": params}, jnp.array([2.0]), inputs, method=Core.advance)
+    np.testing.assert_allclose(state, [expected], rtol=1e-6)
 
 
 def test_the_gru_has_the_same_parameters_without_recurrence():
