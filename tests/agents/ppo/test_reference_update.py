@@ -33,8 +33,7 @@ def ours(recording: Recording) -> dict[str, Any]:
     def run(params):
         trajectory = make_trajectory(learner.agent, params, recording)
         experience = learner.experience(params, trajectory.episodes)
-        assert isinstance(learner.curiosity, ICM)
-        prediction = learner.curiosity.predict(params["curiosity"], experience)
+        prediction = ICM(CONFIG).predict(params["curiosity"], experience)
         before = state._replace(params=params)
         raw, _ = learner.intrinsic_reward(before, trajectory)
         batch, moments = learner.make_batch(before, trajectory, raw)
