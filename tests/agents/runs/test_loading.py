@@ -134,6 +134,14 @@ PRESETS_OF = {
     "icm-base": ("paper", {"stop_when_solved": 1.0}),
     "best-pstsy": ("best", {}),
     "colors-p+pstsy": ("best", {"object_colors": True}),
+    "colors-p+psy+pstsy": (
+        "best",
+        {
+            "object_colors": True,
+            "max_steps": 40,
+            "replay_fractions": (0.0625, 0.125, 0.5),
+        },
+    ),
 }
 
 
