@@ -15,13 +15,13 @@ import trap_tube_jax as tt
 from agents.sweeps import figures, tables
 from trap_tube_jax.checks import expand
 from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.figures import default_style
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.scoring.tasks import label
 from trap_tube_jax.state import take
 
 with needs_extra("pictures"):
-    import matplotlib as mpl
     from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).parent / "results"
@@ -213,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--output", type=expand, default=FIGURES, help="folder of the pictures")
     options = parser.parse_args(arguments)
-    with plain_errors(), mpl.rc_context({"font.size": 10}):
+    with plain_errors(), default_style():
         options.output.mkdir(parents=True, exist_ok=True)
         for name, draw in PICTURES.items():
             draw().savefig(options.output / f"{name}.png", dpi=DPI)

@@ -21,7 +21,7 @@ ENVIRONMENT = (
     ("dynamics", "layouts", "transfers", "graded", "observation"),
     ("environment", "wrappers", "vector"),
     ("controls", "registry"),
-    ("rendering", "solver"),
+    ("figures", "rendering", "solver"),
     ("scoring",),
     ("adapters", "gallery", "play"),
 )

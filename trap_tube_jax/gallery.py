@@ -10,6 +10,7 @@ import numpy as np
 
 from trap_tube_jax.checks import check_integer, check_seed, expand
 from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.figures import default_style
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.objects import NUM_OBJECTS, OBJECT_NAMES
@@ -35,6 +36,7 @@ CELL_SIZE = 16  # pixels
 SIGN_SIZE = 48  # pixels
 
 
+@default_style()
 def save_gallery(
     path: str | os.PathLike[str],
     ids: Sequence[str] = tuple(entry.id for entry in PAPER_TASK_SETS),

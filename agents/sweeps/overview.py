@@ -61,6 +61,8 @@ class Overview(ProgressLine):
 
 def _rows(path: Path) -> int:
     """Counts the iterations in a run's file, which a worker may be writing."""
+    metrics = RunFolder(path).metrics
     with contextlib.suppress(OSError):
-        return max(0, RunFolder(path).metrics.read_bytes().count(b"\n") - 1)
+        if metrics.is_file():  # reading a FIFO would never end
+            return max(0, metrics.read_bytes().count(b"\n") - 1)
     return 0

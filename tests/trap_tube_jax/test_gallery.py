@@ -3,14 +3,17 @@
 import sys
 
 import jax
+import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import trap_tube_jax as tt
+from helpers.easy_task import EASY
 from helpers.refusal import refused
 from trap_tube_jax import gallery
 from trap_tube_jax.objects import OBJECT_NAMES
+from trap_tube_jax.solver.pictures import save_distances, save_histogram
 
 
 def test_the_gallery_shows_distinct_tasks_of_the_seed_and_a_legend(tmp_path, monkeypatch):
@@ -33,6 +36,18 @@ def test_the_gallery_shows_distinct_tasks_of_the_seed_and_a_legend(tmp_path, mon
     assert [axis.get_title() for axis in legend] == list(OBJECT_NAMES)
     corners = [np.asarray(axis.images[0].get_array())[5, 1] for axis in legend]
     np.testing.assert_array_equal(corners, tt.base_palette())
+
+
+def test_pictures_are_drawn_under_matplotlibs_defaults(tmp_path, monkeypatch):
+    """Here by a reader whose settings ask for a LaTeX that is not there."""
+    monkeypatch.setitem(mpl.rcParams, "text.usetex", True)
+    monkeypatch.setenv("PATH", "")
+    gallery.save_gallery(tmp_path / "gallery.png", ("base",), tasks=2)
+    save_histogram({"base": np.array([11])}, tmp_path / "histogram.png")
+    plan = tt.solve(EASY)
+    save_distances(EASY, plan, tt.distances(EASY), tmp_path / "distances.png")
+    assert len(list(tmp_path.iterdir())) == 3
+    assert mpl.rcParams["text.usetex"]
 
 
 @pytest.mark.parametrize(

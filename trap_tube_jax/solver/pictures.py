@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from trap_tube_jax.figures import default_style
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.rendering import render
@@ -21,6 +22,7 @@ CELL_SIZE = 32  # pixels
 MOMENTS = 4  # pictures of distances along a plan
 
 
+@default_style()
 def save_distances(
     state: State, plan: Plan, distances: Distances, path: str | os.PathLike[str]
 ) -> None:
@@ -55,6 +57,7 @@ def save_distances(
     figure.savefig(path, format="png", dpi=100)
 
 
+@default_style()
 def save_histogram(lengths: Mapping[str, np.ndarray], path: str | os.PathLike[str]) -> None:
     """Writes a PNG with a histogram per task set, by label, of its tasks' shortest plans.
 
