@@ -55,6 +55,19 @@ def test_gates_of_the_gru_keep_and_reset_the_state(update, reset, candidate, exp
     np.testing.assert_allclose(state, [expected], rtol=1e-6)
 
 
+def test_an_action_is_embedded_by_its_grasp_and_by_its_move():
+    core: Any = Core(1, 2)
+    tables = jnp.arange(16.0).reshape(2, 4, 2)
+    params = {
+        name: {"embedding": table}
+        for name, table in zip(("grasp_embedding", "move_embedding"), tables, strict=True)
+    }
+    params |= {"input_kernel": jnp.zeros((1, 3)), "state_kernel": jnp.zeros((1, 3))}
+    params |= {"bias": jnp.zeros((2, 3)), "initial": jnp.zeros(1)}
+    found = core.apply({"params": params}, jnp.array([3, 1]), method=Core.embed_action)
+    np.testing.assert_array_equal(found, [6, 7, 10, 11])
+
+
 def test_the_gru_has_the_same_parameters_without_recurrence():
     shapes = [
         jax.eval_shape(Agent(Config(recurrent=recurrent)).init, jax.random.key(0))

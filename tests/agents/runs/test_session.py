@@ -356,6 +356,7 @@ def test_the_best_policy_has_the_highest_mean_over_the_sets_in_common(own, earli
     assert history.is_better(found, 1, 0, own) == better
     assert history.is_better(found, 1, None, own)
     assert not history.is_better(found, 2, 0, own), "not evaluated"
+    assert not history.is_better(found, 1, 1, own), "the best itself"
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
