@@ -39,10 +39,12 @@ def options():
 def start(module, *arguments, cwd=ROOT, **environment):
     """Starts a process of a command line, warnings being errors."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    # On a busy machine, XLA's log complains about slow compilation.
+    fixed = {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "3"}
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-m", module, *map(str, arguments)],
         cwd=cwd,
-        env={**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu", **environment},
+        env={**os.environ, **fixed, **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
