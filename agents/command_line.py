@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import functools
 import inspect
 import re
 import types
@@ -10,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from trap_tube_jax.checks import expand
+from trap_tube_jax.checks import did_you_mean, expand
 from trap_tube_jax.imports import import_modules
 
 Options = TypeVar("Options")
@@ -26,6 +25,17 @@ def option(default: Any, group: str | None = None, **metadata: Any) -> Any:
         lists alternative spellings.
     """
     return dataclasses.field(default=default, metadata={"group": group, **metadata})
+
+
+class _Help(argparse.HelpFormatter):
+    """Breaks the lines of a description to the terminal's width, and keeps its paragraphs."""
+
+    def __init__(self, prog: str, **options: Any):
+        super().__init__(prog, max_help_position=32, **options)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        fill = super()._fill_text
+        return "\n\n".join(fill(part, width, indent) for part in text.split("\n\n"))
 
 
 def parse(cls: type[Options], arguments: Sequence[str] | None, prog: str) -> Options:
@@ -56,9 +66,7 @@ def parse_all(
         prog=prog,
         usage=" ".join([prog, *map(str.upper, positional), "[options]"]),
         description=(inspect.getdoc(declared[0]) or "").partition("\n\nAttributes:")[0],
-        formatter_class=functools.partial(
-            argparse.RawDescriptionHelpFormatter, max_help_position=32
-        ),
+        formatter_class=_Help,
         allow_abbrev=False,
         add_help=not partly,
     )
@@ -72,7 +80,12 @@ def parse_all(
                 groups[group] = parser.add_argument_group(group)
             text = documents[field.name].replace("%", "%%")
             _add(groups[group], field, getattr(options, field.name, None), text, kinds[field.name])
-    found = vars(parser.parse_known_args(arguments)[0] if partly else parser.parse_args(arguments))
+    known, unknown = parser.parse_known_args(arguments)
+    if unknown and not partly:
+        options = [name for action in parser._actions for name in action.option_strings]
+        near = did_you_mean(unknown[0], options) if unknown[0].startswith("-") else ""
+        parser.error(f"unknown arguments: {' '.join(unknown)}{near}")
+    found = vars(known)
     values = {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
     if not partly:
         import_modules(values.get("imports", ()))  # they register names that the classes check

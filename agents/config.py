@@ -4,24 +4,22 @@ Source of the `paper` preset: agents/agent.md.
 """
 
 import dataclasses
-import difflib
 from functools import partial
 from typing import Any, Literal, Self, get_args, get_origin
 
 import jax
 import numpy as np
 
+import trap_tube_jax as tt
 from agents import registry
-from trap_tube_jax.environment import Environment
-from trap_tube_jax.objects import AGENT, FOOD, base_palette
-from trap_tube_jax.registry import task_set
-from trap_tube_jax.transfers import perceptual, structural, symbolic
+from trap_tube_jax.checks import did_you_mean
+from trap_tube_jax.objects import AGENT, FOOD
 
 MAX_INT32 = 2**31 - 1  # the largest i32, in which training counts
 KEEP_COLORS = {
-    perceptual,
-    structural,
-    symbolic,
+    tt.perceptual,
+    tt.structural,
+    tt.symbolic,
 }  # transfers after which agent and food look the same
 GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
@@ -44,9 +42,9 @@ class Config:
 
     Attributes:
       env_id: task set to train on, by id or short name, or a mixture such as p+pstsy.
-      num_features: N, feature channels of the observation; 3 is RGB.
-      max_steps: limit of steps of an episode of training; None keeps the task set's limit,
-        which holds in evaluations on `sets` in any case.
+      num_features: number N of feature channels of the observation; 3 is RGB.
+      max_steps: step limit of training episodes; None keeps the task set's limit. Evaluation always
+        uses the task set's limit.
       iterations: rollouts to train for, at most. Schedules span this number.
       max_transitions: environment steps to train for, at most; training stops before an iteration
         that could exceed it. None sets no limit.
@@ -69,15 +67,15 @@ class Config:
       motion_coef: weight of the motion-prediction loss. 0 trains without its head
         (`agents.ppo.motion`).
       learning_rate: Adam's step size.
-      lr_decay_fraction: final fraction that decays the step size. It decays
+      lr_decay_fraction: final fraction of training that decays the step size. It decays
         geometrically to a fiftieth.
       adam_epsilon: Adam's epsilon.
       max_gradient_norm: global norm of clipped gradients.
       curiosity: intrinsic reward, by its registered name. README.md lists them.
       intrinsic_coef: weight of the intrinsic reward. The reward is normalised; with separate value
         heads its advantage is weighted instead.
-      intrinsic_coef_init: initial weight. It decays geometrically to `intrinsic_coef`; 0 keeps the
-        weight constant.
+      intrinsic_coef_init: initial weight, or 0 for a constant one. It decays geometrically to
+        `intrinsic_coef`.
       intrinsic_anneal_fraction: fraction of iterations that decay the weight.
       curiosity_coef: weight of the curiosity's losses.
       value_heads: one for all rewards, or one each. `shared`: rewards are divided by their standard
@@ -87,7 +85,8 @@ class Config:
         rewards; the rates of `effects` use the same decay.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: failed tasks kept per replay fraction.
-      align_to_food: turns the board so that food is ahead, once per episode; mirrors it, too.
+      align_to_food: turns the board once per episode, so that the food is below the agent. May also
+        mirror it.
       repeat_penalty: penalty on repeats in greedy play. An action loses this many nats for each of
         the last 64 steps that took it at the same observation (`agents.acting.repeats`).
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
@@ -193,7 +192,8 @@ class Config:
           ValueError: unknown preset or setting, or a setting's value is not allowed.
         """
         if name not in PRESETS:
-            raise ValueError(f"unknown preset {name!r}; allowed: {', '.join(PRESETS)}")
+            near = did_you_mean(name, PRESETS)
+            raise ValueError(f"unknown preset {name!r}{near}; allowed: {', '.join(PRESETS)}")
         return cls.from_dict({**PRESETS[name], **overrides})
 
     @classmethod
@@ -206,9 +206,8 @@ class Config:
         known = [field.name for field in dataclasses.fields(cls)]
         for name in settings:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise ValueError(f"unknown setting {name!r}{hint}; allowed: {', '.join(known)}")
+                near = did_you_mean(name, known)
+                raise ValueError(f"unknown setting {name!r}{near}; allowed: {', '.join(known)}")
         return cls(**settings)
 
     def to_dict(self) -> dict[str, Any]:
@@ -216,10 +215,10 @@ class Config:
         return dataclasses.asdict(self)
 
     def step_limit(self, name: str) -> int:
-        """Returns the steps after which an episode of a task set is truncated."""
-        return task_set(name).max_steps if self.max_steps is None else self.max_steps
+        """Returns the step limit of training episodes on a task set."""
+        return tt.task_set(name).max_steps if self.max_steps is None else self.max_steps
 
-    def validate(self, env: Environment) -> None:
+    def validate(self, env: tt.Environment) -> None:
         """Raises ValueError unless these settings can be trained with in an environment."""
         for name in ("num_features", "max_steps"):
             if getattr(self, name) not in (None, getattr(env, name)):
@@ -313,9 +312,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def _check_known_colors(env: Environment) -> None:
+def _check_known_colors(env: tt.Environment) -> None:
     """Raises ValueError if agent or food may have another colour than in the base task."""
-    known = base_palette(env.num_features)[[AGENT, FOOD]].tolist()
+    known = tt.base_palette(env.num_features)[[AGENT, FOOD]].tolist()
     palettes: Any = [env.base.palette]
     if not set(env.transfers) <= KEEP_COLORS:
         states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 16))

@@ -14,10 +14,9 @@ from agents.runs.folder import check_output
 from agents.runs.loading import load
 from agents.runs.metrics import evaluation_rows, write_rows
 from agents.runs.report import save_first_solved
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.scoring.tasks import Purpose
-from trap_tube_jax.solver import solve_batch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     train_set = tt.task_set(config.env_id).short if options.gif else ""
     shortest = None
     if options.optimality:
-        shortest = {name: solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
+        announce("Searching for shortest plans, up to a minute per 1,000 tasks")
+        shortest = {name: tt.solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
+    announce(f"Playing {tasks:,} tasks of every set, up to a minute per 1,000")
     played = evaluator(policy.params)
     scores = evaluator.scores(played, shortest)
     if options.output is not None:

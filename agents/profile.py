@@ -21,7 +21,7 @@ from agents.profiles.tasks import FIRST_PUSH_PARTS, PARTS, STRENGTHS
 from agents.runs import compilation
 from agents.runs.loading import load
 from agents.runs.provenance import provenance
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.interruptions import run_command
 
 FIGURES = ("success.png", "controls.png")
@@ -33,11 +33,11 @@ class Options:
 
     Agents play greedily, one episode a task, on tasks drawn with keys that training never uses.
     Writes profile.csv, provenance.json and, if their parts are measured, success.png and
-    controls.png.
+    controls.png. Takes a few minutes.
 
     Attributes:
       runs: runs' folders, files of parameters, or names of shipped agents.
-      output: folder for the files; runs/profile-NAMES if absent. Only a profile of the same
+      output: folder for the files, by default runs/profile-NAMES. Only a profile of the same
         policies is replaced.
       parts: some of structural, perceptual and both (success by strength), symbolic (by the object
         that is the tool), kind and plan-length (of the tasks of {P}), first-push-p and
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     output = options.output or Path("runs", f"profile-{names}")
     _check_free(output, iterations)
     output.mkdir(parents=True, exist_ok=True)
-    found = profile(policies, options.parts, options.strengths, options.tasks)
+    found = profile(policies, options.parts, options.strengths, options.tasks, announce)
     for figure in FIGURES:  # of an earlier profile
         (output / figure).unlink(missing_ok=True)
     table = found.to_csv(index=False, float_format="%.6g")
@@ -105,7 +105,7 @@ def _print_tables(found: Table) -> None:
     if parts & set(FIRST_PUSH_PARTS):
         tables["First pushes where the food could go either way"] = knowledge_table(found)
     for title, table in tables.items():
-        print(f"{title}\n\n{table.to_string()}\n")
+        print(f"{title}\n\n{table.to_string(line_width=80)}\n")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from typing import Any
 
 from flax.errors import FlaxError
 
-from trap_tube_jax.checks import check_registered_name
+from trap_tube_jax.checks import check_registered_name, did_you_mean
 
 
 class Registry(dict[str, Callable[..., Any]]):
@@ -20,7 +20,7 @@ class Registry(dict[str, Callable[..., Any]]):
         super().__init__()
         self.kind = kind
         self.arguments = arguments
-        self.own: set[str] = set()
+        self.registered: set[str] = set()
 
     def register(self, name: str, factory: Callable[..., Any]) -> None:
         """Registers a factory, or replaces one registered earlier under the same name.
@@ -30,11 +30,11 @@ class Registry(dict[str, Callable[..., Any]]):
             and "-"; or the factory does not take the arguments.
         """
         check_registered_name(self.kind, name)
-        if name in self and name not in self.own:
+        if name in self and name not in self.registered:
             raise ValueError(f"{self.kind} {name!r} is built in; names taken: {', '.join(self)}")
         self._check_factory(name, factory)
         self[name] = factory
-        self.own.add(name)
+        self.registered.add(name)
 
     def _check_factory(self, name: str, factory: Any) -> None:
         try:
@@ -48,8 +48,9 @@ class Registry(dict[str, Callable[..., Any]]):
         """Returns the factory of this name; ValueError lists the names if there is none."""
         if name not in self:
             raise ValueError(
-                f"unknown {self.kind} {name!r}; allowed: {', '.join(self)}. If a module of yours "
-                "registers it, name the module: --import MODULE, or imports=[...] in Python"
+                f"unknown {self.kind} {name!r}{did_you_mean(name, self)}; "
+                f"allowed: {', '.join(self)}. If a module of yours registers it, name the module: "
+                "--import MODULE, or imports=[...] in Python"
             )
         return self[name]
 

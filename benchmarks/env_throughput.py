@@ -14,11 +14,9 @@ import numpy as np
 from rich.table import Table
 
 import trap_tube_jax as tt
-from agents.runs.console import CommandConsole
 from benchmarks import harness
 from trap_tube_jax.checks import check_integer
 from trap_tube_jax.objects import NUM_DIRECTIONS
-from trap_tube_jax.vector import VectorEnvironment
 
 DENSE_UNITS = 64
 ONE_HOT_LEVELS = 8
@@ -174,7 +172,7 @@ def task_set_subject(task_set: str, *, plain: bool = False) -> Subject:
         reset = jax.vmap(auto_reset.reset)
         step = jax.vmap(auto_reset.step)
     else:
-        vector = VectorEnvironment(env)
+        vector = tt.VectorEnvironment(env)
         reset = vector.reset
         step = vector.step
     return Subject(task_set, reset, step, sample_actions, lambda timestep: timestep.observation)
@@ -238,15 +236,15 @@ def on_devices(function: Callable[..., Any], devices: int) -> Callable[..., Any]
     Arguments and results have an additional first axis for the devices.
     """
 
-    def own(*arrays: Any) -> Any:
+    def on_one(*arrays: Any) -> Any:
         result = function(*jax.tree.map(lambda x: x[0], arrays))
         return jax.tree.map(lambda x: x[None], result)
 
     if devices == 1:
-        return own
+        return on_one
     mesh = jax.make_mesh((devices,), ("devices",), axis_types=(jax.sharding.AxisType.Auto,))
     part = jax.sharding.PartitionSpec("devices")
-    return jax.shard_map(own, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+    return jax.shard_map(on_one, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
 
 
 def use_devices(number: int) -> None:
@@ -276,10 +274,8 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
 
 def main(options: Options) -> list[Throughput]:
     """Measures, writes the record and prints a table."""
-    options.check()
     subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
-    console = CommandConsole()
-    console.print(harness.machine())
+    console = harness.begin(options)
     bandwidth = copy_bandwidth()
     console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
     results = [

@@ -22,9 +22,10 @@ from typing import Any, Self
 import jax
 
 from agents.command_line import parse
+from agents.runs.console import CommandConsole
 from agents.runs.provenance import commit, provenance
 from trap_tube_jax.checks import check_integer
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.interruptions import run_command
 
 SCHEMA = "trap-tube-jax benchmark 2"
@@ -55,6 +56,19 @@ class Options:
                 f"a record needs committed code, in a git checkout; the commit is {name}: commit "
                 "the changes, or leave out --output"
             )
+
+
+def begin(options: Options) -> CommandConsole:
+    """Checks the options, and prints the machine and how long measuring takes.
+
+    Raises:
+      ValueError: see `Options.check`.
+    """
+    options.check()
+    console = CommandConsole()
+    console.print(machine())
+    announce("Compiling and measuring, up to a minute per row on an idle machine")
+    return console
 
 
 def run(main: Callable[[Any], Any], options: type, benchmark: str) -> None:

@@ -2,7 +2,7 @@
 
 Times a whole iteration, rollout and update, of `agents.ppo`, of the program in
 `agents/examples/plain_ppo.py` (recurrent PPO with ICM) and of rejax's PPO, in turn within one
-process. Settings are those of preset `paper`, with fewer episodes and epochs. There are three
+process. Settings follow preset `paper`, with fewer episodes and epochs. There are three
 networks; the others' programs play the last two through the gymnax adapter, which needs the extra
 `[interop]`:
 
@@ -28,9 +28,7 @@ import agents.networks
 import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.examples import plain_ppo
-from agents.runs.console import CommandConsole
 from benchmarks import harness
-from trap_tube_jax.state import State, TimeStep
 
 NetworkName = Literal["paper", "dense", "feedforward"]
 ProgramName = Literal["ours", "plain", "plain-by-step", "rejax"]
@@ -113,20 +111,20 @@ class ThroughGymnax:
         self.observation_spec = self._env.observation_space()
         self.max_steps = config.step_limit(config.env_id)
 
-    def reset(self, key: jax.Array) -> tuple[tuple[State, jax.Array], TimeStep]:
+    def reset(self, key: jax.Array) -> tuple[tuple[tt.State, jax.Array], tt.TimeStep]:
         """Draws a task."""
         key, reset_key = jax.random.split(key)
         observation, state = self._env.reset(reset_key, self._params)
         flags = (state.terminated, state.truncated)
-        return (state, key), TimeStep(observation, jnp.zeros(()), *flags, jnp.ones(()))
+        return (state, key), tt.TimeStep(observation, jnp.zeros(()), *flags, jnp.ones(()))
 
-    def step(self, state: tuple[State, jax.Array], action: jax.Array) -> tuple[Any, TimeStep]:
+    def step(self, state: tuple[tt.State, jax.Array], action: jax.Array) -> tuple[Any, tt.TimeStep]:
         """Takes one action; the next task follows the end of an episode."""
         key, step_key = jax.random.split(state[1])
         stepped = self._env.step(step_key, state[0], action, self._params)
         observation, inner, reward, _, info = stepped
         flags = (info["terminated"], info["truncated"], info["discount"])
-        return (inner, key), TimeStep(observation, reward, *flags)
+        return (inner, key), tt.TimeStep(observation, reward, *flags)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,7 +163,7 @@ def plain_program(learner: plain_ppo.PlainPPO) -> Program:
 
     def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
         state, batch, minibatches = learner.collect(state)
-        update = lambda state, places: learner.update(state, batch, places)  # noqa: E731
+        update = lambda state, chosen: learner.update(state, batch, chosen)  # noqa: E731
         state, _ = jax.lax.scan(update, state, minibatches)
         return state, jnp.sum(batch[0].mask)
 
@@ -178,13 +176,13 @@ def plain_program_by_step(learner: plain_ppo.PlainPPO) -> Program:
     state = jax.jit(learner.init)(jax.random.key(0))
     collect, collect_s = harness.compiled(learner.collect, state)
     _, batch, minibatches = jax.eval_shape(learner.collect, state)
-    places = jax.ShapeDtypeStruct(minibatches.shape[1:], minibatches.dtype)
-    update, update_s = harness.compiled(learner.update, state, batch, places)
+    chosen = jax.ShapeDtypeStruct(minibatches.shape[1:], minibatches.dtype)
+    update, update_s = harness.compiled(learner.update, state, batch, chosen)
 
     def iterate(state: plain_ppo.TrainState) -> tuple[plain_ppo.TrainState, jax.Array]:
         state, batch, minibatches = collect(state)
-        for places in minibatches:
-            state, _ = update(state, batch, places)
+        for chosen in minibatches:
+            state, _ = update(state, batch, chosen)
         return state, jnp.sum(batch[0].mask)
 
     return iterate, collect_s + update_s, state
@@ -255,14 +253,12 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
 
 def main(options: Options) -> list[Speed]:
     """Measures, writes the record and prints a table."""
-    options.check()
     cases: list[tuple[str, NetworkName]] = [
         (name, network) for name in options.sets for network in options.networks
     ]
     for case in cases:
         options.config(*case)  # checks the settings
-    console = CommandConsole()
-    console.print(harness.machine())
+    console = harness.begin(options)
     results = []
     columns = ("set", "network", "program", "s/iteration", "steps/s", "ratio", "compile, s")
     table = Table(*columns)

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 from rich.table import Table
 
-from agents.runs.console import CommandConsole
 from benchmarks import env_throughput, harness
 from benchmarks.env_throughput import StepOptions, Subject, Throughput
 
@@ -111,14 +110,11 @@ class Options(StepOptions):
     peers: tuple[PeerName, ...] = tuple(PEERS)
 
 
-def measure(options: Options) -> tuple[list[Throughput], dict[str, str]]:
-    """Measures the task sets and the peers; returns results, and reasons by skipped peer.
-
-    Raises:
-      ValueError: a task set is unknown.
-    """
-    own = [env_throughput.task_set_subject(name) for name in options.sets]
-    results = _measure(own, options)
+def measure(
+    options: Options, subjects: Sequence[Subject]
+) -> tuple[list[Throughput], dict[str, str]]:
+    """Measures our task sets and the peers; returns results, and reasons by skipped peer."""
+    results = _measure(subjects, options)
     skipped = {}
     for name in options.peers:
         try:
@@ -132,10 +128,9 @@ def measure(options: Options) -> tuple[list[Throughput], dict[str, str]]:
 
 def main(options: Options) -> None:
     """Measures, writes the record, and prints a table and the skipped peers."""
-    options.check()
-    console = CommandConsole()
-    console.print(harness.machine())
-    results, skipped = measure(options)
+    subjects = [env_throughput.task_set_subject(name) for name in options.sets]
+    console = harness.begin(options)
+    results, skipped = measure(options, subjects)
     first = {result.num_envs: result.steps_per_s for result in reversed(results)}
     columns = ("envs", "M steps/s", "ratio", "µs/step", "B/obs.", "GB/s")
     table = Table("subject", *columns, "compile, s")

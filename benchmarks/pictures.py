@@ -208,7 +208,8 @@ PICTURES = {"board": draw_board, "symbolic": draw_symbolic, "table2": draw_table
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.pictures", description="Draw the pictures of the pages."
+        prog="python -m benchmarks.pictures",
+        description="Draws the pictures of README.md and other pages.",
     )
     parser.add_argument("--output", type=expand, default=FIGURES, help="folder of the pictures")
     options = parser.parse_args(arguments)

@@ -11,11 +11,10 @@ import jax
 import jax.numpy as jnp
 from rich.table import Table
 
+import trap_tube_jax as tt
 from agents import Config, TrainState, make_learner
 from agents.runs import compilation
-from agents.runs.console import CommandConsole
 from benchmarks import harness
-from trap_tube_jax import task_set
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +26,7 @@ class Options(harness.Options):
       sets: task sets to train on, by id or short name; by default the preset's.
       seeds: numbers of seeds in one program; 1 trains without `jax.vmap`.
       iterations: iterations per timed call.
-      cache: keeps compiled programs, and uses those of earlier commands.
+      cache: keeps compiled programs for later commands, and uses earlier ones.
     """
 
     repeats: int = 3
@@ -68,7 +67,8 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
     init = learner.init
     iterate = learner.iterate
     if seeds > 1:
-        init, iterate = jax.vmap(init), jax.vmap(iterate)
+        init = jax.vmap(init)
+        iterate = jax.vmap(iterate)
     else:
         keys = keys[0]
 
@@ -98,14 +98,12 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
 
 def main(options: Options) -> list[Speed]:
     """Measures, writes the record and prints a table."""
-    options.check()
     if options.cache:
         compilation.enable_cache()
     preset = Config.preset(options.preset)
-    names = [task_set(name).id for name in options.sets or (preset.env_id,)]
+    names = [tt.task_set(name).id for name in options.sets or (preset.env_id,)]
     configs = [Config.preset(options.preset, env_id=name) for name in names]
-    console = CommandConsole()
-    console.print(harness.machine())
+    console = harness.begin(options)
     columns = ("set", "path", "seeds", "s/iteration", "steps/s", "compile, s")
     table = Table(*columns, title=f"preset {options.preset}")
     results = []
@@ -113,7 +111,7 @@ def main(options: Options) -> list[Speed]:
         speed = measure(config, seeds, options)
         results.append(speed)
         table.add_row(
-            task_set(config.env_id).short,
+            tt.task_set(config.env_id).short,
             speed.path,
             str(seeds),
             f"{speed.seconds:.3f}",

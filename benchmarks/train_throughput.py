@@ -13,15 +13,14 @@ import jax
 import jax.numpy as jnp
 from rich.table import Table
 
+import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
 from agents.curiosity import Experience
 from agents.networks.agent import Params
 from agents.ppo.learner import Batch, Learner, TrainState
-from agents.runs.console import CommandConsole
 from benchmarks import harness
-from trap_tube_jax import task_set
 from trap_tube_jax.state import take
 
 
@@ -83,7 +82,7 @@ def measure(config: Config, *, warm: int, repeats: int) -> list[Part]:
         ("encoder", encoder, (params, batch)),
         ("recurrent part and heads", core, (params, batch, features)),
     ]
-    short = task_set(config.env_id).short
+    short = tt.task_set(config.env_id).short
     steps = float(jnp.sum(batch.episodes.mask))
     results = []
     for name, function, arguments in parts:
@@ -138,8 +137,8 @@ def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batc
     )
     actions = agent.embed_action(params, episodes.action)
     experience = Experience(episodes, features[..., :0], embedding, following, actions)
-    own = curiosity.losses(params["curiosity"], experience)
-    everything = jax.tree.leaves((agent.policy_and_value(params, embedding), own))
+    curiosity_losses = curiosity.losses(params["curiosity"], experience)
+    everything = jax.tree.leaves((agent.policy_and_value(params, embedding), curiosity_losses))
     return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 
 
@@ -162,10 +161,8 @@ def _sum_over_minibatches(
 
 def main(options: Options) -> list[Part]:
     """Measures, writes the record and prints a table."""
-    options.check()
-    configs = [Config.preset(options.preset, env_id=task_set(each).id) for each in options.sets]
-    console = CommandConsole()
-    console.print(harness.machine())
+    configs = [Config.preset(options.preset, env_id=tt.task_set(each).id) for each in options.sets]
+    console = harness.begin(options)
     table = Table(
         "set", "part", "seconds", "steps/s", "compile, s", title=f"preset {options.preset}"
     )

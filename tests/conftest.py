@@ -67,7 +67,7 @@ def _compilation(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture
-def own_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
+def fresh_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Task sets that a test registers are gone after it."""
     from trap_tube_jax import registry  # noqa: PLC0415  after the settings above
 
@@ -75,7 +75,7 @@ def own_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def own_names(own_task_sets: None) -> Iterator[None]:
+def fresh_names(fresh_task_sets: None) -> Iterator[None]:
     """Curiosities, encoders and task sets that a test registers are gone after it."""
     from agents import registry  # noqa: PLC0415  after the settings above
 
@@ -85,4 +85,4 @@ def own_names(own_task_sets: None) -> Iterator[None]:
     for kind, names in zip(kinds, known, strict=True):
         for name in set(kind) - names:
             del kind[name]
-            kind.own.discard(name)
+            kind.registered.discard(name)

@@ -174,8 +174,9 @@ def modules_of(requirements: list[str]) -> set[str]:
     return {{"pillow": "PIL"}.get(name, name) for name in found}
 
 
-def test_the_wheel_holds_the_environment_and_what_it_imports():
-    project, build = SETTINGS["project"], SETTINGS["tool"]["hatch"]
+def test_the_wheel_holds_the_environment_and_requires_its_imports():
+    project = SETTINGS["project"]
+    build = SETTINGS["tool"]["hatch"]
     assert build["build"]["targets"]["wheel"] == {"packages": ["trap_tube_jax"]}
     extras = project["optional-dependencies"]
     required = modules_of(project["dependencies"])
@@ -187,7 +188,7 @@ def test_the_wheel_holds_the_environment_and_what_it_imports():
     assert required == {"jax", "flax", "chex", "numpy", "scipy"}
 
 
-def test_every_place_names_the_version():
+def test_all_files_name_the_same_version():
     assert SETTINGS["tool"]["hatch"]["version"] == {"path": "trap_tube_jax/_version.py"}
     cited = re.findall(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     changed = re.findall(

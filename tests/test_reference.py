@@ -48,9 +48,9 @@ def examples(module: ModuleType, name: str) -> list[doctest.DocTest]:
     return [test for test in found if test.examples]
 
 
-@pytest.mark.usefixtures("own_names")
+@pytest.mark.usefixtures("fresh_names")
 @pytest.mark.parametrize(("module", "name"), PUBLIC)
-def test_the_example_of_a_public_name_prints_what_it_states(module, name, tmp_path, monkeypatch):
+def test_the_example_of_a_public_name_prints_the_stated_output(module, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = examples(module, name)
     assert found

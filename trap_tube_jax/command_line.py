@@ -23,6 +23,11 @@ def one_line(error: Exception) -> str:
     return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
 
 
+def announce(work: str) -> None:
+    """Says on stderr what a command is about to do and for how long, if that takes seconds."""
+    print(f"{work} ...", file=sys.stderr, flush=True)
+
+
 @contextlib.contextmanager
 def plain_errors() -> Iterator[None]:
     """Prepares the terminal, and ends the process with one line in place of a traceback.

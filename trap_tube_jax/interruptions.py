@@ -59,6 +59,8 @@ def receive(number: int) -> None:
     Raises:
       KeyboardInterrupt: at once is now, and the process is not a command's.
     """
+    if os.isatty(2):
+        _write("")  # a line of progress, or "^C", may stand there
     block = _process.blocks[-1] if _process.blocks else None
     if block is not None and block.received is None:
         _write(FINISHING)  # before the program can see the signal, and print its own end

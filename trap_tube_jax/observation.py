@@ -50,7 +50,7 @@ def observe(state: State) -> jax.Array:
 
 
 def render_ascii(state: State) -> str:
-    """Draws the board as 12 lines of 12 characters, as `State.from_ascii` reads. Host side.
+    """Draws the board as 12 lines of 12 characters, as `State.from_ascii` reads. Runs on the host.
 
     A character shows the topmost object of its cell alone, so not every state can be read back.
 

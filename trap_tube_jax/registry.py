@@ -79,7 +79,7 @@ _task_sets = dict(_BUILT_IN)
 
 
 def registered_ids() -> tuple[str, ...]:
-    """Returns the ids that `make` takes: the paper's eight, the controls, registered ones.
+    """Returns the ids that `make` takes: the paper's eight sets, the controls, and yours.
 
     Example:
       >>> tt.registered_ids()[:2]

@@ -113,7 +113,7 @@ def rgb(features: jax.Array) -> jax.Array:
 
 
 def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarray:
-    """Draws an episode as u8[T + 1, 12 s, 12 s, 3]. Host side.
+    """Draws an episode as u8[T + 1, 12 s, 12 s, 3]. Runs on the host.
 
     A frame shows the board before an action, with the hand in the action's grasp direction. The
     last frame shows the final board without a hand.
@@ -146,7 +146,7 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
 def save_gif(
     frames: Any, path: str | os.PathLike[str], fps: float = 8, *, hold: float = 1.0
 ) -> None:
-    """Writes an endlessly looping GIF. Host side.
+    """Writes an endlessly looping GIF. Runs on the host.
 
     Args:
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1. Pictures of at most

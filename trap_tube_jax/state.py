@@ -89,8 +89,8 @@ class State(ByValue, struct.PyTreeNode, eq=False):
     ) -> Self:
         """Builds a state at time 0 from concrete arrays of any integer type.
 
-        The tool may cover anything, the agent included, and the food may be in an exit. Any
-        number of cells may hold each static object.
+        The tool may cover anything, the agent included, and the food may be in an exit. A
+        static object may fill any number of cells.
 
         Args:
           board: [12, 12], codes 0 to 4.

@@ -182,7 +182,7 @@ class EpisodeStatistics:
 
     @property
     def auto_resets(self) -> str | None:
-        """When the wrapped environment resets itself, or None."""
+        """The step in which the wrapped environment resets: "SameStep", "NextStep" or None."""
         return _auto_resets(self.env)
 
     @names_adapters

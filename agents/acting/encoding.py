@@ -10,10 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+import trap_tube_jax as tt
 from agents.acting.episodes import Episodes
 from agents.networks.agent import Agent, Params
-from trap_tube_jax.observation import observe
-from trap_tube_jax.state import State
 
 # Maps (params, observations u8[M, 12, 12, N]) to features f32[M, F].
 EncodeFn = Callable[[Params, jax.Array], jax.Array]
@@ -40,17 +39,17 @@ class Encoding:
         self.agent = agent
         self.encode_for_curiosity = encode_for_curiosity
 
-    def start(self, params: Params, initial: State, num_steps: int) -> Any:
+    def start(self, params: Params, initial: tt.State, num_steps: int) -> Any:
         """Returns the memory with which `step` begins B episodes of `num_steps` steps."""
         del params, initial, num_steps
         return ()
 
     def step(
-        self, params: Params, state: State, time: jax.Array, memory: Any
+        self, params: Params, state: tt.State, time: jax.Array, memory: Any
     ) -> tuple[jax.Array, Any]:
         """Returns the policy's features f32[B, F] of B states at `time` i32[], and the memory."""
         del time
-        return self.agent.encode(params, jax.vmap(observe)(state)), memory
+        return self.agent.encode(params, jax.vmap(tt.observe)(state)), memory
 
     def encode_episodes(self, params: Params, episodes: Episodes) -> tuple[jax.Array, jax.Array]:
         """Encodes all observations of episodes; differentiable by `params`.

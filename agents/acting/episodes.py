@@ -5,9 +5,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from trap_tube_jax.observation import observe
+import trap_tube_jax as tt
 from trap_tube_jax.positions import position_id
-from trap_tube_jax.state import State
 
 
 class Episodes(NamedTuple):
@@ -24,7 +23,7 @@ class Episodes(NamedTuple):
       mask: f32[B, T], 1 on steps taken before the episode's end, else 0.
     """
 
-    layout: State
+    layout: tt.State
     cells: jax.Array
     action: jax.Array
     reward: jax.Array
@@ -56,25 +55,25 @@ class Episodes(NamedTuple):
         """i32[B], steps taken."""
         return jnp.sum(self.mask, axis=1).astype(jnp.int32)
 
-    def states(self) -> State:
+    def states(self) -> tt.State:
         """Returns the state of every observation, a tree of arrays [B, T + 1, ...]."""
         return jax.vmap(jax.vmap(with_cells, in_axes=(None, 0)))(self.layout, self.cells)
 
     def observations(self) -> jax.Array:
         """Returns all observations, u8[B, T + 1, 12, 12, N]."""
-        return jax.vmap(jax.vmap(observe))(self.states())
+        return jax.vmap(jax.vmap(tt.observe))(self.states())
 
     def position_ids(self) -> jax.Array:
         """Returns i32[B, T + 1], equal within an episode only for equal observations."""
         return jax.vmap(jax.vmap(position_id))(self.states())
 
 
-def with_cells(layout: State, cells: jax.Array) -> State:
+def with_cells(layout: tt.State, cells: jax.Array) -> tt.State:
     """Returns the layout with agent, tool and food at `cells` u8[3, 2]."""
     agent, tool, food = cells.astype(jnp.int32)
     return layout.replace(agent=agent, tool=tool, food=food)
 
 
-def cells_of(state: State) -> jax.Array:
+def cells_of(state: tt.State) -> jax.Array:
     """Returns the cells of agent, tool and food of one state, u8[3, 2]."""
     return jnp.stack([state.agent, state.tool, state.food]).astype(jnp.uint8)

@@ -4,12 +4,11 @@ from typing import NamedTuple
 
 import jax
 
+import trap_tube_jax as tt
 from agents.acting.encoding import Encoding
 from agents.acting.rollout import rollout
 from agents.acting.symmetry import Symmetry
 from agents.networks.agent import Agent, Params
-from trap_tube_jax.environment import Environment
-from trap_tube_jax.state import State
 
 
 class Evaluation(NamedTuple):
@@ -32,8 +31,8 @@ class Evaluation(NamedTuple):
 def evaluate(
     agent: Agent,
     params: Params,
-    env: Environment,
-    tasks: State,
+    env: tt.Environment,
+    tasks: tt.State,
     encoding: Encoding | None = None,
 ) -> Evaluation:
     """Plays each of B tasks at time 0 once, with the most probable actions. Pure; jit it.

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+import trap_tube_jax as tt
 from agents.networks.actions import ActionDistribution
 from agents.networks.hashing import hash_rows
-from trap_tube_jax.environment import action_to_index
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
 
 MEMORY = 64  # steps
@@ -52,7 +52,7 @@ class Repeats(NamedTuple):
         counts = jnp.einsum("bt,bta->ba", is_same, taken)
         counts = counts.reshape(-1, NUM_DIRECTIONS, NUM_DIRECTIONS)
         action = actions.mode(penalty * counts)
-        newest = Repeats(board, action_to_index(action))
+        newest = Repeats(board, tt.action_to_index(action))
         return action, jax.tree.map(_push, self, newest)
 
 

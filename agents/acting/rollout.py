@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+import trap_tube_jax as tt
 from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes, cells_of
 from agents.acting.step import Memory, choose
 from agents.acting.symmetry import Symmetry
 from agents.networks.agent import Agent, Params
-from trap_tube_jax.environment import Environment
-from trap_tube_jax.observation import observe
-from trap_tube_jax.state import State
 
 
 class Trajectory(NamedTuple):
@@ -37,8 +35,8 @@ class Trajectory(NamedTuple):
 def rollout(
     agent: Agent,
     params: Params,
-    env: Environment,
-    initial: State,
+    env: tt.Environment,
+    initial: tt.State,
     key: jax.Array | None,
     encoding: Encoding | None = None,
 ) -> Trajectory:
@@ -55,14 +53,14 @@ def rollout(
     encoding = encoding or Encoding(agent)
     symmetry = Symmetry.from_index(jnp.zeros(len(initial.time), jnp.int32))
     if agent.config.align_to_food:
-        symmetry = jax.vmap(Symmetry.facing_food)(jax.vmap(observe)(initial))
+        symmetry = jax.vmap(Symmetry.facing_food)(jax.vmap(tt.observe)(initial))
         initial = jax.vmap(Symmetry.transform_state)(symmetry, initial)
 
-    def step(carry: tuple[State, Memory, Any], time: jax.Array) -> Any:
+    def step(carry: tuple[tt.State, Memory, Any], time: jax.Array) -> Any:
         state, memory, encoded = carry
         features, encoded = encoding.step(params, state, time, encoded)
         step_key = None if key is None else jax.random.fold_in(key, time)
-        observation = jax.vmap(observe)(state)
+        observation = jax.vmap(tt.observe)(state)
         choice, memory = choose(agent, params, memory, features, observation, step_key)
         after, timestep = jax.vmap(env.step)(state, choice.action)
         cells = jax.vmap(cells_of)(state)

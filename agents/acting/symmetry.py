@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import trap_tube_jax as tt
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, DOWN, FOOD, LEFT, NUM_DIRECTIONS, RIGHT, UP
-from trap_tube_jax.state import State, base_state
 
 
 class Symmetry(NamedTuple):
@@ -40,7 +40,7 @@ class Symmetry(NamedTuple):
         The food is then at most as far to the right as below. Finds both in u8[12, 12, N] by their
         colours; the identity if one is not visible.
         """
-        palette = base_state(observation.shape[-1]).palette
+        palette = tt.base_state(observation.shape[-1]).palette
         agent, food = (_first_cell(observation, palette[thing]) for thing in (AGENT, FOOD))
         offset = jnp.where(jnp.all(agent >= 0) & jnp.all(food >= 0), food - agent, 0)
         transposed = jnp.abs(offset[1]) > jnp.abs(offset[0])
@@ -53,7 +53,7 @@ class Symmetry(NamedTuple):
         board = jnp.where(self.top_down, board[::-1], board)
         return jnp.where(self.left_right, board[:, ::-1], board)
 
-    def transform_state(self, state: State) -> State:
+    def transform_state(self, state: tt.State) -> tt.State:
         """Returns the image of a state."""
         extent = jnp.where(self.transposed, state.tool_extent[::-1], state.tool_extent)
         one_cell = jnp.ones_like(extent)

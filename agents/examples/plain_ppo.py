@@ -1,10 +1,10 @@
 """Recurrent PPO with an intrinsic curiosity module in one file, to read from top to bottom.
 
-Network, rewards, losses and settings are those of preset `paper`, computed in the plainest way:
+Computes network, rewards and losses of preset `paper` in the plainest way:
 
     python -m agents.examples.plain_ppo
 
-`python -m benchmarks.learner_peers` compares its speed with that of `agents.ppo`.
+`python -m benchmarks.learner_peers` compares its speed with `agents.ppo`'s.
 
 An episode has T steps, and step t leads from observation t to observation t + 1. B episodes are an
 iteration. The GRU has H units. Source: Schulman et al. (2017); Pathak et al. (2017); agent.md.
@@ -96,7 +96,7 @@ class Network(nn.Module):
         return jnp.concatenate([self.grasp(action[..., 0]), self.move(action[..., 1])], axis=-1)
 
     def inputs(self, observation: jax.Array, action: jax.Array, reward: jax.Array) -> jax.Array:
-        """Returns the GRU's input f32[..., H]; action and reward are those of the step before."""
+        """Returns the GRU's input f32[..., H]; action and reward of the step before."""
         parts = [self.encoder(observation), self.embed(action), nn.swish(self.reward(reward))]
         return nn.swish(self.mix(jnp.concatenate(parts, axis=-1)))
 

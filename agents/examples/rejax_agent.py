@@ -10,11 +10,8 @@ import jax
 
 import trap_tube_jax as tt
 from agents.examples.near_food import NEAR_FOOD
-from trap_tube_jax.adapters import to_gymnax
+from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
-
-with needs_extra("interop"):
-    import rejax  # pyright: ignore[reportMissingImports]
 
 
 class Policy:
@@ -38,6 +35,10 @@ class Policy:
 
 def main(total_timesteps: int = 8_192) -> tt.Scores:
     """Trains on `NEAR_FOOD`; scores on this set and on base, which training never plays."""
+    with needs_extra("interop"):
+        import rejax  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+
+        from trap_tube_jax.adapters import to_gymnax  # noqa: PLC0415
     env, params = to_gymnax.make(NEAR_FOOD.id)
     ppo = rejax.PPO.create(
         env=env,
@@ -60,4 +61,5 @@ if __name__ == "__main__":
     argparse.ArgumentParser(
         "python -m agents.examples.rejax_agent", description="Trains rejax's PPO and scores it."
     ).parse_args()
-    main()
+    with plain_errors():
+        main()

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+import trap_tube_jax as tt
 from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes, with_cells
 from agents.fast import chunks, windows
@@ -18,9 +19,8 @@ from agents.fast.convolution import convolutions_as_products
 from agents.fast.grouping import Groups, group, group_rows, slots
 from agents.networks.agent import Params
 from agents.networks.encoder import Encoder
-from trap_tube_jax.observation import observe
 from trap_tube_jax.positions import NUM_POSITIONS, layout_rows, position_id
-from trap_tube_jax.state import State, take
+from trap_tube_jax.state import take
 
 CACHE_BITS = 20  # hash bits; `Cache` has a slot for each value
 CONVOLVING_CHUNK = 64  # observations that a convolving encoder gets at once
@@ -58,9 +58,9 @@ class FastEncoding(Encoding):
     def _has_windows(self) -> bool:
         return type(self.agent.encoder) is Encoder  # a subclass may compute something else
 
-    def start(self, params: Params, initial: State, num_steps: int) -> Cache:
+    def start(self, params: Params, initial: tt.State, num_steps: int) -> Cache:
         """Returns an empty cache for B episodes of `num_steps` steps."""
-        boards = jax.eval_shape(jax.vmap(observe), initial)
+        boards = jax.eval_shape(jax.vmap(tt.observe), initial)
         batch, width = jax.eval_shape(self.agent.encode, params, boards).shape
         return Cache(
             layout_id=group_rows(layout_rows(initial)).group_id,
@@ -70,7 +70,7 @@ class FastEncoding(Encoding):
         )
 
     def step(
-        self, params: Params, state: State, time: jax.Array, memory: Cache
+        self, params: Params, state: tt.State, time: jax.Array, memory: Cache
     ) -> tuple[jax.Array, Cache]:
         """Returns the features f32[B, F] of B states' observations at `time`, and the cache."""
         batch, width = memory.features.shape[1:]
@@ -85,7 +85,7 @@ class FastEncoding(Encoding):
         # False sorts before true: the distinct unknown observations come first.
         groups = group(is_known.astype(jnp.int32), memory.layout_id, position)
         num_new = jnp.max(jnp.where(is_known, -1, groups.group_id)) + 1
-        rows = jax.vmap(observe)(take(state, groups.representative))
+        rows = jax.vmap(tt.observe)(take(state, groups.representative))
         new: Any = chunks.map_rows(self._encode_policy_rows, self.chunk, params, rows, num_new)
         known = memory.features.reshape(-1, width)[met]
         features = jnp.where(is_known[:, None], known, new[groups.group_id])
@@ -104,7 +104,7 @@ class FastEncoding(Encoding):
         episode, time = jnp.divmod(groups.representative, position.shape[1])
         layout = take(episodes.layout, episode)
         states = jax.vmap(with_cells)(layout, episodes.cells[episode, time])
-        rows = jax.vmap(observe)(states)
+        rows = jax.vmap(tt.observe)(states)
         read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
         features = chunks.map_rows(self._encode_rows, self.chunk, read, rows, groups.total)
         group_id = groups.group_id.reshape(position.shape)

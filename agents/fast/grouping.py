@@ -49,16 +49,16 @@ def group_rows(content: jax.Array) -> Groups:
     Each row is compared with one row of the same hash, and joins its group if the two are equal.
     Different rows are never in one group. Equal rows may be in two if hashes collide.
     """
-    own = jnp.arange(len(content), dtype=jnp.int32)
+    index = jnp.arange(len(content), dtype=jnp.int32)
     slot = slots(content, GROUPING_BITS)
-    known = jnp.zeros(2**GROUPING_BITS, jnp.int32).at[slot].max(own)[slot]
-    known = jnp.where(jnp.all(content[known] == content, axis=1), known, own)
-    first = known == own
+    known = jnp.zeros(2**GROUPING_BITS, jnp.int32).at[slot].max(index)[slot]
+    known = jnp.where(jnp.all(content[known] == content, axis=1), known, index)
+    first = known == index
     group_id = jnp.cumsum(first, dtype=jnp.int32) - 1
     zeros = jnp.zeros(len(content), jnp.int32)
     return Groups(
         group_id=group_id[known],
-        representative=zeros.at[jnp.where(first, group_id, len(content))].set(own, mode="drop"),
+        representative=zeros.at[jnp.where(first, group_id, len(content))].set(index, mode="drop"),
         total=group_id[-1] + 1,
     )
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from trap_tube_jax.environment import action_from_index
+import trap_tube_jax as tt
 
 
 class ActionDistribution(NamedTuple):
@@ -31,7 +31,7 @@ class ActionDistribution(NamedTuple):
             return jnp.argmax(self.logits, axis=-1).astype(jnp.int32)
         log_prob = jax.nn.log_softmax(self.logits)
         joint = log_prob[..., 0, :, None] + log_prob[..., 1, None, :] - penalty
-        return action_from_index(jnp.argmax(joint.reshape(*joint.shape[:-2], -1), axis=-1))
+        return tt.action_from_index(jnp.argmax(joint.reshape(*joint.shape[:-2], -1), axis=-1))
 
     def log_prob(self, action: jax.Array) -> jax.Array:
         """Returns log p(grasp) + log p(move), f32[...], of actions i32[..., 2]."""

@@ -22,7 +22,7 @@ PARTS = ("encoder", "core", "heads")  # the policy network's parameters
 class Agent:
     """Functions of the policy network; their parameters are a dictionary of `PARTS`.
 
-    `scan_unroll` is that of `Core`.
+    `scan_unroll` is passed to `Core`.
     """
 
     def __init__(self, config: Config, scan_unroll: int = 1):

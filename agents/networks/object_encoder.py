@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import trap_tube_jax as tt
 from agents.networks.hashing import hash_rows
 from agents.networks.layers import dense
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, NUM_OBJECTS
-from trap_tube_jax.state import base_state
 
 MAX_OBJECTS = NUM_OBJECTS - 2
 NAMED_SIZES = 4  # cells; every size up to here is an input
@@ -91,7 +91,7 @@ def describe_board(observation: jax.Array) -> Board:
     At most 6 objects besides agent and food are described; any further ones are left out.
     """
     color = hash_rows(observation)
-    base_colors = hash_rows(base_state(observation.shape[-1]).palette)
+    base_colors = hash_rows(tt.base_state(observation.shape[-1]).palette)
     anchors = [color == base_colors[code] for code in (AGENT, FOOD)]
     lines, object_colors = _objects(color, left=~(anchors[0] | anchors[1]))
     rows, columns = _project(lines)
@@ -125,7 +125,8 @@ def _objects(color: jax.Array, left: jax.Array) -> tuple[jax.Array, jax.Array]:
     u32[M, 6].
     """
     count = len(color)
-    color, left = color.reshape(count, -1), left.reshape(count, -1)
+    color = color.reshape(count, -1)
+    left = left.reshape(count, -1)
     cells = np.arange(color.shape[1], dtype=np.int32)[None]
     objects = []
     colors = []

@@ -9,27 +9,24 @@ Source: Schulman et al. (2017); paper, section "Results"; agents/agent.md, "PPO"
 import dataclasses
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
 
+import trap_tube_jax as tt
 from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory, rollout
 from agents.config import Config
-from agents.curiosity import Curiosity, Experience
+from agents.curiosity import Curiosity, Experience, make_curiosity
 from agents.networks.agent import Agent, Params
-from agents.networks.layers import assert_floats, init_module
+from agents.networks.layers import init_module
 from agents.parallel.devices import ONE_DEVICE, EpisodeAxis
 from agents.ppo import advantages, losses, machine, returns
 from agents.ppo.motion import MotionHead, motion_loss
 from agents.ppo.optimizer import make_optimizer
 from agents.ppo.task_replay import TaskReplay
-from agents.registry import contract, curiosities
-from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import BOARD_SIZE
-from trap_tube_jax.registry import make
 from trap_tube_jax.state import take
 
 Metrics = dict[str, jax.Array]
@@ -109,7 +106,7 @@ class Learner:
     """
 
     config: Config
-    env: Environment
+    env: tt.Environment
     agent: Agent
     encoding: Encoding
     curiosity: Curiosity
@@ -201,11 +198,7 @@ class Learner:
         experience = self.experience(state.params, trajectory.episodes)
         mask = trajectory.episodes.mask
         params = state.params["curiosity"]
-        returned = self.curiosity.reward(params, state.memory, experience)
-        with contract("curiosity", self.config.curiosity):
-            shapes = jax.eval_shape(lambda: returned)
-            chex.assert_trees_all_equal_shapes_and_dtypes(shapes, (mask, state.memory))
-        reward, memory = returned
+        reward, memory = self.curiosity.reward(params, state.memory, experience)
         return jnp.where(mask > 0, reward, 0.0), memory
 
     def make_batch(
@@ -290,17 +283,7 @@ class Learner:
             )
             motion = motion_loss(logits, batch.episodes.cells)
             terms["motion_loss"] = config.motion_coef * losses.padded_mean(motion, mask)
-        found = self.curiosity.losses(params["curiosity"], experience)
-        with contract("curiosity", config.curiosity):
-            assert isinstance(found, dict), f"losses are {type(found).__name__}, not a dict"
-            shapes = jax.eval_shape(lambda: found)
-            chex.assert_trees_all_equal_shapes_and_dtypes(shapes, dict.fromkeys(found, mask))
-        for name, term in found.items():
-            if name in terms or not name.endswith("_loss"):
-                raise ValueError(
-                    f"curiosity {config.curiosity!r}: names of losses must end in '_loss' and "
-                    f"differ from {', '.join(terms)}; got {name!r}"
-                )
+        for name, term in self.curiosity.losses(params["curiosity"], experience).items():
             terms[name] = config.curiosity_coef * losses.padded_mean(term, mask)
         total = sum(terms.values(), jnp.zeros((), jnp.float32))
         mean_entropy = jnp.sum(entropy * mask) / jnp.sum(mask)
@@ -336,34 +319,14 @@ class Learner:
         return metrics
 
 
-def make_curiosity(config: Config, env: Environment) -> Curiosity:
-    """Builds the curiosity of some settings.
-
-    Raises:
-      ValueError: a registered curiosity breaks its contract.
-    """
-    curiosity = curiosities.factory(config.curiosity)(config, env)
-    with contract("curiosity", config.curiosity):
-        kind = type(curiosity).__name__
-        assert isinstance(curiosity, Curiosity), f"{kind} is no agents.curiosity.Curiosity"
-        boards = jnp.zeros((2, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
-        params = jax.eval_shape(curiosity.init, jax.random.key(0), boards[:1])
-        assert_floats(params)
-        features = jax.eval_shape(curiosity.encode, params, boards)
-        assert isinstance(features, jax.ShapeDtypeStruct), "encode must return an array"
-        chex.assert_shape(features, (len(boards), None))
-        chex.assert_type(features, jnp.float32)
-    return curiosity
-
-
 def make_learner(
-    config: Config, env: Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
+    config: Config, env: tt.Environment | None = None, axis: EpisodeAxis = ONE_DEVICE
 ) -> Learner:
-    """Builds the learner of some settings, as it suits the machine (`agents.ppo.machine`).
+    """Builds the learner for some settings, with the path that suits the machine.
 
     Args:
       config: settings.
-      env: environment; by default that of `config.env_id`.
+      env: environment; by default the task set `config.env_id`.
       axis: devices that share the episodes; `Placement.axis` on several devices.
 
     Raises:
@@ -376,7 +339,7 @@ def make_learner(
       Environment(transfers=(perceptual), max_steps=30)
     """
     if env is None:
-        env = make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
+        env = tt.make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
     config.validate(env)
     curiosity = make_curiosity(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))

@@ -36,7 +36,7 @@ class TaskReplay(NamedTuple):
 
     def draw(self, key: jax.Array, counts: Sequence[int]) -> jax.Array:
         """Draws the reset keys of `counts[l]` tasks from each list l, with equal probabilities."""
-        # Keys are used again on purpose; `jax_debug_key_reuse` allows that of clones only.
+        # Keys are used again on purpose; `jax_debug_key_reuse` allows it for clones only.
         drawn = [
             keys[jax.random.randint(list_key, (count,), 0, len(keys), jnp.int32)]
             for keys, list_key, count in zip(
@@ -51,7 +51,7 @@ class TaskReplay(NamedTuple):
         """Adds each failed task of an iteration to the next list.
 
         Args:
-          reset_keys: PRNG keys [M] of the tasks: new ones, then those of `draw`.
+          reset_keys: PRNG keys [M] of the tasks: new ones, then the ones from `draw`.
           failed: bool[M].
           counts: as in `draw`. Tasks of the last list are not added again.
         """

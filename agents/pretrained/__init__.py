@@ -1,9 +1,10 @@
 """Trained agents that are shipped with the code, as files of safetensors.
 
-fast-base       the preset `fast` on base: the median of ten seeds
-icm-base        the preset `paper` on base, PPO + ICM
-best-pstsy      the preset `best` on {P, St, Sy}: the median of five seeds
-colors-p+pstsy  the preset `best` with `object_colors` on {P} and {P, St, Sy}: one seed
+fast-base           the preset `fast` on base: the median of ten seeds
+icm-base            the preset `paper` on base, PPO + ICM
+best-pstsy          the preset `best` on {P, St, Sy}: the median of five seeds
+colors-p+pstsy      `best` with `object_colors` on {P} and {P, St, Sy}: one seed
+colors-p+psy+pstsy  the same on {P}, {P, Sy} and {P, St, Sy}, with episodes of 40 steps: one seed
 """
 
 from pathlib import Path

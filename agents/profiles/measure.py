@@ -1,12 +1,13 @@
 """Greedy play on the tasks of a profile, as a tidy table, and smaller tables made from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 import pandas as pd
 
+import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.acting.policy import Policy
 from agents.profiles.subgoals import SUBGOALS, Cells, last_subgoals, replay, tool_moves
@@ -16,8 +17,7 @@ from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
 from trap_tube_jax.scoring.knowledge import choice_of_exit, first_push
 from trap_tube_jax.scoring.scores import wilson_interval
-from trap_tube_jax.solver import Plan, solve_batch
-from trap_tube_jax.state import State, take
+from trap_tube_jax.state import take
 
 LONG = 100  # steps, twice the paper's limit
 Table = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
@@ -34,6 +34,7 @@ def profile(
     parts: Sequence[str] = tuple(PARTS),
     strengths: Sequence[float] = STRENGTHS,
     num_tasks: int = 200,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Table:
     """Plays the tasks of a profile once with each policy, greedily.
 
@@ -42,6 +43,7 @@ def profile(
       parts: names of `tasks.PARTS`.
       strengths: of the graded transfers, from 0 (the base task) to 1 (the paper's transfer).
       num_tasks: tasks of each strength and symbolic swap, and of the other draws from {P}.
+      report: is told what is about to be done.
 
     Returns:
       One row per policy, part and level. Columns: the number of tasks, of tasks solved within 50
@@ -62,15 +64,21 @@ def profile(
     if len(channels) != 1:
         raise ValueError(f"profile policies of one num_features together, got {sorted(channels)}")
     sampling = Sampling(strengths, num_tasks, channels.pop())
+    report("Drawing tasks")
     drawn = {part: PARTS[part](sampling) for part in parts}
+    count = sum(len(part.tasks.time) for part in drawn.values())
+    report(f"Searching for the shortest plans of {count:,} tasks, up to a minute per 1,000")
     plans = _solve({name: part.tasks for name, part in drawn.items()})
-    played = [_play(policy, drawn, plans).assign(policy=name) for name, policy in policies.items()]
+    played = []
+    for name, policy in policies.items():
+        report(f"Playing {count:,} tasks with {name}, a minute or two")
+        played.append(_play(policy, drawn, plans).assign(policy=name))
     groups: Any = pd.concat(played).groupby(["policy", "part", "level"], sort=False)
     counts = groups[COUNTS].sum(min_count=1)  # a sum without numbers is unknown, not 0
     return counts.join(groups[MEANS].mean()).reset_index()
 
 
-def episodes(tasks: State, played: Evaluation, plan: Plan) -> Table:
+def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
     """Describes B episodes of at most 100 steps, a row per episode.
 
     An episode counts up to its 50th step; the column `solved_100` alone tells what comes later.
@@ -168,9 +176,9 @@ def is_direct(cells: Cells, planned: np.ndarray) -> np.ndarray:
     return np.all(has_direction, axis=1) & (is_needed | ~tool_moves(cells))
 
 
-def _solve(tasks: Mapping[str, State]) -> dict[str, Plan]:
+def _solve(tasks: Mapping[str, tt.State]) -> dict[str, tt.Plan]:
     """Solves the tasks of all parts in one call, since parts share tasks."""
-    plans = solve_batch(jax.tree.map(lambda *x: np.concatenate(x), *tasks.values()))
+    plans = tt.solve_batch(jax.tree.map(lambda *x: np.concatenate(x), *tasks.values()))
     ends = np.cumsum([len(states.time) for states in tasks.values()])
     return {
         name: take(plans, slice(end - len(states.time), end))
@@ -178,7 +186,7 @@ def _solve(tasks: Mapping[str, State]) -> dict[str, Plan]:
     }
 
 
-def _play(policy: Policy, parts: Mapping[str, Part], plans: Mapping[str, Plan]) -> Table:
+def _play(policy: Policy, parts: Mapping[str, Part], plans: Mapping[str, tt.Plan]) -> Table:
     """Plays all parts with a policy; returns a row for each episode, level by level."""
     suite = Suite({name: part.tasks for name, part in parts.items()}, dict.fromkeys(parts, LONG))
     evaluator = Evaluator(policy.config, suite)

@@ -6,14 +6,14 @@ from typing import Any
 import jax
 import numpy as np
 
+import trap_tube_jax as tt
 from agents.files import write_bytes
 from agents.profiles.measure import Table
 from agents.profiles.tasks import control_layouts
 from agents.runs.drawing import drawing, to_png
 from agents.sweeps.figures import COLORS, WIDTH, make_panels
-from trap_tube_jax.rendering import render, used_window
+from trap_tube_jax.rendering import used_window
 from trap_tube_jax.scoring.scores import wilson_interval
-from trap_tube_jax.state import State
 
 MARKERS = "osD^vPX"
 PANELS = {  # title and label of the x axis, by part
@@ -95,10 +95,10 @@ def _draw_percentages(axis: Any, groups: Table, names: list[str]) -> None:
     axis.tick_params(length=0, pad=1)
 
 
-def _cropped(state: State) -> np.ndarray:
+def _cropped(state: tt.State) -> np.ndarray:
     """Renders the rows and columns that hold objects, with a margin of one cell."""
     batch = jax.tree.map(lambda x: np.asarray(x)[None], state)
-    return np.asarray(render(state, CELL))[used_window(batch, CELL)]
+    return np.asarray(tt.render(state, CELL))[used_window(batch, CELL)]
 
 
 def _margins(groups: Table) -> np.ndarray:

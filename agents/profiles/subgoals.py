@@ -6,9 +6,9 @@ import jax
 import numpy as np
 from scipy import ndimage
 
+import trap_tube_jax as tt
 from trap_tube_jax import dynamics
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
-from trap_tube_jax.state import State
 
 # In the order of a plan. Tool touched: the agent has grasped the tool. Tool moved and food moved:
 # the object has left its initial cell. Food out: the agent can walk to the food without moving the
@@ -26,7 +26,7 @@ class Cells(NamedTuple):
     food: np.ndarray
 
 
-def replay(tasks: State, actions: np.ndarray) -> Cells:
+def replay(tasks: tt.State, actions: np.ndarray) -> Cells:
     """Replays B episodes.
 
     Args:
@@ -45,10 +45,10 @@ def tool_moves(cells: Cells) -> np.ndarray:
     return (cells.tool != cells.tool[:, :1]).any(axis=(1, 2))
 
 
-def last_subgoals(tasks: State, actions: np.ndarray, cells: Cells) -> np.ndarray:
+def last_subgoals(tasks: tt.State, actions: np.ndarray, cells: Cells) -> np.ndarray:
     """Returns i32[B], the index in `SUBGOALS` of the last subgoal of B episodes.
 
-    The arguments are those of `replay` and its result.
+    Takes the arguments of `replay`, and its result.
     """
     agent, tool, food = cells
     extent = np.asarray(tasks.tool_extent)[:, None]

@@ -13,7 +13,6 @@ import trap_tube_jax as tt
 from trap_tube_jax.controls import CONTROLS, with_every_start
 from trap_tube_jax.objects import EXIT, OBJECT_NAMES, TRAP
 from trap_tube_jax.scoring.tasks import fixed_tasks
-from trap_tube_jax.state import State
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS, Transfer, swap_with_tool
 
 # All parts draw with the keys of this name. Hence "perceptual" and "both" have the same layouts,
@@ -34,7 +33,7 @@ class Part(NamedTuple):
         in `measure.episodes`, in the order of its categories.
     """
 
-    tasks: State
+    tasks: tt.State
     levels: Sequence[str] | Callable[[Any], pd.Categorical]
 
 
@@ -58,7 +57,7 @@ def first_pushes(episodes: Any) -> pd.Categorical:
     return pd.Categorical(episodes["choice"].map(FIRST_PUSHES), list(FIRST_PUSHES.values()))
 
 
-def layout_kinds(tasks: State) -> list[str]:
+def layout_kinds(tasks: tt.State) -> list[str]:
     """Names the arrangement of food and tool in B tasks of {P}.
 
     The food leaves the tube "away" from the agent, "towards" the agent or "sideways"; the tool
@@ -104,7 +103,7 @@ def _grouped(
     return Part(_draw(transfers, sampling), levels)
 
 
-def control_layouts(num_features: int = 3) -> dict[str, State]:
+def control_layouts(num_features: int = 3) -> dict[str, tt.State]:
     """Returns the base task and the layouts of all controls, by name and in base colours."""
     base = tt.base_state(num_features)
     made = {"base": base}
@@ -135,11 +134,11 @@ PARTS: dict[str, Callable[[Sampling], Part]] = {
 FIRST_PUSH_PARTS = ("first-push-p", "first-push-pst")
 
 
-def _draw(transfers: Sequence[Transfer], sampling: Sampling) -> State:
+def _draw(transfers: Sequence[Transfer], sampling: Sampling) -> tt.State:
     env = tt.Environment(tuple(transfers), base=tt.base_state(sampling.num_features))
     return jax.device_get(fixed_tasks(env, KEYS, sampling.num_tasks))
 
 
-def _join(groups: dict[str, State]) -> Part:
+def _join(groups: dict[str, tt.State]) -> Part:
     tasks = jax.tree.map(lambda *parts: np.concatenate(parts), *groups.values())
     return Part(tasks, [name for name, states in groups.items() for _ in states.time])

@@ -12,6 +12,7 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 import trap_tube_jax as tt
 from agents.runs.folder import RunFolder
@@ -26,12 +27,14 @@ class ProgressLine(Progress):
     """
 
     def __init__(self, console: Console, total: float, *columns: ProgressColumn, **options: Any):
+        rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # alone is cut off
         super().__init__(
             BarColumn(bar_width=12),
             *columns,
-            TextColumn("{task.description}", markup=False),  # cut off on a narrow terminal
+            TextColumn("{task.description}", markup=False, table_column=rest),
             console=console,
             auto_refresh=False,
+            expand=True,
             disable=not console.is_terminal,
             **options,
         )
@@ -49,17 +52,19 @@ class TrainingLine(ProgressLine):
     """Shows the progress of one run."""
 
     def __init__(self, console: Console, iterations: int):
-        columns = (MofNCompleteColumn(), TimeRemainingColumn(compact=True))
+        columns = (MofNCompleteColumn(), TimeRemainingColumn(compact=True), TextColumn("left,"))
         super().__init__(console, iterations, *columns)
+        self.update(self.task_ids[0], description="compiling")
+        self.iterations = iterations
 
     def show(self, row: Row) -> None:
         """Shows an iteration, given its row of metrics."""
         text = (
-            f"{row['episodes']:,} episodes, {row['success']:.1%} solved, "
-            f"{row['validation_success']:.1%} greedily, "
-            f"{row['transitions_per_second']:,.0f} steps/s"
+            f"{row['success']:.1%} solved, {row['validation_success']:.1%} greedily, "
+            f"{row['episodes']:,} episodes, {row['transitions_per_second']:,.0f} steps/s"
         )
-        self.write(row["iteration"], text, head=f"iteration {row['iteration']}: ")
+        head = f"iteration {row['iteration']} of {self.iterations}: "
+        self.write(row["iteration"], text, head)
 
 
 def summary(folder: RunFolder, run: Run) -> list[str]:

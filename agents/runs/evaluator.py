@@ -11,8 +11,7 @@ from agents.acting.evaluation import Evaluation, evaluate
 from agents.config import Config
 from agents.networks.agent import Params
 from agents.ppo import machine
-from trap_tube_jax.scoring import ALL_SETS, Purpose, Scores, Suite
-from trap_tube_jax.state import State
+from trap_tube_jax.scoring import ALL_SETS, Purpose, Suite
 
 
 class Evaluator:
@@ -45,7 +44,7 @@ class Evaluator:
         return cls(config, suite)
 
     @property
-    def tasks(self) -> Mapping[str, State]:
+    def tasks(self) -> Mapping[str, tt.State]:
         """The states [B] of every set, by its short name."""
         return self.suite.tasks
 
@@ -57,7 +56,7 @@ class Evaluator:
         self,
         played: Mapping[str, Evaluation],
         shortest: Mapping[str, np.ndarray] | None = None,
-    ) -> Scores:
+    ) -> tt.Scores:
         """Scores the outcomes that a call returned.
 
         `shortest` has the lengths i32[B] of the shortest plans of every set, to compare with.

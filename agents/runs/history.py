@@ -11,9 +11,7 @@ from agents.runs.metrics import Row, Table, check_row, is_last, read_rows
 from agents.runs.run import Run
 
 
-def restore(
-    folder: RunFolder, iterations: int, shapes: TrainState
-) -> tuple[TrainState | None, Row | None]:
+def restore(folder: RunFolder, shapes: TrainState) -> tuple[TrainState | None, Row | None]:
     """Returns the newest checkpoint's state and row of metrics; None for one that is missing.
 
     Raises ValueError for a checkpoint of other settings, or without the values of its row.
@@ -30,8 +28,6 @@ def restore(
         raise ValueError(
             f"checkpoint {done} in {folder.checkpoints} cannot be continued: {error}"
         ) from error
-    if done > iterations:
-        raise ValueError(f"iterations must be at least {done}, which are done, got {iterations}")
     return state, row if done else None
 
 
@@ -106,7 +102,7 @@ def best_iteration(folder: RunFolder) -> int | None:
 
 
 def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:
-    """Returns whether an evaluation is better than that of the best iteration so far.
+    """Returns whether an evaluation is better than the best iteration's so far.
 
     Compares the mean fractions of validation tasks solved, over the task sets that both have. Base,
     a single task, counts only if it is the training set or the only set.

@@ -11,12 +11,12 @@ from typing import Any, get_args
 
 import pandas as pd
 
+import trap_tube_jax as tt
 from agents.acting.policy import Policy
 from agents.config import Config
 from agents.files import append_text, damage_named, is_file, read_text, write_bytes
 from agents.runs.run import check_algorithm
 from trap_tube_jax.checks import check_stored_name
-from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import Purpose
 
 Row = Mapping[str, Any]
@@ -198,7 +198,7 @@ def rewind_rows(path: Path, iteration: int) -> None:
         write_bytes(path, file.getvalue().encode())
 
 
-def evaluation_rows(scores: Scores, policy: Policy, purpose: Purpose) -> list[Row]:
+def evaluation_rows(scores: tt.Scores, policy: Policy, purpose: Purpose) -> list[Row]:
     """Returns the rows of `evaluations.csv` for the scores of a policy.
 
     `solved` counts tasks. Where a set has few layouts, `layouts` of `layouts_total` are solved in

@@ -15,7 +15,6 @@ from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_learner
 from agents.runs.evaluator import Evaluator, default_sets
 from agents.runs.run import RunOptions
-from trap_tube_jax.scoring.tasks import evaluation_tasks
 
 Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
 Metrics = dict[str, np.ndarray]
@@ -72,7 +71,7 @@ class Cohort:
     """The states of one or several seeds, which a compiled program advances together.
 
     The states of several are stacked along a first axis, and `jax.vmap` makes one program of them;
-    a single run's program is that of its learner. A member that has ended is advanced as before,
+    a single run uses its learner's program. A member that has ended is advanced as before,
     since another program would have to be compiled for fewer.
     """
 
@@ -111,7 +110,9 @@ def make_advance(learner: Learner) -> Advance:
     """
     config = learner.config
     env = tt.make(config.env_id, num_features=config.num_features)
-    tasks = evaluation_tasks(config.env_id, config.eval_episodes, config.num_features, "validation")
+    tasks = tt.evaluation_tasks(
+        config.env_id, config.eval_episodes, config.num_features, "validation"
+    )
 
     def advance(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         after, metrics = learner.iterate(state)

@@ -28,7 +28,6 @@ from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read
 from agents.runs.program import Metrics, Program
 from agents.runs.provenance import note_provenance
 from agents.runs.run import Run
-from trap_tube_jax.scoring.scores import Scores
 
 
 class Progress:
@@ -62,10 +61,13 @@ class Progress:
         self.folder = folder
         if stored.config.is_file():
             run.check_continues(stored.read()[0])
-        restored, self.last = restore(stored, run.config.iterations, program.state_shapes)
-        check_rows(stored, self.iteration)
+        restored, self.last = restore(stored, program.state_shapes)
+        done = self.iteration
+        if done > (limit := run.config.iterations):
+            raise ValueError(f"iterations must be at least {done}, which are done, got {limit}")
+        check_rows(stored, done)
         if program.validation:
-            check_best(stored, self.iteration, program.sets)
+            check_best(stored, done, program.sets)
         first = program.init(run.seed) if restored is None else restored
         self.state: Callable[[], TrainState] = lambda: first
 
@@ -101,10 +103,11 @@ class Progress:
         self._log = stack.enter_context(open_loggers(self.folder.path, self.run, **chosen))
         self._line = stack.enter_context(TrainingLine(self.console, config.iterations))
         together = f", with {seeds - 1} other seed(s)" if seeds > 1 else ""
+        train_set = tt.task_set(config.env_id).label
         self.console.out(
-            f"{self.folder.path}: {tt.task_set(config.env_id).id}, curiosity {config.curiosity}, "
-            f"seed {self.run.seed}, {self.program.num_parameters:,} parameters, on "
-            f"{self.program.placement}, {self.program.learner.path} path{together}. "
+            f"{self.folder.path}: {train_set}, curiosity {config.curiosity}, "
+            f"seed {self.run.seed}, {self.program.num_parameters:,} parameters\n"
+            f"On {self.program.placement}, {self.program.learner.path} path{together}. "
             "Compiling, which takes up to a minute ..."
         )
 
@@ -138,7 +141,7 @@ class Progress:
         state = self.program.placement.local(self.state())
         checkpoint.save(self.folder.checkpoints, self.iteration, state, dict(self.last or {}))
 
-    def finish(self) -> Scores | None:
+    def finish(self) -> tt.Scores | None:
         """Plays the test tasks with the final policy, or the best one; writes the results.
 
         Returns the scores; None if all are in the files.
@@ -153,7 +156,7 @@ class Progress:
         if tested.issuperset(self.program.sets) and has_page:
             self.console.out("Already tested; to play other tasks, run python -m agents.evaluate.")
             return None
-        self.console.out("Evaluating ...")
+        self.console.out("Playing test tasks, which takes up to a minute ...")
         evaluator = self.program.test
         played = evaluator(policy.params)
         scores = evaluator.scores(played)
@@ -163,6 +166,7 @@ class Progress:
         append_rows(self.folder.evaluations, [row for row in rows if row["task_set"] not in tested])
         self.console.out(scores)
         if options.report:  # last, since a figure may fail
+            self.console.out("Drawing the report, which takes up to half a minute ...")
             report.write(self.folder, self.run, evaluator, played)
         return scores
 

@@ -29,10 +29,8 @@ from agents.runs.run import Run
 from trap_tube_jax import solver
 from trap_tube_jax._version import __version__
 from trap_tube_jax.objects import DIRECTION_NAMES, NO_DIRECTION
-from trap_tube_jax.rendering import episode_frames, save_gif
-from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import label
-from trap_tube_jax.state import State, take
+from trap_tube_jax.state import take
 
 CELL_SIZE = 16  # pixels of the page's boards
 GIF_CELL_SIZE = 24
@@ -97,7 +95,7 @@ def _origin(folder: RunFolder) -> str:
     return ", ".join(words)
 
 
-def _score_rows(scores: Scores) -> str:
+def _score_rows(scores: tt.Scores) -> str:
     """Returns the rows of the page's table."""
     rows = []
     for score in scores.sets:
@@ -149,7 +147,7 @@ def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: 
             actions = np.asarray(outcome.action[index, : outcome.length[index]])
             state = take(evaluator.tasks[name], index)
             with draft_of(path) as draft:
-                save_gif(episode_frames(state, actions, GIF_CELL_SIZE), draft, fps=4)
+                tt.save_gif(tt.episode_frames(state, actions, GIF_CELL_SIZE), draft, fps=4)
             return name
     return None
 
@@ -191,14 +189,14 @@ def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
     return episodes
 
 
-def _replay(state: State, actions: np.ndarray) -> dict[str, Any]:
+def _replay(state: tt.State, actions: np.ndarray) -> dict[str, Any]:
     """Replays actions i32[T, 2], padded with -1.
 
     Returns `frames`, the boards before every step and after the last one as PNG in base64, and
     `actions`, the steps in words.
     """
     taken = actions[(actions >= 0).all(axis=1)]
-    frames = episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]
+    frames = tt.episode_frames(state, actions, CELL_SIZE)[: len(taken) + 1]
     return {
         "frames": list(map(_png, frames)),
         "actions": [

@@ -4,10 +4,10 @@ import dataclasses
 import re
 from typing import Any, Self
 
+import trap_tube_jax as tt
 from agents.command_line import option
 from agents.config import Config
 from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
-from trap_tube_jax.registry import task_set
 
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
@@ -39,7 +39,7 @@ class Run:
     def __post_init__(self) -> None:
         """Completes task set and algorithm; ValueError names a value that is not allowed."""
         check_seed(self.seed)
-        env_id = task_set(self.config.env_id).id
+        env_id = tt.task_set(self.config.env_id).id
         object.__setattr__(self, "config", dataclasses.replace(self.config, env_id=env_id))
         if not self.algorithm:
             curiosity = self.config.curiosity
@@ -101,6 +101,8 @@ class DeviceOptions:
 class RunOptions(DeviceOptions):
     """Options for carrying out a run; on one device, none of them changes what it learns.
 
+    `devices` share the run: by default one, or all if several processes train it.
+
     Attributes:
       checkpoint_every: iterations between checkpoints.
       evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation
@@ -132,4 +134,4 @@ class RunOptions(DeviceOptions):
         if self.test_tasks is not None:
             check_integer("test_tasks", self.test_tasks, maximum=MAX_TASKS)
         for name in self.sets or ():
-            task_set(name)
+            tt.task_set(name)

@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
+import trap_tube_jax as tt
 from agents.parallel import processes
 from agents.runs.folder import RunFolder
 from agents.runs.loggers import check_loggers
@@ -23,10 +24,9 @@ from agents.runs.program import Cohort, Program
 from agents.runs.progress import Progress
 from agents.runs.run import Run, RunOptions
 from trap_tube_jax.interruptions import Stopped, deferring
-from trap_tube_jax.scoring.scores import Scores
 
 # Scores on test tasks, None if the run was finished before, or the reason why it did not end.
-Outcome = Scores | None | Stopped | ValueError | OSError
+Outcome = tt.Scores | None | Stopped | ValueError | OSError
 
 
 def train_run(
@@ -36,7 +36,7 @@ def train_run(
     *,
     console: Console | None = None,
     stop: Callable[[], bool] | None = None,
-) -> Scores | None:
+) -> tt.Scores | None:
     """Trains a run to its end from its newest checkpoint, evaluates it and writes its files.
 
     A finished run is left unchanged. Only one process at a time may call `train_run` for a folder.

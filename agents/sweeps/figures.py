@@ -15,6 +15,7 @@ WIDTH = 8.3  # inches, as in a page 830 pixels wide
 DPI = 150
 UNITS = {"transitions": "environment steps", "episodes": "episodes"}
 # Okabe and Ito's palette, which is colour-blind safe.
+MOST_RANGES = 3  # of seeds that a panel can show
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 
 
@@ -24,11 +25,13 @@ def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) ->
     See `tables.tables` for the arguments.
     """
     tested = tables.reported(results)
+    compared = tables.differences(tested)
     has_few = curves["algorithm"].nunique() <= len(COLORS)
     drawn = []
     for name, is_drawn, make in (
         ("curves.png", has_few, lambda: draw_curves(results, curves, about)),
         ("success.png", len(tested) > 0, lambda: draw_success(tested, about)),
+        ("differences.png", len(compared) > 0, lambda: draw_differences(compared, about)),
     ):
         path = root / name
         path.unlink(missing_ok=True)  # it may be of an earlier, smaller grid
@@ -57,13 +60,16 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
         if name != train_set and rows.groupby(["algorithm", "seed"]).size().min() > 1:
             panels[f"greedy, {label(str(name))}"] = rows
     figure, axes = make_panels(list(panels), min(3, len(panels)), 2.1, about["title"])
+    names = sorted(curves["algorithm"].unique())  # so that a colour means the same on all pages
+    has_ranges = len(names) <= MOST_RANGES
+    shown = set()
     for axis, rows in zip(axes, panels.values(), strict=True):
-        for color, name in zip(COLORS, curves["algorithm"].unique(), strict=False):
-            _draw_seeds(axis, rows[rows["algorithm"] == name], color, str(name))
+        for color, name in zip(COLORS, names, strict=False):
+            shown.add(_draw_seeds(axis, rows[rows["algorithm"] == name], color, name, has_ranges))
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
         axis.set_xlabel(f"{UNITS[unit]}, millions")
-    figure.supylabel("solved, %: mean and range of seeds", fontsize=10)
+    figure.supylabel(f"solved, %: {' or '.join(sorted(shown))}", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -98,6 +104,25 @@ def draw_success(tested: Table, about: Mapping[str, Any]) -> Any:
     return figure
 
 
+def draw_differences(compared: Table, about: Mapping[str, Any]) -> Any:
+    """Draws the differences of `tables.differences` by set, with their intervals."""
+    names = list(compared["algorithm"].unique())
+    sets = list(compared["task_set"].unique())
+    height = 0.25 * len(names) + 0.4
+    figure, axes = make_panels(list(map(label, sets)), 5, height, about["title"])
+    for axis, task_set in zip(axes, sets, strict=True):
+        rows = compared[compared["task_set"] == task_set].set_index("algorithm").loc[names]
+        axis.axvline(0, color="black", linewidth=0.8)
+        for row, (middle, low, high) in enumerate(rows[["difference", "low", "high"]].to_numpy()):
+            axis.plot([low, high], [row, row], color=COLORS[0])
+            axis.plot(middle, row, "o", color=COLORS[0], markersize=4)
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].set_ylim(len(names) - 0.5, -0.5)
+    what = f"test tasks solved, points above {compared['reference'].iloc[0]}"
+    figure.supxlabel(f"{what}: mean and 95 % interval", fontsize=10)
+    return figure
+
+
 def make_panels(
     titles: Sequence[str], columns: int, height: float, title: str = "", *, sharex: bool = True
 ) -> tuple[Any, list[Any]]:
@@ -119,19 +144,25 @@ def make_panels(
     return figure, axes[: len(titles)]
 
 
-def _draw_seeds(axis: Any, rows: Table, color: str, name: str) -> None:
-    """Plots a line per seed, or the mean and range of seeds that end at the same iteration."""
+def _draw_seeds(axis: Any, rows: Table, color: str, name: str, has_range: bool) -> str:
+    """Plots the mean of seeds that end at the same iteration, else a line per seed.
+
+    `has_range` adds their range. Returns a description of the lines.
+    """
     values = 100 * rows.pivot_table(index="iteration", columns="seed", values="value")
     progress = rows.pivot_table(index="iteration", columns="seed", values="progress")
     if values.shape[1] > 1 and bool(values.iloc[-1].notna().all()):
         together = values.dropna()
         x = progress.loc[together.index].mean(axis=1)
-        axis.fill_between(x, together.min(axis=1), together.max(axis=1), color=color, alpha=0.1)
         axis.plot(x, together.mean(axis=1), color=color, label=name)
-        return
+        if not has_range:
+            return "mean of seeds"
+        axis.fill_between(x, together.min(axis=1), together.max(axis=1), color=color, alpha=0.1)
+        return "mean and range of seeds"
     for count, seed in enumerate(values):
         curve = values[seed].dropna()
         name_once = "" if count else name
         axis.plot(
             progress.loc[curve.index, seed], curve, color=color, label=name_once, linewidth=1.2
         )
+    return "a line per seed"

@@ -25,7 +25,7 @@ COMMA = re.compile(r",(?![^\[]*\])")  # but not within a list
 class Options:
     """Trains every point of a grid of settings with every seed, several runs at a time.
 
-    Each run has a folder like those of agents.train. The grid's folder also holds results.csv, with
+    Each run has a folder, as with agents.train. The grid's folder also holds results.csv, with
     a row per run, evaluation and task set, table.md and figures. Ctrl-C saves all runs; repeating
     the command resumes them. Adding seeds or values of a setting extends the grid.
 
@@ -182,28 +182,28 @@ GRIDS = {
         PAPER_RUN,
         {"iterations": 250},
         PAPER_POINTS,
-        "the paper's Experiment 1: base, with and without ICM",
+        "the paper's Experiment 1: base, with and without ICM; hours",
     ),
     "exp2": Grid(
         Options(preset="paper", env="pstsy", seeds=5),
         PAPER_RUN,
         {"iterations": 500},
         PAPER_POINTS,
-        "the paper's Table 2: {P, St, Sy}, with and without ICM; takes days",
+        "the paper's Table 2: {P, St, Sy}, with and without ICM; days",
     ),
     "exp1-code": Grid(
         Options(preset="paper", env="base", seeds=5),
         PAPER_RUN,
         {"iterations": 250},
         CODE_POINTS,
-        "exp1, and what the published code may have run",
+        "exp1, and what the published code may have run; hours",
     ),
     "exp2-code": Grid(
         Options(preset="paper", env="pstsy", seeds=5),
         PAPER_RUN,
         {"iterations": 500},
         CODE_POINTS,
-        "exp2, and what the published code may have run; takes days",
+        "exp2, and what the published code may have run; days",
     ),
     "fast": Grid(
         Options(preset="fast", env="base", seeds=10),

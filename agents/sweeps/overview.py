@@ -54,7 +54,7 @@ class Overview(ProgressLine):
     def _time_left(self, share: float) -> str:
         trained = share - self.share_before
         if trained <= 0:
-            return "time left not known yet"
+            return "time left is known after the first iterations"
         seconds = (self.shown - self.began) * (1 - share) / trained
         return f"at most {datetime.timedelta(seconds=round(seconds))} left"
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NotRequired, TypedDict
 
 import agents
+import trap_tube_jax as tt
 from agents.files import is_file, read_json, write_bytes, write_json
 from agents.runs.folder import CONFIG_FILE, RunFolder, Settings, check_name
 from agents.runs.history import has_ended
@@ -18,7 +19,6 @@ from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.provenance import Machine, read_provenance
 from agents.runs.results import find_runs, metrics
 from agents.sweeps import figures, tables
-from trap_tube_jax.registry import task_set
 
 COUNTS = ["iteration", "episodes", "transitions", "seconds"]
 CURVES = ["algorithm", "seed", *COUNTS, "success", "validation_success"]
@@ -100,7 +100,8 @@ def _read_about(root: Path) -> About | None:
 def _about(name: str, folders: Sequence[RunFolder], commands: Sequence[str]) -> About:
     stored = [folder.stored() for folder in folders]
     configs = [run["config"] for run in stored]
-    train_sets = [task_set(name) for name in dict.fromkeys(config["env_id"] for config in configs)]
+    env_ids = dict.fromkeys(config["env_id"] for config in configs)
+    train_sets = [tt.task_set(name) for name in env_ids]
     machines = itertools.chain.from_iterable(read_provenance(x.provenance) for x in folders)
     unique = {repr(machine): machine for machine in machines}
     return {

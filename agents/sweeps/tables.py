@@ -1,6 +1,7 @@
 """Tables of a grid's results, with the paper's figures alongside.
 
-Source: the paper's Tables 1 and 2; Student's t for the interval of a mean of few seeds.
+Source: the paper's Tables 1 and 2; Student's t for the interval of a mean of few seeds; Welch
+(1947) and Holm (1979) for differences between algorithms.
 """
 
 import re
@@ -29,7 +30,9 @@ PAPER_SUCCESS = {
 }
 NOTE = (
     "Means over seeds with 95 % intervals (Student's t); the paper's are ± one standard deviation. "
-    "A layout counts as solved if more than half of its draws are solved."
+    "A layout counts as solved if more than half of its draws are solved. Differences have 95 % "
+    "intervals of Welch's t-test, corrected by Holm's method for the comparisons in a row; * marks "
+    "p < 0.05."
 )
 MEAN = "mean without base"  # over task sets, each counting the same
 NOTHING = "–"
@@ -51,6 +54,10 @@ def tables(results: Table, curves: Table, about: Mapping[str, Any]) -> dict[str,
     found = {"Training": training_table(curves, about["threshold"], with_paper, unfinished)}
     if len(tested):
         found["Test tasks solved, %"] = success_table(tested, train_set == "pstsy")
+    compared = differences(tested)
+    if len(compared):
+        heading = f"Difference from {compared['reference'].iloc[0]}, points"
+        found[heading] = difference_table(compared)
     return found
 
 
@@ -119,6 +126,80 @@ def success_table(tested: Table, with_paper: bool) -> Table:
         }
     table = pd.DataFrame(columns).fillna(NOTHING)
     return table.rename(index=label)
+
+
+def differences(tested: Table) -> Table:
+    """Compares the percent solved by every algorithm with the first one's.
+
+    Leaves out algorithms of one seed, and sets of few layouts, where a seed solves all or nothing.
+
+    Returns:
+      A row per task set and algorithm: `task_set`, `reference` and `algorithm`, the `difference` of
+      their means over seeds, `low` and `high` of its 95 % interval, and `p` of Welch's t-test.
+      Interval and p are corrected by Holm's method for the comparisons in a task set.
+    """
+    seeds = tested.groupby("algorithm", sort=False)["seed"].nunique()
+    several = list(seeds[seeds > 1].index)
+    if len(several) < 2 or several[0] != seeds.index[0]:
+        return pd.DataFrame()
+    reference, *others = several
+    few_layouts = tested.loc[tested["layouts_total"].notna(), "task_set"].unique()
+    rows = []
+    for task_set, percents in by_set(tested).drop(columns=few_layouts).items():
+        tests = [
+            welch(percents[name].to_numpy(), percents[reference].to_numpy()) for name in others
+        ]
+        factors = holm_factors(np.array([p for *_, p in tests]))
+        for name, test, factor in zip(others, tests, factors, strict=True):
+            difference, error, freedom, p = test
+            margin = stats.t.isf(0.025 / factor, freedom) * error
+            low = difference - margin
+            high = difference + margin
+            rows.append((task_set, reference, name, difference, low, high, min(1.0, factor * p)))
+    columns = ["task_set", "reference", "algorithm", "difference", "low", "high", "p"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def welch(a: Any, b: Any) -> tuple[float, float, float, float]:
+    """Compares the means of two samples by Welch's t-test.
+
+    Returns mean(a) - mean(b), its standard error, the degrees of freedom, and p.
+    """
+    parts = np.array([x.var(ddof=1) / len(x) for x in (a, b)])
+    difference = a.mean() - b.mean()
+    error = np.sqrt(parts.sum())
+    if not error:  # every seed solves as much, as in the first iterations
+        return difference, 0.0, 1.0, float(difference == 0)
+    freedom = error**4 / np.sum(parts**2 / [len(a) - 1, len(b) - 1])
+    p = 2 * float(stats.t.sf(abs(difference) / error, freedom))
+    return difference, error, freedom, p
+
+
+def holm_factors(p: Any) -> Any:
+    """Returns the factors f64[M] by which Holm's method corrects M values of p.
+
+    The i-th smallest counts M + 1 - i times, and more if its product would not exceed a smaller
+    p's. The 100 (1 - 0.05 / factor) % interval excludes 0 exactly where factor * p < 0.05.
+    """
+    order = np.argsort(p)
+    counts = np.arange(len(p), 0, -1.0)
+    factors = np.empty(len(p))
+    products = np.maximum.accumulate(counts * p[order])
+    factors[order] = np.divide(products, p[order], out=counts, where=p[order] > 0)
+    return factors
+
+
+def difference_table(compared: Table) -> Table:
+    """Formats `differences`: a row per set, a column per algorithm; * marks p < 0.05."""
+    shown = [
+        f"{row.difference:+.1f} [{row.low:.1f}, {row.high:.1f}]{'*' if row.p < 0.05 else ''}"
+        for row in compared.itertuples()
+    ]
+    table = compared.assign(shown=shown).pivot(
+        index="task_set", columns="algorithm", values="shown"
+    )
+    table = table.loc[compared["task_set"].unique(), compared["algorithm"].unique()]
+    return table.rename_axis(index=None, columns=None).rename(index=label)
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:

@@ -37,7 +37,7 @@ def test_misfits_are_named(change, message):
         from_arrays(to_arrays(TREE), {**TREE, **change})
 
 
-def test_arrays_share_no_memory_with_what_is_donated():
+def test_arrays_share_no_memory_with_a_donated_state():
     state = jnp.zeros(1000)
     arrays = to_arrays({"x": state})
     jax.jit(lambda x: x + 1, donate_argnums=0)(state).block_until_ready()

@@ -23,6 +23,15 @@ class Options:
     extra: Path | None = None
 
 
+@pytest.mark.parametrize(
+    ("word", "meant"), [("--otu=x", " (did you mean '--out'?)"), ("--xyz", "")]
+)
+def test_an_unknown_option_is_refused_and_the_nearest_offered(word, meant, capsys):
+    with pytest.raises(SystemExit):
+        parse(Options, ["a", word], "x")
+    assert capsys.readouterr().err.endswith(f"error: unknown arguments: {word}{meant}\n")
+
+
 def test_a_leading_tilde_in_a_path_is_the_home_folder(monkeypatch):
     """Also where no shell expands it, as in --out=~/x."""
     monkeypatch.setenv("HOME", "/home/somebody")

@@ -14,14 +14,19 @@ from helpers.refusal import assert_refused
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_survive_json_and_train_without_curiosity_and_in_an_environment_of_ones_own(name):
+def test_a_preset_is_the_same_after_json(name):
     config = Config.preset(name)
     assert Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_trains_in_a_custom_environment_without_curiosity_and_previous_inputs(name):
     env = tt.make("sy", max_steps=9)
-    for settings in (config, Config.preset(name, curiosity="none")):
-        assert make_learner(settings, env).env is env
-    blind = make_learner(Config.preset(name, previous_inputs=False), env)
-    jax.eval_shape(blind.iterate, jax.eval_shape(blind.init, jax.random.key(0)))
+    assert make_learner(Config.preset(name), env).env is env
+    learner = make_learner(Config.preset(name, curiosity="none", previous_inputs=False), env)
+    state = jax.eval_shape(learner.init, jax.random.key(0))
+    after, _ = jax.eval_shape(learner.iterate, state)
+    assert after == state
 
 
 @pytest.mark.parametrize(
@@ -62,7 +67,7 @@ def test_refusals_name_the_value_and_what_is_allowed(settings, words):
     assert_refused(words, Config.preset, "paper", **settings)
 
 
-def test_numpy_scalars_are_those_of_python():
+def test_numpy_scalars_become_numbers_of_python():
     values = {"learning_rate": np.float64(1e-3), "hidden": np.int64(8), "filters": [np.int32(2), 4]}
     config = Config(**values)
     assert config == Config(learning_rate=1e-3, hidden=8, filters=(2, 4))
@@ -79,7 +84,7 @@ def test_unknown_preset_lists_the_known():
     assert_refused(["unknown preset 'quick'", "paper", "fast"], Config.preset, "quick")
 
 
-def test_the_sets_own_limit_holds_unless_the_settings_give_one(own_task_sets):
+def test_the_step_limit_of_the_task_set_holds_unless_the_settings_give_one(fresh_task_sets):
     tt.register("Short-v0", (), max_steps=30)
     config = Config(env_id="Short-v0")
     assert make_learner(config).env.max_steps == config.step_limit("Short-v0") == 30

@@ -34,7 +34,7 @@ SIZES = shlex.split(re.sub("--max-steps [0-9]+", "", " ".join(options())))
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch, own_names):
+def here(tmp_path, monkeypatch, fresh_names):
     """A folder with the page's module, which is forgotten after the test."""
     (tmp_path / "my_module.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)

@@ -12,7 +12,8 @@ from agents.acting.rollout import Trajectory, rollout
 from agents.networks.core import Core
 from helpers import probes
 
-DISCOUNT, ITERATIONS = 0.5, 100
+DISCOUNT = 0.5
+ITERATIONS = 100
 CONFIG = Config(
     max_steps=probes.STEPS,
     episodes_per_iteration=64,
@@ -65,7 +66,7 @@ def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajecto
     return 1 / jnp.sqrt(state.reward_variance[0]), played
 
 
-def test_a_certain_reward_has_its_value(learn):
+def test_the_value_of_a_certain_reward_is_the_reward(learn):
     reward, played = learn("value")
     np.testing.assert_allclose(played.value[:, 0, 0], reward, rtol=0.1)
     np.testing.assert_allclose(played.value[:, 1:-1, 0] / reward, 0.0, atol=0.1)
@@ -79,7 +80,7 @@ def test_value_is_discounted(learn):
 
 
 @pytest.mark.parametrize("kind", ["policy", "cue", "credit", "memory"])
-def test_policy_earns_all_there_is(learn, kind):
+def test_the_policy_earns_every_reward(learn, kind):
     _, played = learn(kind)
     np.testing.assert_array_equal(jnp.sum(played.episodes.reward, axis=1), 1)
 

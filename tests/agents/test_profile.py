@@ -1,6 +1,7 @@
 """The command python -m agents.profile, from sources to files."""
 
 import json
+from pathlib import Path
 
 import jax
 import pandas as pd
@@ -23,10 +24,9 @@ def one_start(monkeypatch):
 
 @pytest.mark.usefixtures("one_start")
 def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monkeypatch, capsys):
-    # A name that Matplotlib would take for mathematics.
-    source = tmp_path / r"$\frac{$.safetensors"
-    source.write_bytes((FOLDER / "fast-base.safetensors").read_bytes())
     monkeypatch.chdir(tmp_path)
+    source = Path(r"$\frac{$.safetensors")  # which Matplotlib would take for mathematics
+    source.write_bytes((FOLDER / "fast-base.safetensors").read_bytes())
     options = "--parts structural first-push-p control --strengths 0 1 --tasks 2"
     arguments = ["fast-base", str(source), *options.split()]
     out = tmp_path / "runs" / f"profile-fast-base+{source.stem}"
@@ -41,7 +41,9 @@ def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monk
         with pytest.raises(SystemExit):
             profile.main(arguments)
     assert {path.name for path in out.iterdir()} == {"profile.csv", "provenance.json"}
-    assert "Controls solved directly" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "Controls solved directly" in shown
+    assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80
     profile.main(arguments)
     table = pd.read_csv(out / "profile.csv")
     one, two = (group.drop(columns="policy") for _, group in table.groupby("policy", sort=False))

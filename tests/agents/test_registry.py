@@ -8,7 +8,7 @@ from agents.registry import Registry, curiosities
 from helpers.refusal import assert_refused
 
 
-def test_a_name_of_yours_is_allowed_and_may_be_registered_again(own_names):
+def test_a_name_of_yours_is_allowed_and_may_be_registered_again(fresh_names):
     register("mine", print)
     register("mine", ours := lambda config, env: Curiosity())
     assert curiosities.factory("mine") is ours
@@ -39,5 +39,6 @@ def test_a_factory_that_cannot_be_called_is_refused(factory):
 @pytest.mark.parametrize("setting", ["curiosity", "encoder"])
 def test_unknown_names_are_refused_with_the_known_ones_and_the_way_to_add_more(setting):
     known = {"curiosity": "icm, rnd", "encoder": "paper, objects"}[setting]
-    words = [f"unknown {setting} 'rdn'; allowed: {known}", "--import MODULE", "imports="]
-    assert_refused(words, Config, **{setting: "rdn"})
+    words = [f"unknown {setting} 'xyz'; allowed: {known}", "--import MODULE", "imports="]
+    assert_refused(words, Config, **{setting: "xyz"})
+    assert_refused(["unknown curiosity 'rdn' (did you mean 'rnd'?)"], Config, curiosity="rdn")

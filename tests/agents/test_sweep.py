@@ -182,7 +182,8 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
     os.mkfifo(tmp_path / "b" / "metrics.csv")  # somebody's; the run will refuse it
     with overview.Overview(console, runs):
         pass
-    assert console.export_text() == "12% of 2 run(s), time left not known yet\n"
+    text = "12% of 2 run(s), time left is known after the first iterations\n"
+    assert console.export_text() == text
 
 
 @pytest.mark.parametrize(
@@ -208,7 +209,7 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
     ],
 )
 def test_impossible_sweeps_are_refused_and_leave_nothing(
-    capsys, monkeypatch, own_task_sets, tmp_path, arguments, words
+    capsys, monkeypatch, fresh_task_sets, tmp_path, arguments, words
 ):
     monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
     out = tmp_path / "out"

@@ -149,7 +149,7 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--env q", "as by --import MODULE"),
         ("--minibatch-size 3", "minibatch_size must divide episodes_per_iteration=256, got 3"),
         ("--episodess 8", "--episodess"),
-        ("--curiosity icmm", "unknown curiosity 'icmm'; allowed: icm, "),
+        ("--curiosity icmm", "unknown curiosity 'icmm' (did you mean 'icm'?); allowed: icm, "),
         ("--discount 2", "discount must be a finite number from 0 to 1, got 2"),
         ("--max-gradient-norm inf", "max_gradient_norm must be a finite number"),
         ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),

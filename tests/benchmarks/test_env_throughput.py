@@ -27,7 +27,7 @@ def counter(name, *, plain=False):
     )
 
 
-def test_measures_every_set_batch_and_pattern(timed, monkeypatch):
+def test_throughput_measures_every_set_batch_and_pattern(timed, monkeypatch):
     monkeypatch.setattr(env_throughput, "copy_bandwidth", lambda: 1e9)
     monkeypatch.setattr(env_throughput, "task_set_subject", counter)
     options = env_throughput.Options(
@@ -41,7 +41,7 @@ def test_measures_every_set_batch_and_pattern(timed, monkeypatch):
     assert results[2].steps_per_s == 4 * 3 / 2
 
 
-def test_folds_every_observation(timed):
+def test_throughput_folds_every_observation(timed):
     options = StepOptions(num_steps=4, repeats=1)
     result = env_throughput.measure_throughput(counter("counter"), 2, options)
     assert result.observation_bytes == 3 * 4
@@ -59,7 +59,7 @@ def test_a_task_set_steps_by_the_vector_environment_or_by_vmap(plain):
     assert subject.observe(timestep).shape == (2, 12, 12, 3)
 
 
-def test_patterns_compute_what_they_say():
+def test_patterns_read_observations_as_their_names_say():
     observations = jax.random.bits(jax.random.key(0), (4, 12, 12, 3), jnp.uint8)
     values = np.asarray(observations, np.int64)
     read = {name: np.asarray(pattern.read(observations)) for name, pattern in PATTERNS.items()}
@@ -72,7 +72,7 @@ def test_patterns_compute_what_they_say():
     assert PATTERNS["last"].join(jnp.zeros_like(observations), observations) is observations
 
 
-def test_peers_prints_time_and_size_of_a_step_and_skips_what_fails(timed, capsys, monkeypatch):
+def test_peers_prints_steps_and_skips_libraries_that_fail(timed, capsys, monkeypatch):
     def absent():
         raise ImportError("no such package")
 

@@ -79,7 +79,8 @@ def first_plan(state) -> list[list[int]] | None:
     _, successors, _, to_goal = graph(state)
     if np.isinf(to_goal[0]):
         return None
-    position, plan = 0, []
+    position = 0
+    plan = []
     while to_goal[position]:
         action = int(np.argmin(to_goal[successors[position]]))
         plan.append([*divmod(action, 4)])

@@ -14,7 +14,8 @@ def assert_fits(counts: np.ndarray, chances: np.ndarray) -> None:
     Nothing may fall where the chance is 0. Rare outcomes are tested together, at five
     expected counts or more.
     """
-    counts, chances = np.ravel(counts), np.ravel(chances)
+    counts = np.ravel(counts)
+    chances = np.ravel(chances)
     assert counts.shape == chances.shape
     np.testing.assert_allclose(chances.sum(), 1, rtol=1e-9)
     impossible = counts[chances == 0]
@@ -24,7 +25,8 @@ def assert_fits(counts: np.ndarray, chances: np.ndarray) -> None:
     observed = np.append(counts[~rare], counts[rare].sum())
     expected = np.append(expected[~rare], expected[rare].sum())
     if expected[-1] < SMALLEST_EXPECTATION:
-        observed, expected = observed[:-1], expected[:-1]
+        observed = observed[:-1]
+        expected = expected[:-1]
     parts = (observed - expected) ** 2 / expected
     degrees = max(len(expected) - 1, 1)
     worst = np.argmax(parts)

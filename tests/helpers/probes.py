@@ -46,7 +46,8 @@ class Probe(tt.Environment):
         return state, timestep.replace(observation=tt.observe(state))
 
     def step(self, state: tt.State, action: jax.Array) -> tuple[tt.State, TimeStep]:
-        bit, time = state.time // HIDDEN_UNIT, state.time % HIDDEN_UNIT
+        bit = state.time // HIDDEN_UNIT
+        time = state.time % HIDDEN_UNIT
         chosen = self._is("credit") & (time == 0)
         bit = jnp.where(chosen, (action[0] == 3).astype(jnp.int32), bit)
         reward = self._reward(bit, time, action)

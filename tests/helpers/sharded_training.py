@@ -31,7 +31,8 @@ def train(iterations):
     """Trains on two devices; returns the final state where it is, all metrics and the placement."""
     placement = Placement.of(2, CONFIG)
     learner = small_learner(placement.axis)
-    state, rows = placement.put(jax.jit(learner.init)(jax.random.key(0))), []
+    state = placement.put(jax.jit(learner.init)(jax.random.key(0)))
+    rows = []
     iterate = jax.jit(placement.shard(learner.iterate), donate_argnums=0)
     for _ in range(iterations):
         state, metrics = iterate(state)
@@ -55,7 +56,8 @@ def train_seeds():
         return iterate(init(keys))[0]
 
     keys = jax.random.split(jax.random.key(0), 2)
-    first, second = train(keys), train(keys[::-1])
+    first = train(keys)
+    second = train(keys[::-1])
     devices = len(first.iteration.devices())
     second = {name: x[::-1] for name, x in to_arrays(second).items()}
     return to_arrays(first), second, devices
@@ -82,7 +84,8 @@ def gradient_gap():
         reward, _ = learner.intrinsic_reward(state, trajectory)
         return learner.make_batch(state, trajectory, reward)[0]
 
-    placement, batch = Placement.of(2, CONFIG), make_batch(state)
+    placement = Placement.of(2, CONFIG)
+    batch = make_batch(state)
     assert placement.mesh is not None
 
     def gradient(params, batch):

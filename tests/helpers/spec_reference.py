@@ -59,7 +59,8 @@ class Layouts(NamedTuple):
 
     def bar(self, corner: Cell) -> list[Cell]:
         """The four cells of a tool at `corner`; a shorter one repeats its last."""
-        rows, columns = self.extent[..., 0], self.extent[..., 1]
+        rows = self.extent[..., 0]
+        columns = self.extent[..., 1]
         along = Cell((rows > 1).astype(int), (columns > 1).astype(int))
         last = np.maximum(rows, columns) - 1
         return [corner.shifted(along, np.minimum(i, last)) for i in range(4)]
@@ -92,8 +93,10 @@ def step(layouts: Layouts, agent: Cell, tool: Cell, food: Cell, action: tuple) -
     grasp, move = action
     d = Cell(*np.moveaxis(DIRECTIONS[move], -1, 0))
     next_to = agent.shifted(Cell(*np.moveaxis(DIRECTIONS[grasp], -1, 0)))
-    bar, moved_bar = layouts.bar(tool), layouts.bar(tool.shifted(d))
-    ahead, pushed = agent.shifted(d), food.shifted(d)
+    bar = layouts.bar(tool)
+    moved_bar = layouts.bar(tool.shifted(d))
+    ahead = agent.shifted(d)
+    pushed = food.shifted(d)
     grasped = is_in(next_to, bar) & ~is_in(agent, bar)
     agent_free = layouts.static_object(ahead) == GROUND
     food_ahead = is_in(food.shifted(d, -1), bar) & ~is_in(food, bar)
@@ -147,8 +150,10 @@ def outlines() -> dict[Outline, float]:
 
 def boards(outline: Outline) -> Iterator[np.ndarray]:
     """The eight equally likely boards of an outline."""
-    top, left = outline.row, outline.column
-    bottom, right = top + outline.height - 1, left + outline.width - 1
+    top = outline.row
+    left = outline.column
+    bottom = top + outline.height - 1
+    right = left + outline.width - 1
     row_side = [(top, slice(left, right + 1)), (bottom, slice(left, right + 1))]
     column_side = [(slice(top, bottom + 1), left), (slice(top, bottom + 1), right)]
     row_openings = [(row, slice(left + 1, right)) for row in (top, bottom)]
@@ -156,8 +161,10 @@ def boards(outline: Outline) -> Iterator[np.ndarray]:
     for tubes, openings in ((row_side, column_openings), (column_side, row_openings)):
         for trap, tube1 in itertools.product((0, 1), (0, 1)):
             board = np.full((SIZE, SIZE), GROUND, np.uint8)
-            board[openings[trap]], board[openings[1 - trap]] = TRAP, EXIT
-            board[tubes[tube1]], board[tubes[1 - tube1]] = TUBE1, TUBE2
+            board[openings[trap]] = TRAP
+            board[openings[1 - trap]] = EXIT
+            board[tubes[tube1]] = TUBE1
+            board[tubes[1 - tube1]] = TUBE2
             yield board
 
 
@@ -230,7 +237,8 @@ def swapped(before: Looks, code: int) -> Looks:
     cells = [tuple(cell) for cell in np.argwhere(before.board == code).tolist()]  # reading order
     length = len(cells)
     horizontal = length > 1 and cells[0][0] == cells[1][0]
-    board, palette = before.board.copy(), before.palette.copy()
+    board = before.board.copy()
+    palette = before.palette.copy()
     for cell in cells:
         board[cell] = GROUND
     for row in range(before.tool[0], before.tool[0] + before.extent[0]):
@@ -253,7 +261,8 @@ def sphere_feature_chances(num_features: int) -> np.ndarray:
         return chances
     angles = np.arccos(1 - 2 * np.arange(256) / 255)
     nodes, weights = np.polynomial.legendre.leggauss(16)
-    middle, half = (angles[1:] + angles[:-1]) / 2, (angles[1:] - angles[:-1]) / 2
+    middle = (angles[1:] + angles[:-1]) / 2
+    half = (angles[1:] - angles[:-1]) / 2
     samples = np.sin(middle[:, None] + half[:, None] * nodes) ** (num_features - 2)
     chances[:255] = half * (samples @ weights)
     return chances / chances.sum()

@@ -23,7 +23,8 @@ def bits(leaf: Any) -> np.ndarray:
 
 def assert_same(tree: Any, other: Any) -> None:
     """Two trees have the same structure, dtypes and numbers."""
-    tree, other = jax.tree.map(bits, tree), jax.tree.map(bits, other)
+    tree = jax.tree.map(bits, tree)
+    other = jax.tree.map(bits, other)
     chex.assert_trees_all_equal_structs(tree, other)
     chex.assert_trees_all_equal_dtypes(tree, other)
     jax.tree.map(np.testing.assert_array_equal, tree, other)

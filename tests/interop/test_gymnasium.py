@@ -38,7 +38,7 @@ def test_the_environment_checker_finds_nothing(name, options):
     check_env(gymnasium.make(f"trap_tube_jax/{name}", **options).unwrapped)
 
 
-def test_a_seeded_episode_is_that_of_the_environment_below():
+def test_a_seeded_episode_equals_one_of_the_wrapped_environment():
     env = gymnasium.make("trap_tube_jax/PerceptualTrapTube-v0")
     below = tt.AutoReset(tt.make("p"))
     observation, _ = env.reset(seed=3)
@@ -74,7 +74,7 @@ def test_an_episode_ends_with_success_or_at_the_limit_with_actions_of_either_kin
 
 @pytest.mark.parametrize("mode", AUTORESET_MODES)
 @pytest.mark.parametrize("flat", [False, True])
-def test_the_batch_equals_gymnasiums_own(mode, flat, easy_env):
+def test_the_batch_equals_gymnasiums_vector_environment(mode, flat, easy_env):
     """On tasks that are drawn, and on one that random actions solve."""
     for task_set in (tt.make("p", max_steps=5), easy_env):
         options = {"task_set": task_set, "flat_actions": flat}
@@ -157,7 +157,7 @@ def test_episode_statistics_count_over_the_batch(easy_env):
 
 
 @pytest.mark.parametrize("mode", AUTORESET_MODES)
-def test_masks_and_missing_seeds_reset_as_gymnasiums_own_batch_does(mode):
+def test_masks_and_missing_seeds_reset_as_in_gymnasiums_batch(mode):
     options = {"task_set": "p", "max_steps": 3}
     ours = TrapTubeVectorEnv(num_envs=3, autoreset_mode=mode, **options)
     theirs = SyncVectorEnv([functools.partial(TrapTubeEnv, **options)] * 3, autoreset_mode=mode)
@@ -216,7 +216,7 @@ def test_masks_and_seeds_are_checked():
             envs.reset(seed=seed)
 
 
-def test_render_modes_show_what_the_package_renders(easy_env):
+def test_render_modes_show_the_pictures_of_the_package(easy_env):
     env = TrapTubeEnv(easy_env, render_mode="rgb_array", cell_size=8)
     env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), tt.render(easy_env.base, 8))
@@ -237,7 +237,7 @@ def test_observations_are_the_callers_to_change(easy_env):
         assert following.any()
 
 
-def test_own_task_sets_can_be_registered(own_task_sets):
+def test_custom_task_sets_can_be_registered(fresh_task_sets):
     tt.register("GymnasiumTest-v0", (tt.perceptual,))
     register()
     env = gymnasium.make("trap_tube_jax/GymnasiumTest-v0")
@@ -268,7 +268,7 @@ def test_copies_continue_the_episode(make, duplicate):
 
 
 @pytest.mark.parametrize("context", ["spawn", "forkserver"])
-def test_processes_of_their_own_change_nothing(context):
+def test_a_batch_in_processes_plays_the_same(context):
     env = tt.Environment((tt.perceptual,), max_steps=3)
     functions = [functools.partial(TrapTubeEnv, env)] * 2
     envs = [SyncVectorEnv(functions), AsyncVectorEnv(functions, context=context)]

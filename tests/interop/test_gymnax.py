@@ -27,7 +27,7 @@ def easy(easy_env):
     return to_gymnax.make(easy_env)
 
 
-def test_spaces_and_parameters_are_gymnaxs_own(easy):
+def test_spaces_and_parameters_are_gymnaxs(easy):
     env, params = easy
     assert isinstance(env, gymnax.environments.environment.Environment)
     assert isinstance(env.action_space(params), spaces.Discrete)
@@ -44,7 +44,7 @@ def test_spaces_and_parameters_are_gymnaxs_own(easy):
     assert to_gymnax.make("TrapTube-v0")[1].max_steps_in_episode == 50
 
 
-def test_five_values_are_those_of_the_environment_below(easy, easy_env):
+def test_five_values_equal_those_of_the_wrapped_environment(easy, easy_env):
     env, params = easy
     observation, state = env.reset(jax.random.PRNGKey(0), params)
     below, timestep = easy_env.reset(jax.random.key(0))
@@ -176,7 +176,7 @@ def test_stoa_steps_it(easy):
 
 
 @needs_six_values
-def test_an_own_set_may_be_registered_again(own_task_sets):
+def test_a_custom_set_may_be_registered_again(fresh_task_sets):
     for limit in (7, 9):
         tt.register("GymnaxTest-v0", (), max_steps=limit)
         to_gymnax.register()

@@ -66,14 +66,15 @@ def test_agents_start_from_every_cell_that_they_can_walk_to():
         )
 
 
-def test_ids_and_labels_are_those_of_the_functions():
+def test_ids_and_labels_follow_the_names_of_the_functions():
     entry = tt.CONTROL_TASK_SETS[0]
     names = (entry.id, entry.short, entry.label)
     assert names == ("TrapTurnedControl-v0", "trap-turned", "trap-turned")
 
 
 def test_every_layout_is_drawn_as_often_and_as_it_is_in_the_states_colours():
-    start, keys = tt.base_state(5), jax.random.split(jax.random.key(0), 400)
+    start = tt.base_state(5)
+    keys = jax.random.split(jax.random.key(0), 400)
     for layouts in CONTROLS:
         choices = [state.replace(palette=start.palette) for state in layouts()]
         drawn = jax.device_get(jax.jit(jax.vmap(LayoutDraw(layouts), (0, None)))(keys, start))

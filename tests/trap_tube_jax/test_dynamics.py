@@ -96,8 +96,8 @@ def _layouts(task: str, number: int) -> list[tt.State]:
     ("task", "number"),
     [
         ("sy", 5),  # base among them
-        ("p", 3),
-        ("psy", 3),
+        ("p", 2),
+        ("psy", 2),
         pytest.param("p", 70, marks=pytest.mark.slow),
         pytest.param("psy", 30, marks=pytest.mark.slow),
     ],

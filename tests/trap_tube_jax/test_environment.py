@@ -69,7 +69,7 @@ def modes(request) -> Modes:
     return Modes(env, keys, actions, reset, vmapped)
 
 
-def test_alone_eager_and_in_scanned_slices_the_episodes_are_the_same(modes):
+def test_episodes_are_the_same_alone_eager_and_in_scanned_slices(modes):
     env = modes.env
     alone = (traced_once(env.reset), traced_once(env.step))
     for (reset, step), index in ((alone, 0), (alone, BATCH - 1), ((env.reset, env.step), 7)):
@@ -91,7 +91,7 @@ def test_alone_eager_and_in_scanned_slices_the_episodes_are_the_same(modes):
         assert_same(rest, rows(modes.vmapped, (part, slice(1, None))))
 
 
-def test_same_key_gives_the_same_bits_and_others_other_tasks(modes):
+def test_the_same_key_draws_the_same_bits_and_others_other_tasks(modes):
     again = Pace(*modes.reset(modes.keys))
     assert_same(again, rows(modes.vmapped, (slice(None), 0)))
     # A symbolic swap is invisible, so that what is seen does not tell all tasks apart.
@@ -109,23 +109,6 @@ def test_reset_starts_an_episode(modes):
     assert np.all(timestep.discount == 1)
     for index in range(0, BATCH, 100):
         tt.validate(rows(state, index))
-
-
-def test_episodes_end_at_the_limit_and_stay_ended(modes):
-    timestep = modes.vmapped.timestep
-    state = modes.vmapped.state
-    solved = np.asarray(timestep.terminated)
-    at_limit = np.arange(STEPS + 1) >= LIMIT
-    np.testing.assert_array_equal(timestep.truncated, at_limit & ~solved)
-    np.testing.assert_array_equal(timestep.discount, 1 - solved)
-    assert np.all(np.asarray(state.time) <= LIMIT)
-    unsolved = ~solved[:, -1]
-    assert_same(
-        rows(modes.vmapped.state, (unsolved, LIMIT)), rows(modes.vmapped.state, (unsolved, -1))
-    )
-    np.testing.assert_array_equal(
-        rows(timestep.observation, (unsolved, LIMIT)), rows(timestep.observation, (unsolved, -1))
-    )
 
 
 OVER = EASY.replace(time=jnp.int32(1), truncated=jnp.array(True))
@@ -195,7 +178,7 @@ def test_states_of_numpy_arrays_serve_under_vmap_and_jit():
         assert_same(alone, rows(expected, 0))
 
 
-def test_own_transfers_apply_in_order_to_what_the_ones_before_return():
+def test_custom_transfers_apply_in_order():
     """The second puts the agent where the base task has a trap."""
 
     def clear(key, state):
@@ -215,7 +198,7 @@ def test_own_transfers_apply_in_order_to_what_the_ones_before_return():
 
 
 @pytest.mark.parametrize("make_key", [jax.random.key, jax.random.PRNGKey], ids=["typed", "raw"])
-def test_own_transfers_get_keys_that_mix_with_own_keys(make_key):
+def test_custom_transfers_get_typed_keys_by_fold_in(make_key):
     """Typed keys, whatever `reset` was given, and those that `compose` promises."""
 
     def custom(key, state):
@@ -243,7 +226,7 @@ def test_action_numbers_are_four_times_grasp_plus_move():
 WIDE = [np.array(number) for number in (2**32 + 3, 2**64 - 2**32 + 3, -(2**32) + 3)]
 
 
-def test_other_numbers_are_no_directions():
+def test_numbers_out_of_range_are_no_directions():
     index = jnp.array([[-1, 16], [99, 15]])
     expected = [[[-1, -1], [-1, -1]], [[-1, -1], [3, 3]]]
     np.testing.assert_array_equal(jax.jit(tt.action_from_index)(index), expected)
@@ -259,7 +242,7 @@ def test_other_numbers_are_no_directions():
 
 
 @pytest.mark.parametrize("value", [None, "right", 1.0, True, [[0], [1, 2]], jax.random.key(0)])
-def test_what_is_no_integer_is_refused_as_an_action(value):
+def test_actions_other_than_integers_are_refused(value):
     functions = (
         tt.action_from_index,
         tt.action_to_index,
@@ -328,7 +311,7 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
 
 
 @pytest.mark.parametrize(("options", "words"), BAD_ENVIRONMENTS)
-def test_environment_refuses(options, words):
+def test_impossible_arguments_of_an_environment_are_refused(options, words):
     assert_refused(words, tt.Environment, **options)
 
 

@@ -96,7 +96,7 @@ def test_observations_equal_the_recorded_ones(recorded, starts, replay):
     np.testing.assert_array_equal(last, recorded["image_last"])
 
 
-def test_states_past_the_end_stay(recorded, replay):
+def test_states_do_not_change_after_the_end(recorded, replay):
     """Steps after the end of an episode change nothing and pay nothing."""
     past = ~_within_episode(recorded)
     episode, _ = np.nonzero(past)
@@ -108,7 +108,7 @@ def test_states_past_the_end_stay(recorded, replay):
     assert not replay.timestep.reward[past].any()
 
 
-def test_reading_of_the_rules_agrees(recorded):
+def test_the_numpy_reading_of_the_rules_agrees_with_the_recording(recorded):
     """The plain-NumPy reading under `tests/` is itself held to the recording."""
     episode, time = np.nonzero(_within_episode(recorded))
     before = {name: recorded[name][episode, time] for name in ("agent", "tool", "food")}

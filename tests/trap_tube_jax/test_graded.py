@@ -99,7 +99,7 @@ def test_tool_and_agent_have_the_specified_distribution(strength):
     assert_fits(tally(by_agent.shape, drawn.outline, drawn.vertical, drawn.agent), by_agent)
 
 
-def test_what_is_drawn_can_be_drawn_at_any_higher_strength():
+def test_a_higher_strength_allows_all_draws_of_a_lower_one():
     drawn = layouts(STRENGTHS[0])
     for strength in (0.5, STRENGTHS[1], 1.0):
         assert np.all(layout_chances(strength)[drawn.outline, drawn.variant, drawn.vertical] > 0)

@@ -1,5 +1,6 @@
 """Signals end a command with one line and their code, whatever it does, or are deferred."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -33,13 +34,8 @@ NEVER_SAVES = """with deferring():
 
 
 def start(body, **options):
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM.format(body=body)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **options,
-    )
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    return subprocess.Popen([sys.executable, "-c", PROGRAM.format(body=body)], text=True, **options)
 
 
 @pytest.mark.parametrize(
@@ -65,6 +61,20 @@ def test_a_signal_ends_a_command_with_one_line_and_its_code(body, times, lines):
             errors += process.stderr.read()
         ends[number] = (process.returncode, errors.splitlines())
     assert ends == {number: (128 + number, lines) for number in SIGNALS}
+
+
+def test_on_a_terminal_the_words_begin_a_line():
+    """After a line of progress, and the "^C" of the terminal."""
+    pty = pytest.importorskip("pty")
+    terminal, errors = pty.openpty()
+    with start(SAVES, stderr=errors) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+    shown = os.read(terminal, 1024).decode()
+    assert shown.splitlines()[:2] == ["", FINISHING]
+    os.close(terminal)
+    os.close(errors)
 
 
 def test_ignored_signals_stay_ignored():

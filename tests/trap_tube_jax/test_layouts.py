@@ -50,7 +50,8 @@ def test_the_share_of_layouts_that_training_meets_is_the_documented_one(layouts)
 
     best = Config.preset("best")
     paper = Config.preset("paper")
-    few, many = best.num_new * best.iterations, paper.num_new * 500  # of `exp2`
+    few = best.num_new * best.iterations
+    many = paper.num_new * 500
     (any_tool, bar) = met(few)
     (of_many, bar_of_many) = met(many)
     page = " ".join((ROOT / "trap_tube_jax" / "protocol.md").read_text().split())

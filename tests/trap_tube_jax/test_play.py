@@ -59,7 +59,7 @@ def test_keys_turn_the_hand_and_move(game, key, move, hand, grasp):
     assert (after.grasp, after.state) == (grasp, expected)
 
 
-def test_restart_next_task_and_other_keys(game):
+def test_keys_restart_and_draw_the_next_task(game):
     restarted = press_all(game, [UP, "d", "r"])
     assert (restarted.seed, restarted.state) == (0, game.state)
     assert play.press(game, "n").seed == 1

@@ -70,6 +70,6 @@ TAKE_A_KEY = [
 
 
 @pytest.mark.parametrize(("key", "words"), NO_KEYS.values(), ids=NO_KEYS)
-def test_what_is_not_one_key_is_refused(key, words):
+def test_arguments_other_than_one_key_are_refused(key, words):
     for function in TAKE_A_KEY:
         assert_refused(["one PRNG key", "jax.random.key", *words], function, key)

@@ -30,7 +30,7 @@ SPECIFIED = [
 ]
 
 
-def test_the_papers_sets_are_those_of_the_page_by_id_short_name_and_label():
+def test_the_papers_sets_are_found_by_id_short_name_and_label():
     sets = [(entry.id, entry.short, entry.label, entry.transfers) for entry in tt.PAPER_TASK_SETS]
     assert sets == SPECIFIED
     assert tt.registered_ids()[:8] == tuple(entry[0] for entry in SPECIFIED)
@@ -40,7 +40,7 @@ def test_the_papers_sets_are_those_of_the_page_by_id_short_name_and_label():
             assert (env.transfers, env.max_steps, env.num_features) == (transfers, 50, 3)
 
 
-def test_register_adds_a_set(own_task_sets):
+def test_register_adds_a_set(fresh_task_sets):
     def to_the_top(key, state):
         del key
         return state.replace(agent=state.agent.at[0].set(0))
@@ -53,7 +53,7 @@ def test_register_adds_a_set(own_task_sets):
     assert tt.make("Top-v0").transfers == entry.transfers == transfers
 
 
-def test_base_state_and_step_limit_are_those_of_the_set_or_given(own_task_sets):
+def test_base_state_and_step_limit_come_from_the_set_unless_given(fresh_task_sets):
     base = tt.base_state(5).replace(agent=np.array((0, 0), np.int32))
     entry = tt.register("Own-v0", (), short="own", base=base, max_steps=20)
     assert (entry.base, entry.max_steps, entry.label) == (base, 20, "own")
@@ -71,28 +71,14 @@ def test_base_state_and_step_limit_are_those_of_the_set_or_given(own_task_sets):
 
 
 @pytest.mark.parametrize("options", [{}, {"base": tt.base_state()}, {"max_steps": 20}])
-def test_no_two_sets_have_one_label(own_task_sets, options):
+def test_no_two_sets_have_one_label(fresh_task_sets, options):
     tt.register("Own-v0", (tt.structural,), short="own", **options)
     labels = [tt.task_set(name).label for name in tt.registered_ids()]
     assert len(set(labels)) == len(labels)
     assert labels[-1] == "own"
 
 
-@pytest.mark.parametrize("name", ["NA", "null", "nan", "None"])
-def test_a_name_that_reads_as_missing_is_a_name(own_task_sets, name):
-    tt.register(name, (tt.structural,))
-    assert tt.make(name).transfers == (tt.structural,)
-    scores = tt.score_gymnasium(Upward(), [name, "base"], 2)
-    assert list(scores) == [name, "base"]
-    assert scores[name].tasks == 2
-
-
-class Upward:
-    def act(self, observation):
-        return 0, 0
-
-
-def test_an_own_set_may_be_registered_again(own_task_sets):
+def test_a_custom_set_may_be_registered_again(fresh_task_sets):
     before = tt.register("Own-v0", (), short="own", max_steps=20)
     assert tt.register("Own-v0", (), short="own", max_steps=20) == before
     tt.register("Own-v0", (tt.structural,), short="own", max_steps=30)
@@ -166,7 +152,7 @@ BAD_SETS = [
 
 
 @pytest.mark.parametrize(("name", "transfers", "options", "words"), BAD_SETS)
-def test_register_refuses(own_task_sets, name, transfers, options, words):
+def test_register_refuses(fresh_task_sets, name, transfers, options, words):
     assert_refused(words, tt.register, name, transfers, **options)
     assert "Mine-v0" not in tt.registered_ids()
 
@@ -185,7 +171,7 @@ def test_a_mixture_draws_a_set_as_often_as_it_is_named():
         tt.validate(take(states, index))
 
 
-def test_a_mixture_is_a_task_set_with_names_of_its_own():
+def test_a_mixture_is_a_task_set_with_id_short_name_and_label():
     entry = tt.task_set("p + {P, St, Sy}")
     assert (entry.short, entry.label) == ("p+pstsy", "{P} + {P, St, Sy}")
     assert tt.task_set(entry.id) == tt.task_set(entry.short) == tt.task_set(entry.label) == entry
@@ -193,7 +179,7 @@ def test_a_mixture_is_a_task_set_with_names_of_its_own():
     assert len(tt.evaluation_tasks("p+pstsy", 3).time) == 3
 
 
-def test_a_mixture_refuses_sets_that_do_not_mix(own_task_sets):
+def test_a_mixture_refuses_sets_that_do_not_mix(fresh_task_sets):
     tt.register("Short-v0", (), max_steps=20)
     tt.register("Own-v0", (), base=tt.base_state())
     assert_refused(["one step limit; p has 50 steps, Short-v0 20"], tt.make, "p+Short-v0")

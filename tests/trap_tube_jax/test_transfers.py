@@ -53,7 +53,7 @@ def test_tool_and_agent_have_the_specified_distribution(layout, thing):
     assert_fits(counts, chances)
 
 
-def test_perceptual_agent_given_the_tool(layout):
+def test_the_agent_is_uniform_over_the_cells_that_the_tool_leaves(layout):
     """Among the cells left to it in its layout, the agent's is any with equal chance."""
     allowed = spec.placements() > 0
     where = (layout.outline, layout.vertical, layout.tool)
@@ -119,7 +119,7 @@ def _points(num_features: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("num_features", FEATURES)
-def test_structural_features_are_exactly_those_of_the_sphere(num_features):
+def test_structural_features_have_the_distribution_of_the_sphere(num_features):
     """Each coordinate alone, at the resolution of a single feature value."""
     chances = spec.sphere_feature_chances(num_features)
     for code in POINTS_OF:
@@ -210,7 +210,7 @@ def test_the_base_task_has_five_equally_likely_swaps(palette):
         assert np.all(getattr(drawn, name) == np.asarray(getattr(start, name)))
 
 
-def test_symbolic_on_perceptual_tasks(drawn):
+def test_perceptual_tasks_have_five_equally_likely_swaps(drawn):
     """256 layouts, 512 draws each: nothing but the five specified outcomes."""
     layouts = 256
     draws = SAMPLES // 256
@@ -228,7 +228,7 @@ def test_symbolic_on_perceptual_tasks(drawn):
     assert_fits(counts, np.full((layouts, 5), 0.2 / layouts))
 
 
-def test_symbolic_cannot_be_seen(drawn):
+def test_symbolic_keeps_the_observation(drawn):
     """Cells and colours change roles together, so that every cell keeps its colour."""
 
     def before_and_after(key, state):
@@ -240,7 +240,7 @@ def test_symbolic_cannot_be_seen(drawn):
     np.testing.assert_array_equal(before, after)
 
 
-def test_symbolic_leaves_alone_what_could_not_be_a_tool():
+def test_symbolic_swaps_no_object_that_cannot_be_a_tool():
     """On own boards: an object of no cell, of five, or whose bar would leave the board."""
     start = tt.State.from_ascii(
         ["11111......A", "TT..........", *["." * 12] * 8, ".........F..", "..........xx"],
@@ -258,7 +258,7 @@ def test_symbolic_leaves_alone_what_could_not_be_a_tool():
 
 
 @pytest.mark.parametrize("covered", ["agent", "food"])
-def test_symbolic_leaves_alone_what_would_put_an_object_below_agent_or_food(covered):
+def test_symbolic_puts_no_object_below_agent_or_food(covered):
     start = tt.base_state()
     tool = {"agent": start.agent, "food": start.food}[covered] - jnp.array([3, 0], jnp.int32)
     drawn = draw(tt.symbolic, 7, start.replace(tool=tool), 64)

@@ -80,7 +80,7 @@ def test_auto_reset_shows_the_next_episode_where_one_ended(auto_reset):
     assert len(np.unique(looks, axis=0)) == done.sum()
 
 
-def test_episode_statistics_count_what_happened(auto_reset):
+def test_episode_statistics_count_returns_and_lengths(auto_reset):
     done = auto_reset.timestep.done
     reward = auto_reset.timestep.reward
     for row in range(ROWS):
@@ -132,7 +132,7 @@ def test_episode_statistics_of_a_vector_count_its_environments_without_resets(ve
 
 
 @pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
-def test_auto_reset_refuses_what_resets_itself_or_counts(wrapper):
+def test_auto_reset_refuses_environments_that_reset_themselves_or_count(wrapper):
     env = wrapper(tt.Environment())
     words = [wrapper.__name__, "resets itself", "trap_tube_jax.Environment"]
     assert_refused(words, tt.AutoReset, env)

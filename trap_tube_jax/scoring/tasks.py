@@ -122,9 +122,9 @@ def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
 
 
 def label(name: str) -> str:
-    """Returns a registered set's name in the paper's notation, any other name unchanged."""
+    """Returns a set's or mixture's name in the paper's notation; keeps unregistered names."""
     known = {entry.short: entry.label for entry in map(task_set, registered_ids())}
-    return known.get(name, name)
+    return " + ".join(known.get(part, part) for part in name.split("+"))
 
 
 @functools.cache

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed, expand
-from trap_tube_jax.command_line import add_import_option, plain_errors
+from trap_tube_jax.command_line import add_import_option, announce, plain_errors
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.objects import DIRECTION_NAMES
@@ -73,7 +73,7 @@ def _survey(options: argparse.Namespace) -> None:
     keys = jax.random.split(jax.random.key(check_seed(options.seed)), tasks)
     lengths = {}
     for entry in dict.fromkeys(task_set(name) for name in options.sets):
-        print(f"solving {tasks:,} tasks of {entry.label}", file=sys.stderr)
+        announce(f"Solving {tasks:,} tasks of {entry.label}, up to a minute per 1,000 tasks")
         states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
         lengths[entry.label] = solve_batch(states).length
     quantiles = (f"{quantile} %" for quantile in QUANTILES)
@@ -108,6 +108,7 @@ def _show(options: argparse.Namespace) -> None:
 def _distances(options: argparse.Namespace) -> None:
     state = _task(options.distances, options.seed)
     plan = solve(state)
+    announce("Exploring up to two million states, which takes seconds")
     found = distances(state)
     print(f"length of the plan: {plan.length if plan.solvable else 'unsolvable'}")
     print(f"reachable states: {found.num_reachable}")

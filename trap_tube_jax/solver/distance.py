@@ -50,7 +50,7 @@ class Distances(ByValue, struct.PyTreeNode, eq=False):
 
 
 def distances(state: State) -> Distances:
-    """Computes the distances of every state that is reachable from `state`. Host side.
+    """Computes the distances of every state that is reachable from `state`. Runs on the host.
 
     d(s) = 0 if s is solved, else 1 + min over the 16 actions a of d(step(s, a)).
 

@@ -245,7 +245,8 @@ def _unbatched(states: State) -> Iterator[State]:
 
 def _to_host(state: State) -> State:
     if not isinstance(state, State):
-        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}")
+        hint = "; reset and step return (state, timestep)" if isinstance(state, tuple) else ""
+        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}{hint}")
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
         raise ValueError(
             "the solver runs on the host and got a traced state; call it outside jit, vmap and "

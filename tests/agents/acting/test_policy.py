@@ -16,10 +16,15 @@ from trap_tube_jax.scoring import Suite, evaluation_tasks
 def drive(policy, tasks):
     """Plays with nothing but observations, as a user would; returns solved, length, actions."""
     env = tt.Environment(base=tt.base_state(1), max_steps=STEPS)
-    step, act = jax.jit(jax.vmap(env.step)), jax.jit(policy.act)
+    step = jax.jit(jax.vmap(env.step))
+    act = jax.jit(policy.act)
     batch = len(tasks.time)
-    state, carry, observation = tasks, policy.initial(batch), jax.vmap(tt.observe)(tasks)
-    solved, length, actions = np.zeros(batch, bool), np.zeros(batch, int), []
+    state = tasks
+    carry = policy.initial(batch)
+    observation = jax.vmap(tt.observe)(tasks)
+    solved = np.zeros(batch, bool)
+    length = np.zeros(batch, int)
+    actions = []
     for time in range(STEPS):
         action, carry = act(observation, carry, jax.random.key(time))
         length += ~np.asarray(state.terminated | state.truncated)
@@ -41,7 +46,8 @@ def drive(policy, tasks):
     ],
 )
 def test_a_policy_reaches_the_evaluators_outcomes(seed, settings):
-    policy, tasks = random_policy(seed, **settings), food_next_to_agent()
+    policy = random_policy(seed, **settings)
+    tasks = food_next_to_agent()
     solved, length, actions = drive(policy, tasks)
     suite = Suite({"mine": tasks}, {"mine": STEPS})
     played = Evaluator(policy.config, suite)(policy.params)["mine"]
@@ -56,7 +62,7 @@ def test_a_policy_reaches_the_evaluators_outcomes(seed, settings):
         assert not np.array_equal(actions, drive(plain, tasks)[2])
 
 
-def test_driving_scoring_and_evaluating_have_one_result(own_task_sets):
+def test_stepping_scoring_and_evaluating_have_one_result(fresh_task_sets):
     def near(key, state):
         cells = jnp.array(FOOD_CELLS, jnp.int32)
         return state.replace(food=cells[jax.random.randint(key, (), 0, 4)])
@@ -102,7 +108,8 @@ def test_unusable_arguments_are_refused(batch, convert, key, message):
 
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
 def test_copies_are_equal(copied):
-    policy, agent = random_policy(), Agent(CONFIG)
+    policy = random_policy()
+    agent = Agent(CONFIG)
     carry = policy.initial(2)
     assert_same(copied(policy).params, policy.params)
     assert copied(policy).replace(params=None) == policy.replace(params=None)

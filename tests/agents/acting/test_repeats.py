@@ -14,37 +14,30 @@ def test_an_action_is_avoided_where_it_was_taken_until_it_is_forgotten():
     logits = jnp.log(jnp.array([[[0.5, 0.3, 0.1, 0.1], [0.97, 0.01, 0.01, 0.01]]]))
     actions = ActionDistribution(logits)
     for gap, best in ((0, [1, 0]), (MEMORY - 1, [1, 0]), (MEMORY, [0, 0])):
-        repeats, action = Repeats.empty(1), jnp.zeros((1, 2), jnp.int32)
+        repeats = Repeats.empty(1)
+        action = jnp.zeros((1, 2), jnp.int32)
         for seen in (0, *range(1, gap + 1), 0):
             board = jnp.full((1, 12, 12, 1), seen, jnp.uint8)
             action, repeats = repeats.choose(actions, 1.0, board)
         assert action[0].tolist() == best, gap
 
 
-def test_a_penalty_changes_the_most_probable_action():
-    logits = jnp.array([[0.0, 4.0, 3.0, 0.0]])
-    # Grasp 1, move 2; then move 1.
-    actions = ActionDistribution(jnp.stack([logits, logits[:, ::-1]], axis=1))
-    penalty = jnp.zeros((1, 4, 4))
-    assert actions.mode(penalty).tolist() == actions.mode().tolist() == [[1, 2]]
-    penalty = penalty.at[0, 1, 2].set(0.9)
-    assert actions.mode(penalty).tolist() == [[1, 2]]
-    penalty = penalty.at[0, 1, 2].set(1.1)
-    assert actions.mode(penalty).tolist() == [[1, 1]], "the lower index of two equal ones"
-
-
-def test_under_a_high_penalty_no_action_is_repeated():
+def test_under_a_high_penalty_greedy_play_repeats_no_action():
     env = tt.Environment(base=tt.base_state(1), max_steps=STEPS)
     step = jax.jit(jax.vmap(env.step))
 
     def repeated(penalty):
-        policy, state, seen = random_policy(repeat_penalty=penalty), food_next_to_agent(), []
-        carry, act = policy.initial(4), jax.jit(policy.act)
+        policy = random_policy(repeat_penalty=penalty)
+        state = food_next_to_agent()
+        seen = []
+        carry = policy.initial(4)
+        act = jax.jit(policy.act)
         for _ in range(STEPS):
             observation = jax.vmap(tt.observe)(state)
             action, carry = act(observation, carry)
             state, _ = step(state, action)
-            pictures, pairs = map(bytes, np.asarray(observation)), map(tuple, action.tolist())
+            pictures = map(bytes, np.asarray(observation))
+            pairs = map(tuple, action.tolist())
             seen.append(list(zip(pictures, pairs, strict=True)))
         ends = np.asarray(state.time)
         return [end - len(set(rows[:end])) for end, *rows in zip(ends, *seen, strict=True)]

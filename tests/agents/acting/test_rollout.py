@@ -46,7 +46,7 @@ def played():
     return env, agent, params, initial, trajectory
 
 
-def test_values_and_log_probabilities_are_those_of_the_observations_in_order(played):
+def test_values_and_log_probabilities_belong_to_the_observations_in_order(played):
     """Values are of all observations, the last one included."""
     _, agent, params, _, trajectory = played
     episodes = trajectory.episodes
@@ -55,7 +55,8 @@ def test_values_and_log_probabilities_are_those_of_the_observations_in_order(pla
     def expected():
         again = lambda x: jnp.concatenate([x, x[:, -1:]], axis=1)  # noqa: E731
         features = jax.vmap(functools.partial(agent.encode, params))(episodes.observations())
-        action, reward = again(episodes.action), again(episodes.reward)
+        action = again(episodes.action)
+        reward = again(episodes.reward)
         embedding, _ = agent.unroll(params, again(features), action, reward)
         actions, value = agent.policy_and_value(params, embedding)
         return value, actions.log_prob(action)[:, :-1]
@@ -69,7 +70,8 @@ def test_episodes_follow_the_environment(played):
     env, _, _, initial, trajectory = played
     episodes = trajectory.episodes
     step = jax.jit(jax.vmap(env.step))
-    state, done = initial, np.zeros(CONFIG.episodes_per_iteration, bool)
+    state = initial
+    done = np.zeros(CONFIG.episodes_per_iteration, bool)
     for t in range(env.max_steps):
         np.testing.assert_array_equal(episodes.mask[:, t], ~done)
         for name, index in (("agent", 0), ("tool", 1), ("food", 2)):

@@ -49,7 +49,7 @@ BY_HAND = {
 
 
 @pytest.mark.parametrize("name", BY_HAND)
-def test_rewards_are_those_computed_by_hand(name):
+def test_rewards_equal_hand_computed_ones(name):
     features, column, expected = BY_HAND[name]
     np.testing.assert_allclose(reward_of(name, features, column), expected, rtol=1e-5)
 
@@ -122,7 +122,7 @@ def config_of_jax(request):
 
 
 @pytest.mark.parametrize("name", ["icm", "noveld", "effects"])
-def test_training_keeps_its_types_whatever_users_set(name, config_of_jax):
+def test_training_keeps_its_types_under_users_settings_of_jax(name, config_of_jax):
     """Nothing is computed, only traced."""
     learner = make_learner(small_config(curiosity=name, env_id="sy"))
     state = jax.eval_shape(learner.init, jax.random.key(0))

@@ -12,7 +12,8 @@ from agents.curiosity import Experience
 from agents.curiosity.effects import Effects, new_effects
 from trap_tube_jax.objects import DIRECTIONS
 
-STEPS, BATCH = 40, 48
+STEPS = 40
+BATCH = 48
 
 
 def random_episodes(env: tt.Environment) -> Episodes:
@@ -53,12 +54,14 @@ def read_off(
     rest[is_agent | is_food] = ground
     found = []
     for views in (is_food, rest):
-        seen, new = set(), []
+        seen = set()
+        new = []
         for view in views:
             new.append(view.tobytes() not in seen)
             seen.add(view.tobytes())
         found.append(new[1:])
-    met, new = set(), []
+    met = set()
+    new = []
     for board, body, grasp in zip(boards, is_agent, grasps, strict=False):
         hand = np.argwhere(body)[0] + DIRECTIONS[grasp]
         color = board[tuple(hand)].tobytes() if np.all((hand >= 0) & (hand < 12)) else None
@@ -101,13 +104,13 @@ def by_hand() -> Episodes:
     return Episodes(layout, cells, action, zeros, zeros + 1, mask)
 
 
-def test_a_return_is_not_new(by_hand):
+def test_food_and_tool_that_return_are_no_new_effect(by_hand):
     food, tool, _ = np.asarray(new_effects(by_hand) * by_hand.mask[None])
     np.testing.assert_array_equal(tool, [[1, 0, 0, 1], [0, 1, 0, 0]])
     np.testing.assert_array_equal(food, [[0, 0, 1, 0], [0, 1, 0, 0]])
 
 
-def test_each_kind_pays_the_inverse_of_its_rate(by_hand):
+def test_an_effect_pays_the_inverse_of_its_kinds_rate(by_hand):
     curiosity = Effects(Config(reward_ema_decay=0.75))
     experience = Experience(by_hand, jnp.zeros((2, 5, 0)))
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)

@@ -34,7 +34,8 @@ def plain_params(params):
     gru["hn"]["bias"] = candidate[2][1]
 
     def pair(layers, prefix=""):
-        grasp, move = layers[f"{prefix}grasp"], layers[f"{prefix}move"]
+        grasp = layers[f"{prefix}grasp"]
+        move = layers[f"{prefix}move"]
         return {name: jnp.stack([grasp[name], move[name]], axis=-2) for name in ("kernel", "bias")}
 
     blocks = [encoder[block][conv] for block in ("block1", "block2") for conv in ("conv1", "conv2")]
@@ -56,8 +57,9 @@ def plain_params(params):
     }
 
 
-def test_rewards_advantages_and_losses_are_those_of_the_learner():
-    learner, plain = make_learner(CONFIG), plain_ppo.PlainPPO(CONFIG)
+def test_rewards_advantages_and_losses_equal_the_learners():
+    learner = make_learner(CONFIG)
+    plain = plain_ppo.PlainPPO(CONFIG)
     state = jax.jit(learner.init)(jax.random.key(0))
 
     @jax.jit

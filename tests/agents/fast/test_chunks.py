@@ -10,7 +10,8 @@ import pytest
 
 from agents.fast import chunks, grouping
 
-ROWS, WIDTH = 37, 5
+ROWS = 37
+WIDTH = 5
 
 
 @pytest.mark.parametrize("bits", [None, 16, 0])

@@ -95,7 +95,8 @@ def test_every_distinct_observation_is_encoded_once(bits, monkeypatch):
     """Across episodes and times; where hashes collide it may be more often, to the same result."""
     monkeypatch.setattr(distinct, "CACHE_BITS", bits)
     monkeypatch.setattr(distinct, "CHUNK", 4)
-    counts, map_rows = [], chunks.map_rows
+    counts = []
+    map_rows = chunks.map_rows
 
     def counting(fn: Any, chunk: int, params: Any, rows: Any, count: jax.Array) -> Any:
         jax.debug.callback(lambda count: counts.append(int(count)), count)

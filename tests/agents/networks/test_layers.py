@@ -35,11 +35,13 @@ def scales(module: nn.Module, *inputs: Any) -> dict[str, float]:
 
 
 def test_every_layer_has_the_scale_of_the_table_in_agent_md():
-    h, a = jnp.zeros((1, 64)), jnp.zeros((1, 16))
+    h = jnp.zeros((1, 64))
+    a = jnp.zeros((1, 16))
     board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
     core = scales(Core(64, 8), h, h, jnp.zeros((1, 2), jnp.int32), jnp.zeros(1))
     encoder = scales(make_encoder(Config()), board)
-    icm, heads = scales(Models(64), h, h, a), scales(Heads(), h)
+    icm = scales(Models(64), h, h, a)
+    heads = scales(Heads(), h)
     biases = ("bias", "initial")
     for part in (core, encoder, icm, heads):
         for name in [name for name in part if name.endswith(biases)]:
@@ -75,7 +77,7 @@ class Own(nn.Module):
 
 
 @pytest.mark.parametrize("module", [Own(), nn.remat(Own)()])
-def test_only_kernels_of_our_layers_are_drawn_whatever_surrounds_them(module):
+def test_only_kernels_of_our_layers_are_drawn_in_any_module(module):
     params = init_module(module, jax.random.key(0), jnp.ones((1, 3)))["params"]
     np.testing.assert_array_equal(params["scale"], 1)
     assert len(np.unique(params["Dense_0"]["kernel"])) == 12

@@ -74,12 +74,13 @@ def test_objects_beyond_the_sixth_are_left_out():
 
 
 @pytest.mark.parametrize("num_features", [1, 5])
-def test_any_number_of_features_will_do(num_features):
+def test_the_object_encoder_reads_any_number_of_features(num_features):
     config = Config(
         num_features=num_features, encoder="objects", filters=(4, 6), hidden=4, curiosity="none"
     )
     agent = Agent(config)
-    params, encode = jax.jit(agent.init)(jax.random.key(0)), jax.jit(agent.encode)
+    params = jax.jit(agent.init)(jax.random.key(0))
+    encode = jax.jit(agent.encode)
     board = tt.observe(tt.base_state(num_features))[None]
     features = encode(params, board)
     assert features.shape == (1, 12)
@@ -88,7 +89,7 @@ def test_any_number_of_features_will_do(num_features):
     assert (encode(params, moved) != features).any()
 
 
-def test_objects_that_are_not_there_do_not_count(monkeypatch):
+def test_absent_objects_do_not_change_features(monkeypatch):
     """The features of a board do not depend on what the rows of absent objects are filled with."""
     config = Config(
         encoder="objects", object_colors=True, filters=(4, 6), hidden=4, curiosity="none"

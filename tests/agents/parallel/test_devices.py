@@ -35,8 +35,9 @@ def test_devices_that_do_not_divide_the_minibatch_are_refused(twelve_devices, de
         Placement.of(devices, config)
 
 
-def test_one_device_computes_as_it_is_told():
-    alone, x = Placement(), jnp.arange(3)
+def test_one_device_needs_no_mesh_and_leaves_arrays_as_they_are():
+    alone = Placement()
+    x = jnp.arange(3)
     assert alone.shard(print) is print
     assert alone.put(x) is alone.local(x) is x
     for method in (ONE_DEVICE.mean, ONE_DEVICE.part, ONE_DEVICE.gather, ONE_DEVICE.device_key):

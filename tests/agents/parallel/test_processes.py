@@ -13,8 +13,8 @@ from helpers.refusal import refused
 from helpers.small_runs import options, start
 
 
-def own(text):
-    """Output without that of the library that connects processes."""
+def without_gloo(text):
+    """Returns output without the lines of the library that connects processes."""
     return "".join(line for line in text.splitlines(True) if not line.startswith("[Gloo]"))
 
 
@@ -30,7 +30,7 @@ def start_two(tmp_path, iterations):
 
 @pytest.mark.slow
 def test_two_processes_end_together_and_the_first_reports(tmp_path):
-    ended = [(each.communicate(), each.returncode) for each in start_two(tmp_path, 2)]
+    ended = [(process.communicate(), process.returncode) for process in start_two(tmp_path, 2)]
     assert [code for _, code in ended] == [0, 0], ended
     rows = read_rows(tmp_path / "joint" / "evaluations.csv")
     assert rows["task_set"].tolist() == ["base", "p"]
@@ -41,12 +41,13 @@ def test_two_processes_end_together_and_the_first_reports(tmp_path):
 def test_two_processes_stop_together_and_one_continues(tmp_path):
     first, second = start_two(tmp_path, 100_000)
     assert first.stdout is not None
-    while not re.match("iteration 2:", line := first.stdout.readline()):
+    while not re.match("iteration 2 of", line := first.stdout.readline()):
         assert line, first.communicate()
     second.send_signal(signal.SIGTERM)
-    (output, errors), (silence, complaints) = first.communicate(), second.communicate()
+    (output, errors) = first.communicate()
+    (silence, complaints) = second.communicate()
     assert (first.returncode, second.returncode) == (143, 143), errors + complaints
-    assert own(silence + errors + complaints) == ""
+    assert without_gloo(silence + errors + complaints) == ""
     assert "Stopped. Continue with: " in output
 
     folder = tmp_path / "joint"

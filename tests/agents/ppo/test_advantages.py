@@ -24,7 +24,8 @@ def test_the_intrinsic_weight_decays_geometrically():
 
 def plain_advantages(reward, discount, value, mask, lambda_):
     """Generalised advantages, step by step."""
-    found, following = np.zeros_like(reward), 0.0
+    found = np.zeros_like(reward)
+    following = 0.0
     for t in reversed(range(reward.shape[1])):
         delta = mask[:, t] * (reward[:, t] + discount[:, t] * value[:, t + 1] - value[:, t])
         found[:, t] = following = delta + discount[:, t] * lambda_ * following
@@ -37,14 +38,21 @@ def normal(x, mask):
     return mask * x / np.sqrt(np.mean(x[mask > 0] ** 2) + 4e-4)
 
 
-def test_separate_heads_estimate_two_streams_of_rewards():
+def test_separate_heads_estimate_the_advantages_of_both_rewards():
     """Of two episodes one is solved at its third step; the old moments have a variance of 4."""
     config = Config.preset("best")
-    gamma, lambda_, rate = config.discount, config.gae_lambda, config.reward_ema_decay
+    gamma = config.discount
+    lambda_ = config.gae_lambda
+    rate = config.reward_ema_decay
     rng = np.random.default_rng(0)
-    value, novelty = rng.normal(size=(2, 6, 2)), rng.random((2, 5))
-    mask, reward, going_on = np.ones((2, 5)), np.zeros((2, 5)), np.ones((2, 5))
-    mask[0, 3:], reward[0, 2], going_on[0, 2:] = 0, 1, 0
+    value = rng.normal(size=(2, 6, 2))
+    novelty = rng.random((2, 5))
+    mask = np.ones((2, 5))
+    reward = np.zeros((2, 5))
+    going_on = np.ones((2, 5))
+    mask[0, 3:] = 0
+    reward[0, 2] = 1
+    going_on[0, 2:] = 0
     novelty *= mask
 
     task = plain_advantages(reward, gamma * going_on, value[..., 0], mask, lambda_)
@@ -54,13 +62,15 @@ def test_separate_heads_estimate_two_streams_of_rewards():
     variance = rate * 4 + (1 - rate) * returns_to_come[:, :-1][mask > 0].var()
     bootstrapped = value[..., 1].copy()
     bootstrapped[0, 3:] = bootstrapped[:, 5] = bootstrapped[:, 0].mean()
-    paid, discount = 0.3 * novelty / np.sqrt(variance), np.full((2, 5), gamma)
+    paid = 0.3 * novelty / np.sqrt(variance)
+    discount = np.full((2, 5), gamma)
     curiosity = plain_advantages(paid, discount, bootstrapped, mask, lambda_)
 
     arrays = (jnp.array(x, jnp.float32) for x in (reward, going_on, mask))
     zero = jnp.zeros(())
     episodes = Episodes(tt.base_state(), zero, zero, *arrays)  # pyright: ignore
-    old, intrinsic_reward = jnp.full(2, 4.0), jnp.float32(novelty)
+    old = jnp.full(2, 4.0)
+    intrinsic_reward = jnp.float32(novelty)
     moments = advantages.update_variance(config, old, jnp.int32(3), episodes, intrinsic_reward)
     advantage, target = advantages.estimate(
         config, episodes, intrinsic_reward, 0.7, jnp.float32(value), moments
@@ -74,7 +84,7 @@ def test_separate_heads_estimate_two_streams_of_rewards():
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_without_curiosity_the_task_has_the_only_value():
+def test_without_curiosity_separate_heads_are_one():
     config = Config.preset("best", hidden=4, filters=(4, 4), curiosity="none")
     params = jax.eval_shape(make_learner(config).init, jax.random.key(0)).params
     assert params["heads"]["params"]["value"]["kernel"].shape == (4, 1)
@@ -87,9 +97,13 @@ def test_without_curiosity_the_task_has_the_only_value():
 
 
 def test_variances_are_moving_averages():
-    config, rng, variance, expected = Config(), np.random.default_rng(1), jnp.zeros(2), np.zeros(2)
+    config = Config()
+    rng = np.random.default_rng(1)
+    variance = jnp.zeros(2)
+    expected = np.zeros(2)
     for index in range(6):
-        rewards, mask = rng.normal(3, 2, (2, 4, 5)), rng.integers(0, 2, (4, 5))
+        rewards = rng.normal(3, 2, (2, 4, 5))
+        mask = rng.integers(0, 2, (4, 5))
         arrays = (jnp.float32(x) for x in (rewards[0], mask, mask))
         zero = jnp.zeros(())
         episodes = Episodes(tt.base_state(), zero, zero, *arrays)  # pyright: ignore

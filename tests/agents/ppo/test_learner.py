@@ -4,6 +4,7 @@ Play and gradient steps are replaced where they are not tested.
 """
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import flax.linen as nn
@@ -16,6 +17,7 @@ from flax import nnx
 
 import trap_tube_jax as tt
 from agents import Config, make_learner
+from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
 from agents.acting.symmetry import Symmetry
@@ -28,7 +30,7 @@ from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
 from agents.registry import curiosities, encoders
 from helpers.small_runs import SETTINGS
-from helpers.trees import rows
+from helpers.trees import assert_same, rows
 from trap_tube_jax.objects import AGENT
 
 BEST = Config.preset(
@@ -41,7 +43,8 @@ BEST = Config.preset(
     intrinsic_anneal_fraction=0.8,
 )
 PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
-STEPS, EPISODES = 6, 8
+STEPS = 6
+EPISODES = 8
 OWN_COLORS = tt.Environment(base=tt.base_state().replace(palette=255 - tt.base_state().palette))
 
 
@@ -55,8 +58,12 @@ RECOLOURED = tt.Environment((tt.perceptual, recolour))
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
 
+def plus_one(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x + jnp.ones((), x.dtype), tree)
+
+
 class Scripted(Learner):
-    """Plays tasks of known keys, solves those of `SOLVED`, and does not learn."""
+    """Plays tasks of known keys, solves those of `SOLVED`, and adds 1 to all that is learned."""
 
     def draw_tasks(self, task_replay, key):
         return reset_keys()
@@ -80,10 +87,11 @@ class Scripted(Learner):
         return Trajectory(symmetry, episodes, jnp.zeros(shape), value)
 
     def intrinsic_reward(self, state, trajectory):
-        return jax.random.uniform(jax.random.key(4), (EPISODES, STEPS)), state.memory
+        return jax.random.uniform(jax.random.key(4), (EPISODES, STEPS)), plus_one(state.memory)
 
     def update(self, state, batch, key):
-        return state.params, state.opt_state, {"advantage": batch.advantage}
+        metrics = {"advantage": batch.advantage}
+        return plus_one(state.params), plus_one(state.opt_state), metrics
 
 
 def reset_keys() -> jax.Array:
@@ -107,17 +115,24 @@ def scripted() -> tuple[Learner, TrainState, Any]:
     return scripted, scripted.init(jax.random.key(0)), jax.jit(iterate)
 
 
-def test_new_tasks_are_new_and_others_are_of_the_lists():
+def by_plain_path(config: Config) -> Learner:
+    """Makes a learner that compiles sooner than one of the fast path."""
+    made = make_learner(config)
+    return dataclasses.replace(made, encoding=Encoding(made.agent, made.curiosity.encode))
+
+
+def test_replayed_tasks_are_of_their_list_and_the_others_new():
     best = make_learner(BEST)
     task_replay = best.init(jax.random.key(0)).task_replay
     drawn = data(best.draw_tasks(task_replay, jax.random.key(1)))
-    once, twice = data(task_replay.keys[0]), data(task_replay.keys[1])
+    once = data(task_replay.keys[0])
+    twice = data(task_replay.keys[1])
     assert len(set(drawn[:4]) - {*once, *twice}) == 4
     assert set(drawn[4:6]) <= set(once)
     assert set(drawn[6:]) <= set(twice)
 
 
-def test_an_iteration_remembers_failed_tasks_and_counts_what_was_played(scripted):
+def test_an_iteration_remembers_failed_tasks_and_counts_successes_and_steps(scripted):
     """Success is that on new tasks."""
     _, state, iterate = scripted
     after, metrics = iterate(state)
@@ -132,8 +147,30 @@ def test_an_iteration_remembers_failed_tasks_and_counts_what_was_played(scripted
     assert (int(after.iteration), int(after.transitions)) == (2, 2 * EPISODES * STEPS)
 
 
+def test_the_next_iteration_gets_what_this_one_has_learned(scripted):
+    """Variances move by a tenth, after an iteration in which they were 4 and 9."""
+    _, state, iterate = scripted
+    first, _ = iterate(state)
+    later, _ = iterate(
+        state._replace(iteration=jnp.int32(1), reward_variance=jnp.array([4.0, 9.0]))
+    )
+    expected = 0.9 * np.array([4, 9]) + 0.1 * np.asarray(first.reward_variance)
+    np.testing.assert_allclose(later.reward_variance, expected, rtol=1e-5)
+    for name in ("params", "opt_state", "memory"):
+        assert_same(getattr(first, name), plus_one(getattr(state, name)))
+
+
+def test_metrics_of_play_are_means_over_episodes_and_over_steps_taken():
+    nothing: Any = None
+    mask = jnp.array([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    episodes = Episodes(nothing, nothing, nothing, nothing, nothing, mask)
+    reward = jnp.array([[1.0, 3.0, 0.0], [2.0, 0.0, 0.0]])
+    metrics = make_learner(PLAIN).play_metrics(episodes, reward, jnp.array([True, False]))
+    assert metrics == {"episode_length": 1.5, "intrinsic_reward": 2, "success": 0.5}
+
+
 @pytest.mark.parametrize(("iteration", "coef"), [(0, 3.0), (4, 0.3), (8, 0.03), (9, 0.03)])
-def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, coef):
+def test_the_intrinsic_coefficient_is_the_iterations(scripted, iteration, coef):
     scripted, state, iterate = scripted
     _, metrics = iterate(state._replace(iteration=jnp.int32(iteration)))
     trajectory = scripted.play(None, reset_keys(), None)
@@ -151,7 +188,7 @@ def test_the_weight_of_curiosity_is_that_of_the_iteration(scripted, iteration, c
 
 def test_episodes_are_played_facing_the_food():
     keys = jax.random.split(jax.random.key(1), 64)
-    best = make_learner(BEST)
+    best = by_plain_path(BEST)
     params = jax.eval_shape(best.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
     played = jax.jit(best.play)(params, keys, jax.random.key(2))
@@ -162,47 +199,50 @@ def test_episodes_are_played_facing_the_food():
 
 
 def recorder(updates: int) -> optax.GradientTransformation:
-    """Plain gradient descent, whose state holds all gradients [updates, EPISODES]."""
+    """Gradient descent of rate 0.5, whose state holds all gradients [updates, EPISODES]."""
 
     def init(params: Any) -> Any:
         return jnp.zeros((), jnp.int32), jnp.zeros((updates, *params.shape))
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
         count, seen = state
-        return -updates, (count + 1, seen.at[count].set(updates))
+        return -0.5 * updates, (count + 1, seen.at[count].set(updates))
 
     return optax.GradientTransformation(init, update)
 
 
 class Counting(Learner):
-    """Its gradient is 1 at the episodes of the minibatch."""
+    """Its gradient is 1 at the episodes of the minibatch, and its metric their mean number."""
 
     def loss(self, params: Any, batch: Any):
-        return jnp.sum(params[batch.log_prob]), {}
+        return jnp.sum(params[batch.log_prob]), {"number": jnp.mean(batch.log_prob)}
 
 
-def test_every_epoch_takes_every_episode_once_and_in_an_order_of_its_own():
+def test_every_epoch_takes_every_episode_once_in_a_new_order():
+    """The metrics are means over all gradient steps."""
     updates = BEST.gradient_steps
     counting = Counting(**{**vars(make_learner(BEST)), "optimizer": recorder(updates)})
     params = jnp.zeros(EPISODES)
     state = TrainState(params, counting.optimizer.init(params), *[None] * 6)  # pyright: ignore
     index: Any = jnp.arange(EPISODES)
     batch = learner.Batch(*[index] * 4)
-    after, (count, seen), _ = counting.update(state, batch, jax.random.key(0))
+    after, (count, seen), metrics = counting.update(state, batch, jax.random.key(0))
     assert count == updates == 3 * 2
-    np.testing.assert_array_equal(after, -3)
+    np.testing.assert_array_equal(after, -1.5)
     epochs = np.asarray(seen).reshape(3, 2, EPISODES)
     np.testing.assert_array_equal(epochs.sum(axis=2), 4)
     np.testing.assert_array_equal(epochs.sum(axis=1), 1)
     assert len({epoch[0].tobytes() for epoch in epochs}) > 1
+    assert metrics == {"number": 3.5, "gradient_norm": 2}
 
 
 @pytest.mark.slow
-def test_seeds_side_by_side_are_those_alone():
+def test_seeds_trained_by_vmap_equal_seeds_trained_alone():
     """With the cache of encodings and the loops of the real rollout; up to rounding."""
     plain = make_learner(dataclasses.replace(PLAIN, env_id="sy"))
     both = jax.vmap(plain.init)(jax.vmap(jax.random.key)(jnp.array([3, 4])))
-    together, alone = jax.jit(jax.vmap(plain.iterate))(both), jax.jit(plain.iterate)
+    together = jax.jit(jax.vmap(plain.iterate))(both)
+    alone = jax.jit(plain.iterate)
     for seed in range(2):
         expected = to_arrays(alone(rows(both, seed)))
         got = to_arrays(rows(together, seed))
@@ -212,7 +252,7 @@ def test_seeds_side_by_side_are_those_alone():
 
 
 def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key():
-    best = make_learner(dataclasses.replace(BEST, epochs=1))
+    best = by_plain_path(dataclasses.replace(BEST, epochs=1))
     state = jax.jit(best.init)(jax.random.key(0))
     assert state.params["heads"]["params"]["value"]["kernel"].shape == (4, 2)
     iterate = jax.jit(best.iterate)
@@ -220,7 +260,8 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
         after, metrics = iterate(state)
         iterate(after)
     assert all(np.isfinite(float(value)) for value in metrics.values())
-    before, after = to_arrays(state.params), to_arrays(after.params)
+    before = to_arrays(state.params)
+    after = to_arrays(after.params)
     same = [name for name in before if np.array_equal(before[name], after[name])]
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
 
@@ -245,7 +286,8 @@ class Known(Learner):
     """Has seen an episode of two steps, of which the second is padding."""
 
     def experience(self, params, episodes):
-        hidden, width = self.config.hidden, 2 * self.config.embedding
+        hidden = self.config.hidden
+        width = 2 * self.config.embedding
         outputs = (jnp.zeros((1, 2, hidden)), None, jnp.zeros((1, 2, width)))
         return Experience(episodes, jnp.zeros((1, 3, 0)), *outputs)
 
@@ -258,12 +300,14 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     custom = Returning(losses={"own_loss": jnp.ones((1, 2))})
     params = jax.eval_shape(made.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), params)
-    mask, cells = jnp.array([[1.0, 0.0]]), jnp.zeros((1, 3, 3, 2), jnp.uint8)
+    mask = jnp.array([[1.0, 0.0]])
+    cells = jnp.zeros((1, 3, 3, 2), jnp.uint8)
     episodes = Episodes(tt.base_state(), cells, jnp.zeros((1, 2, 2), jnp.int32), *[mask] * 3)
     old = jnp.full((1, 2), -2 * np.log(4) - np.log(1.5), jnp.float32)  # clipped to 1.2
     target = jnp.array([[[3.0, 4.0], [9.0, 9.0]]])
     batch = learner.Batch(episodes, old, jnp.array([[2.0, 9.0]]), target)
-    total, found = Known(**{**vars(made), "curiosity": custom}).loss(params, batch)
+    known = Known(**{**vars(made), "curiosity": custom})
+    total, found = known.loss(params, batch)
     expected = {
         "policy_loss": -1.2 * 2 / 2,
         "value_loss": 0.5 * (9 + 16) / 2,
@@ -274,7 +318,10 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     for name, value in expected.items():
         np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
     np.testing.assert_allclose(total, sum(expected.values()), rtol=1e-5)
-    np.testing.assert_allclose(found["entropy"], 2 * np.log(4), rtol=1e-6)
+    assert found["entropy"] == pytest.approx(2 * np.log(4))
+    both_taken = batch._replace(episodes=episodes._replace(mask=jnp.ones((1, 2))))
+    _, found = known.loss(params, both_taken)
+    assert found["entropy"] == pytest.approx(2 * np.log(4)), "a mean over steps taken"
 
 
 @pytest.fixture
@@ -288,14 +335,26 @@ def with_curiosity(monkeypatch):
     return build
 
 
+def test_an_intrinsic_reward_is_zero_after_the_end_of_an_episode(with_curiosity):
+    nothing: Any = None
+    learner = Known(**vars(with_curiosity(Returning(reward=jnp.ones((1, 2))))))
+    mask = jnp.array([[1.0, 0.0]])
+    episodes = Episodes(nothing, nothing, nothing, nothing, nothing, mask)
+    state: Any = SimpleNamespace(params={"curiosity": {}}, memory=jnp.int32(7))
+    trajectory = Trajectory(nothing, episodes, nothing, nothing)
+    reward, memory = learner.intrinsic_reward(state, trajectory)
+    np.testing.assert_array_equal(reward, [[1, 0]])
+    assert memory == 7
+
+
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
         ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(2, 6\)"),
         ({"reward": jnp.zeros((2, 6), jnp.int32)}, "'none' .*int32 != float32"),
         ({"given": jnp.zeros(2, jnp.int32)}, r"'none' .*\(2,\) != \(\)"),
-        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got 'policy_loss'"),
-        ({"losses": ["mine"]}, "'none': .* entropy_loss; got 'mine'"),
+        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got policy_loss"),
+        ({"losses": ["mine"]}, "'none' .* motion_loss; got mine"),
         ({"losses": {"my_loss": jnp.ones(3)}}, r"'none' .*\(3,\)"),
     ],
 )

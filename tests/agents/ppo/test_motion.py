@@ -14,17 +14,19 @@ AFTER = [[4, 3], [5, 5], [7, 8]]
 CELLS = jnp.array([[[[3, 3], [5, 5], [7, 7]], AFTER, AFTER]], jnp.uint8)
 
 
-def test_motion_is_a_change_of_row_or_column():
+def test_the_motion_loss_is_a_cross_entropy_of_changed_rows_and_columns():
     moving = [[9.0, -9.0], [-9.0, -9.0], [-9.0, 9.0]]
     confident = jnp.array([[moving, [[-9.0, -9.0]] * 3]])
-    right, wrong = motion_loss(confident, CELLS), motion_loss(-confident, CELLS)
+    right = motion_loss(confident, CELLS)
+    wrong = motion_loss(-confident, CELLS)
     np.testing.assert_allclose(motion_loss(0 * confident, CELLS), [[6 * np.log(2)] * 2], rtol=1e-6)
     np.testing.assert_allclose(right, [[6 * np.log1p(np.exp(-9))] * 2], rtol=1e-3)
     np.testing.assert_allclose(wrong - right, [[6 * 9] * 2], rtol=1e-6)
 
 
 def test_the_head_reads_embedding_and_action_of_a_step():
-    embedding, action = jnp.ones((2, 4, 5)), jnp.ones((2, 4, 3))
+    embedding = jnp.ones((2, 4, 5))
+    action = jnp.ones((2, 4, 3))
     head: Any = MotionHead()
     params = init_module(head, jax.random.key(0), embedding, action)
     logits = head.apply(params, embedding, action)

@@ -35,7 +35,8 @@ def test_adam_takes_the_learning_rate_schedule_of_its_count():
     """With a constant gradient each step is as long as the schedule says."""
     optimizer = adam(lambda count: jnp.where(jnp.equal(count, 0), 0.1, 0.01), epsilon=0.0)
     params = jnp.zeros(3)
-    state, steps = optimizer.init(params), []
+    state = optimizer.init(params)
+    steps = []
     for _ in range(2):
         step, state = optimizer.update(jnp.full(3, 2.0), state, params)
         steps.append(step)

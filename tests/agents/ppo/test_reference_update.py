@@ -33,8 +33,7 @@ def ours(recording: Recording) -> dict[str, Any]:
     def run(params):
         trajectory = make_trajectory(learner.agent, params, recording)
         experience = learner.experience(params, trajectory.episodes)
-        assert isinstance(learner.curiosity, ICM)
-        prediction = learner.curiosity.predict(params["curiosity"], experience)
+        prediction = ICM(CONFIG).predict(params["curiosity"], experience)
         before = state._replace(params=params)
         raw, _ = learner.intrinsic_reward(before, trajectory)
         batch, moments = learner.make_batch(before, trajectory, raw)
@@ -46,7 +45,8 @@ def ours(recording: Recording) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
-    learner, batch = ours["learner"], ours["batch"]
+    learner = ours["learner"]
+    batch = ours["batch"]
 
     @jax.jit
     def update(params, opt_state):
@@ -55,7 +55,9 @@ def updates(ours: dict[str, Any]) -> list[dict[str, Any]]:
         params = optax.apply_updates(params, step)
         return params, opt_state, {**terms, "gradient_norm": optax.tree.norm(gradient)}
 
-    params, opt_state, done = ours["params"], jax.jit(learner.optimizer.init)(ours["params"]), []
+    params = ours["params"]
+    opt_state = jax.jit(learner.optimizer.init)(ours["params"])
+    done = []
     for _ in range(5):
         params, opt_state, terms = update(params, opt_state)
         done.append({"params": params, "moment": opt_state[1].mu, "terms": terms})
@@ -66,7 +68,8 @@ def assert_close(actual: Any, expected: Any) -> None:
     """Leaves are equal within 1e-4 of the largest magnitude of the expected one."""
     leaves = jax.tree_util.tree_leaves_with_path(expected)
     for (path, want), got in zip(leaves, jax.tree.leaves(actual), strict=True):
-        scale, name = np.abs(want).max(), jax.tree_util.keystr(path)
+        scale = np.abs(want).max()
+        name = jax.tree_util.keystr(path)
         np.testing.assert_allclose(
             np.asarray(got) / scale, np.asarray(want) / scale, rtol=0, atol=1e-4, err_msg=name
         )
@@ -82,7 +85,8 @@ def test_replayed_boards_are_the_recorded_ones(recording, ours):
 
 
 def test_network_outputs_equal_the_recorded_ones(recording, ours):
-    trajectory, (error, inferred) = ours["trajectory"], ours["prediction"]
+    trajectory = ours["trajectory"]
+    (error, inferred) = ours["prediction"]
     embedding = ours["experience"].embedding
     actions, _ = ours["learner"].agent.policy_and_value(ours["params"], embedding)
     assert_close(embedding, recording["out/embedding"])
@@ -112,7 +116,8 @@ def test_rewards_and_targets_equal_the_recorded_ones(recording, ours):
 
 @pytest.mark.parametrize("index", range(5))
 def test_loss_terms_and_gradient_norm_equal_the_recorded_ones(recording, updates, index):
-    terms, prefix = updates[index]["terms"], f"update{index + 1}"
+    terms = updates[index]["terms"]
+    prefix = f"update{index + 1}"
     expected = {
         "value_loss": recording[f"{prefix}/loss/value"],
         "entropy_loss": recording[f"{prefix}/loss/entropy"],

@@ -11,10 +11,12 @@ from agents.acting.episodes import Episodes
 from agents.config import Config
 from agents.ppo import advantages, returns
 
-CASES, STEPS = 1_000, 23
+CASES = 1_000
+STEPS = 23
 
 
-TERMINATED, TRUNCATED = ([1, 0, 0], [1, 1, 0]), ([1, 1, 1], [1, 1, 1])  # discount and mask
+TERMINATED = ([1, 0, 0], [1, 1, 0])
+TRUNCATED = ([1, 1, 1], [1, 1, 1])
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import pytest
 from agents.ppo.task_replay import TaskReplay
 from helpers.trees import bits
 
-LISTS, CAPACITY = 2, 5
+LISTS = 2
+CAPACITY = 5
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def test_of_more_failures_than_fit_the_last_are_kept(replay):
 @pytest.mark.parametrize(
     "key", [jax.random.key(0, impl="rbg"), jax.random.PRNGKey(0)], ids=["rbg", "raw"]
 )
-def test_keys_of_any_kind_are_remembered(key):
+def test_task_replay_remembers_keys_of_any_kind(key):
     replay = TaskReplay.untried(jax.random.clone(key), LISTS, CAPACITY)
     drawn = replay.draw(jax.random.clone(key), (2, 2))
     after = replay.remember(drawn, jnp.ones(4, bool), (2, 2))
@@ -46,7 +47,7 @@ def test_keys_of_any_kind_are_remembered(key):
     np.testing.assert_array_equal(bits(after.keys)[1, :2], bits(drawn)[:2])
 
 
-def test_all_that_is_remembered_is_drawn_in_its_place(replay):
+def test_tasks_are_drawn_from_all_of_their_list_and_no_other(replay):
     drawn = bits(replay.draw(jax.random.key(1), (300, 200)))
     for part, keys in zip((drawn[:300], drawn[300:]), bits(replay.keys), strict=True):
         assert {tuple(key) for key in part} == {tuple(key) for key in keys}

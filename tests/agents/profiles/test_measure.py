@@ -58,7 +58,7 @@ def test_each_episode_is_solved_or_failed_after_one_last_subgoal(measured):
     assert (measured["solved"] <= measured["solved_100"]).all()
 
 
-def test_means_are_of_the_solved_tasks(measured):
+def test_means_are_over_solved_tasks(measured):
     base = row(measured, "structural", "0")
     assert base["optimality"] == pytest.approx(11 / base["steps"])
     failed = row(measured, "control", "food-outside, near")
@@ -112,7 +112,8 @@ def test_a_push_against_the_planned_direction_is_not_direct():
 
 def test_episodes_are_grouped_by_plan_length_and_by_first_push():
     table = pd.DataFrame({"plan": [11.0, 9.0, 10.0], "choice": [0, -1, 1]})
-    lengths, pushes = plan_lengths(table), first_pushes(table)
+    lengths = plan_lengths(table)
+    pushes = first_pushes(table)
     assert list(lengths) == ["10-14", "5-9", "10-14"]
     assert list(lengths.categories) == ["5-9", "10-14"]
     assert list(pushes) == ["no choice", "away from it", "to the exit"]

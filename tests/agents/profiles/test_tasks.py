@@ -58,6 +58,6 @@ def test_controls_have_the_layouts_of_the_registered_sets_in_base_colours():
         (trap_exchanged()[0], (7, 11), (1, 4), "away, along"),
     ],
 )
-def test_kinds_of_layouts(state, agent, extent, kind):
+def test_layouts_are_grouped_by_push_and_tool_direction(state, agent, extent, kind):
     state = state.replace(agent=jnp.array(agent), tool_extent=jnp.array(extent))
     assert layout_kinds(jax.tree.map(lambda x: x[None], state)) == [kind]

@@ -29,7 +29,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "checkpoints"
 
 
-def test_the_newest_are_kept_and_come_back(folder):
+def test_the_newest_checkpoints_are_kept_and_read_back(folder):
     assert checkpoint.iterations(folder) == [3, 4]
     for iteration, expected in ((None, 4), (3, 3), (4, 4)):
         arrays, record = checkpoint.load(folder, iteration)
@@ -39,7 +39,7 @@ def test_the_newest_are_kept_and_come_back(folder):
         checkpoint.load(folder, 7)
 
 
-def test_reading_makes_nothing(tmp_path):
+def test_reading_creates_no_file(tmp_path):
     for folder in (tmp_path, tmp_path / "none"):
         with pytest.raises(ValueError, match=r"holds no checkpoint$"):
             checkpoint.load(folder)

@@ -10,6 +10,8 @@ import pytest
 import trap_tube_jax as tt
 from agents import Config, make_learner
 from agents.acting.evaluation import Evaluation
+from agents.networks.actions import ActionDistribution
+from agents.networks.agent import Agent
 from agents.ppo.learner import Learner
 from agents.runs.evaluator import Evaluator, default_sets
 from helpers.tiny_policy import CONFIG, STEPS, food_next_to_agent, random_params
@@ -32,7 +34,7 @@ def played() -> Played:
     return evaluator, params, evaluator(params)
 
 
-def test_tasks_of_your_own_are_scored(played):
+def test_custom_tasks_are_scored(played):
     evaluator, _, outcomes = played
     assert outcomes["mine"].solved.any()
     assert 1 in outcomes["mine"].length[outcomes["mine"].solved]
@@ -41,13 +43,13 @@ def test_tasks_of_your_own_are_scored(played):
     assert (by_set["mine"].interval is None, by_set["base"].interval is None) == (False, True)
 
 
-def test_playing_in_blocks_changes_nothing(played, monkeypatch):
+def test_play_does_not_depend_on_the_size_of_blocks(played, monkeypatch):
     evaluator, params, outcomes = played
     monkeypatch.setattr(suite, "BLOCK", 3)
     assert_same(Evaluator(CONFIG, evaluator.suite)(params), outcomes)
 
 
-def test_each_sets_limit_holds(played):
+def test_episodes_beyond_the_step_limit_of_their_set_are_not_solved(played):
     """With limits of 1 and 12, tasks that took longer than 1 are not solved."""
     evaluator, params, outcomes = played
     mine = outcomes["mine"]
@@ -62,11 +64,16 @@ def test_each_sets_limit_holds(played):
     np.testing.assert_array_equal(found["one"].length, 1)
 
 
-def test_a_limit_of_training_does_not_change_the_protocol(own_task_sets):
+def test_a_limit_of_training_does_not_change_the_protocol(fresh_task_sets):
     tt.register("Own-v0", (), short="own", max_steps=6)
     for max_steps in (1, 500):
         evaluator = Evaluator.of_sets(Config(max_steps=max_steps), ["pst", "own"], 2)
         assert evaluator.suite.max_steps == {"pst": 50, "own": 6}
+
+
+def test_tasks_have_the_feature_channels_that_the_policy_reads():
+    evaluator = Evaluator.of_sets(Config(num_features=5), ["p"], 2)
+    assert evaluator.tasks["p"].palette.shape == (2, 8, 5)
 
 
 def test_scores_use_the_papers_notation():
@@ -78,22 +85,33 @@ def test_scores_use_the_papers_notation():
     assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)
 
 
-def test_a_set_of_your_own_is_evaluated_after_the_papers(own_task_sets):
+def test_a_custom_training_set_is_evaluated_after_the_papers(fresh_task_sets):
     tt.register("Own-v0", (), short="own")
     papers = tuple(entry.short for entry in PAPER_TASK_SETS)
     assert default_sets(Config(env_id="own")) == (*papers, "own")
     assert default_sets(Config(env_id="pst")) == papers
 
 
-def test_values_of_states_are_of_the_extrinsic_head():
-    """Of two heads that always value states 5 and -7."""
+def test_values_are_of_the_extrinsic_head_before_each_step(monkeypatch):
+    """The heads value a state by the steps taken so far, and by -7."""
+
+    def count(agent, params, state, features, action_tm1, reward_tm1):
+        return state + 1
+
+    def policy_and_value(agent, params, state):
+        time = state[:, :1]
+        actions = ActionDistribution(jnp.zeros((len(state), 2, 4)))
+        return actions, jnp.concatenate([time, jnp.full_like(time, -7.0)], axis=1)
+
+    monkeypatch.setattr(Agent, "step", count)
+    monkeypatch.setattr(Agent, "policy_and_value", policy_and_value)
     settings = {"curiosity": "effects", "value_heads": "separate", "bootstrap": "value"}
     config = Config.from_dict({**CONFIG.to_dict(), **settings})
-    params = random_params(config)
-    head = params["heads"]["params"]["value"]
-    head |= {"kernel": 0 * head["kernel"], "bias": jnp.array([5.0, -7.0])}
     suite = Suite({"mine": food_next_to_agent()}, {"mine": STEPS})
-    np.testing.assert_array_equal(Evaluator(config, suite)(params)["mine"].value, 5)
+    params = random_params(config)
+    params["core"]["params"]["initial"] = jnp.zeros(config.hidden)
+    found = Evaluator(config, suite)(params)["mine"].value
+    np.testing.assert_array_equal(found, [range(1, STEPS + 1)] * 4)
 
 
 def test_unknown_sets_are_refused():

@@ -134,12 +134,21 @@ PRESETS_OF = {
     "icm-base": ("paper", {"stop_when_solved": 1.0}),
     "best-pstsy": ("best", {}),
     "colors-p+pstsy": ("best", {"object_colors": True}),
+    "colors-p+psy+pstsy": (
+        "best",
+        {
+            "object_colors": True,
+            "max_steps": 40,
+            "replay_fractions": (0.0625, 0.125, 0.5),
+        },
+    ),
 }
 
 
 @pytest.mark.parametrize("name", pretrained.names())
 def test_shipped_agents_have_the_presets_of_today_and_solve_their_tasks(name):
-    policy, (preset, changes) = agents.load(name), PRESETS_OF[name]
+    policy = agents.load(name)
+    (preset, changes) = PRESETS_OF[name]
     train_set = tt.task_set(policy.config.env_id)
     assert policy.config == Config.preset(preset, **changes, env_id=train_set.id)
     assert tt.score(policy, [train_set.short], tasks=32)[train_set.short].percent > 85

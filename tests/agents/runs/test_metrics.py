@@ -69,8 +69,17 @@ def test_other_columns_are_refused(tmp_path):
         rewind_rows(path, 3)
 
 
-def test_a_score_is_a_row():
-    solved, layout = np.array([True, True, False]), np.array([0, 0, 1])
+def test_a_row_of_another_length_is_named_by_its_number(tmp_path):
+    path = tmp_path / "metrics.csv"
+    append_rows(path, [row(1)])
+    path.write_text(path.read_text() + "2,0.5\n3,0.5\n")
+    with pytest.raises(ValueError, match=r"metrics.csv .*row 2 has 2 values for 5 columns"):
+        read_rows(path)
+
+
+def test_an_evaluation_row_holds_the_counts_of_a_score():
+    solved = np.array([True, True, False])
+    layout = np.array([0, 0, 1])
     few = Score.of("sy", "{Sy}", solved, np.array([3, 6, 50]), layout=layout)
     none = Score.of("p", "{P}", np.zeros(4, bool), np.full(4, 50))
     policy: Any = SimpleNamespace(iteration=7)
@@ -93,6 +102,6 @@ def test_a_score_is_a_row():
         ({"max_transitions": 600}, {"transitions": 201}, True),
     ],
 )
-def test_the_last_iteration_is_known(settings, values, expected):
+def test_training_ends_at_the_first_limit_that_is_reached(settings, values, expected):
     config = Config(episodes_per_iteration=8, minibatch_size=8, **settings)
     assert is_last(row(4, **values), config) == expected

@@ -54,7 +54,8 @@ def page(played, tmp_path_factory):
     append_rows(folder.metrics, [row(1), row(2, policy_loss=0.5)])
     note_provenance(folder.provenance, "cpu")
     report.write(folder, Run(CONFIG), evaluator, outcome)
-    start, end = '<script type="application/json" id="data">', "</script>"
+    start = '<script type="application/json" id="data">'
+    end = "</script>"
     return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
 
 
@@ -71,27 +72,27 @@ def test_a_page_needs_no_network_and_holds_the_settings(page):
 def test_a_page_shows_solved_and_unsolved_episodes(played, page):
     outcome = played[1]["mine"]
     solved, unsolved = (int(np.argmax(outcome.solved == which)) for which in (True, False))
-    mine = [each for each in page[1] if each["title"].startswith("mine")]
-    assert [each["title"] for each in mine] == [
+    mine = [episode for episode in page[1] if episode["title"].startswith("mine")]
+    assert [episode["title"] for episode in mine] == [
         f"mine, task {solved}: solved",
         f"mine, task {unsolved}: not solved",
     ]
-    for index, each in zip((solved, unsolved), mine, strict=True):
+    for index, episode in zip((solved, unsolved), mine, strict=True):
         length = outcome.length[index]
-        assert len(each["agent"]["frames"]) == length + 1
-        assert len(each["agent"]["actions"]) == length
-        np.testing.assert_allclose(each["values"], outcome.value[index, :length], atol=1e-4)
-        for frame in each["agent"]["frames"]:
+        assert len(episode["agent"]["frames"]) == length + 1
+        assert len(episode["agent"]["actions"]) == length
+        np.testing.assert_allclose(episode["values"], outcome.value[index, :length], atol=1e-4)
+        for frame in episode["agent"]["frames"]:
             with Image.open(io.BytesIO(base64.b64decode(frame))) as picture:
                 assert picture.size == (192, 192)
 
 
 def test_a_page_shows_shortest_plans(played, page):
     """From the same board as the episode, and with as many steps as are needed."""
-    for each in page[1]:
-        name, _, number = each["title"].partition(":")[0].partition(", task ")
+    for episode in page[1]:
+        name, _, number = episode["title"].partition(":")[0].partition(", task ")
         steps = {"base": 11, "mine": 1}.get(name)
-        plan = each["plan"]
+        plan = episode["plan"]
         assert len(plan["frames"]) == len(plan["actions"]) + 1
         if steps is not None:
             assert len(plan["actions"]) == steps
@@ -102,8 +103,7 @@ def test_a_page_shows_shortest_plans(played, page):
         assert plan["frames"][0] == report._png(shown)
 
 
-def test_curves_of_a_run_that_solves_nothing_say_so():
-    """As many panels as if it did."""
+def test_curves_have_as_many_panels_where_nothing_is_solved():
     heights = []
     for share in (0.0, 0.5):
         rows = pd.DataFrame([row(i, success=share, validation_success=share) for i in (1, 2)])
@@ -162,9 +162,17 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
         for iteration in (1, 2):
             progress.show(row(iteration))
     text = file.getvalue()
-    assert "16 episodes, 25.0% solved, 50.0% greedily, 6,000 steps/s" in text
-    assert ("iteration 2: " in text) != is_terminal
+    assert "25.0% solved, 50.0% greedily, 16 episodes, 6,000 steps/s" in text
+    assert ("iteration 2 of 5: " in text) != is_terminal
     assert ("2/5" in text) == is_terminal
+
+
+def test_a_narrow_terminal_shows_total_time_left_and_success():
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
+    with display.TrainingLine(console, 1150) as progress, console.capture() as shown:
+        numbers = {"success": 1.0, "validation_success": 1.0, "episodes": 1_177_600}
+        progress.show(row(1149, **numbers))
+    assert re.search(r"1149/1150 .* left, 100.0% solved, 100.0% greedily, ", shown.get())
 
 
 @pytest.mark.parametrize(
@@ -177,7 +185,8 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
     ],
 )
 def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
-    run, folder = Run(small_config(iterations=7, **settings)), RunFolder(tmp_path)
+    run = Run(small_config(iterations=7, **settings))
+    folder = RunFolder(tmp_path)
     solved = [row(2, validation_success=1.0, episodes=episodes)] if episodes else []
     rows = [row(1), *solved, row(3, validation_success=1.0, episodes=9999)] if solved else [row(1)]
     append_rows(folder.metrics, rows)
@@ -190,7 +199,8 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
 
 
 def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
-    run, folder = Run(small_config(stop_when_solved=0.995)), RunFolder(tmp_path)
+    run = Run(small_config(stop_when_solved=0.995))
+    folder = RunFolder(tmp_path)
     append_rows(folder.metrics, [row(1, validation_success=0.996)])
     solved = "First solved 99.5 % of base after 8 episodes; --stop-when-solved 0 trains on."
     assert display.summary(folder, run)[0] == solved

@@ -15,10 +15,12 @@ import pytest
 from rich.console import Console
 
 import agents
+import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.arrays import read_arrays, write_arrays
 from agents.ppo.learner import Learner
 from agents.runs import checkpoint, history, program, progress, session
+from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
@@ -27,6 +29,7 @@ from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run, train_runs
 from helpers.small_runs import final_state, small_config, untimed
+from helpers.trees import assert_same
 from trap_tube_jax.interruptions import Stopped
 from trap_tube_jax.scoring import suite
 from trap_tube_jax.scoring.scores import Scores
@@ -34,7 +37,7 @@ from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks
 
 ITERATIONS = 6
 TRACKED = RunOptions(
-    checkpoint_every=2, evaluate_every=2, sets=("base", "p"), test_tasks=3, report=False
+    checkpoint_every=3, evaluate_every=2, sets=("base", "p"), test_tasks=3, report=False
 )
 PLAIN = RunOptions(checkpoint_every=2, sets=("base",), report=False)
 ASKED: list[tuple[str, str]] = []  # sets and purposes of the tasks that `whole` has drawn
@@ -45,8 +48,11 @@ def small_run(iterations=ITERATIONS, **values):
     return Run(small_config(iterations=iterations, motion_coef=0.5, **replay), **values)
 
 
-def replace_training(monkeypatch, change):
-    """Makes an iteration count and set its metrics to 0, then `change` what it returns."""
+def replace_training(monkeypatch, change, evaluate=None):
+    """Makes an iteration count and set its metrics to 0, then `change` what it returns.
+
+    Validation tasks are played by `evaluate`, or not solved.
+    """
     iterate = Learner.iterate
 
     def count(self, state):
@@ -54,7 +60,20 @@ def replace_training(monkeypatch, change):
         metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
         return change(state._replace(iteration=state.iteration + 1), metrics)
 
+    def fail(*_):
+        return outcome(jnp.array([False]))
+
     monkeypatch.setattr(Learner, "iterate", count)
+    monkeypatch.setattr(program, "evaluate", evaluate or fail)
+
+
+def outcome(solved):
+    return Evaluation(solved, *jnp.ones((3, len(solved))))
+
+
+def count_up(state, metrics):
+    """Adds 1 to all parameters."""
+    return state._replace(params=jax.tree.map(lambda x: x + 1, state.params)), metrics
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +86,7 @@ def whole(tmp_path_factory):
         return evaluation_tasks(name, number, features, purpose)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (suite, program):
+        for module in (suite, tt):
             patch.setattr(module, "evaluation_tasks", record)
         train_run(path, small_run(), TRACKED)
     return path
@@ -78,7 +97,7 @@ def copy(whole, tmp_path):
     return shutil.copytree(whole, tmp_path / "copy")
 
 
-def test_a_run_leaves_its_rows(whole):
+def test_a_run_writes_metrics_and_evaluations(whole):
     rows = untimed(whole)
     assert [row["iteration"] for row in rows] == [str(n + 1) for n in range(ITERATIONS)]
     assert [row["episodes"] for row in rows] == [str(8 * n + 8) for n in range(ITERATIONS)]
@@ -115,12 +134,13 @@ def test_results_are_a_tidy_table(whole, tmp_path):
 
 
 def test_stopped_runs_continue_to_the_same_bits(whole, tmp_path, monkeypatch):
-    """Stopped between two checkpoints; the rows and the best parameters are the same, too."""
-    path, record = tmp_path / "stopped", Progress.record
+    """Stopped two iterations and an evaluation after a checkpoint."""
+    path = tmp_path / "stopped"
+    record = Progress.record
 
     def stop(self, metrics, seconds):
         record(self, metrics, seconds)
-        if self.iteration == 3:
+        if self.iteration == 5:
             raise Stopped(2)
 
     monkeypatch.setattr(Progress, "record", stop)
@@ -141,7 +161,8 @@ def _raise(error):
 
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(program, "make_advance", None)
-    before, output = (copy / "evaluations.csv").read_bytes(), io.StringIO()
+    before = (copy / "evaluations.csv").read_bytes()
+    output = io.StringIO()
     more = dataclasses.replace(TRACKED, test_tasks=9)
     assert train_run(copy, small_run(), more, console=Console(file=output)) is None
     assert (copy / "evaluations.csv").read_bytes() == before
@@ -158,7 +179,7 @@ def test_the_best_policy_is_never_newer_than_the_last_checkpoint(tmp_path, monke
     assert best <= final_state(tmp_path / "x")[0] <= 2
 
 
-def test_a_kill_before_the_best_policy_is_saved_is_made_good(whole, tmp_path, monkeypatch):
+def test_a_best_policy_lost_by_a_kill_is_saved_on_resume(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(progress, "save", lambda *_: _raise(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         train_run(tmp_path / "x", small_run(), TRACKED)
@@ -335,6 +356,7 @@ def test_the_best_policy_has_the_highest_mean_over_the_sets_in_common(own, earli
     assert history.is_better(found, 1, 0, own) == better
     assert history.is_better(found, 1, None, own)
     assert not history.is_better(found, 2, 0, own), "not evaluated"
+    assert not history.is_better(found, 1, 1, own), "the best itself"
 
 
 def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
@@ -345,6 +367,26 @@ def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monke
     with pytest.raises(ValueError, match=r"iteration 3: .* try a learning_rate below 0.002"):
         train_run(tmp_path / "x", small_run(), PLAIN)
     assert final_state(tmp_path / "x")[0] == 2
+
+
+def test_the_page_of_a_run_is_gone_while_it_trains_on(tmp_path, monkeypatch):
+    def diverge(after, metrics):
+        return after, {**metrics, "intrinsic_reward": jnp.float32(np.nan)}
+
+    replace_training(monkeypatch, diverge)
+    folder = RunFolder(tmp_path / "x")
+    folder.path.mkdir()
+    folder.page.touch()
+    with pytest.raises(ValueError, match=r"'effects' returned a reward that is not finite in iter"):
+        train_run(folder.path, small_run(), dataclasses.replace(PLAIN, report=True))
+    assert not folder.page.exists()
+
+
+def test_a_run_stops_after_the_iteration_in_which_it_is_asked_to(tmp_path, monkeypatch):
+    replace_training(monkeypatch, lambda *returned: returned)
+    with pytest.raises(Stopped):
+        train_run(tmp_path / "x", small_run(), PLAIN, stop=lambda: True)
+    assert final_state(tmp_path / "x")[0] == len(untimed(tmp_path / "x")) == 1
 
 
 def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch):
@@ -376,26 +418,33 @@ def test_speed_is_steps_over_the_seconds_of_an_iteration(tmp_path, monkeypatch):
 
 def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypatch):
     """Whose float32 mean is 0.99999994."""
-    solved = Evaluation(jnp.full(41, True), *jnp.ones((3, 41)))
-    monkeypatch.setattr(program, "evaluate", lambda *_: solved)
-    replace_training(monkeypatch, lambda *returned: returned)
+    solved = outcome(jnp.full(41, True))
+    replace_training(monkeypatch, lambda *returned: returned, lambda *_: solved)
     run = Run(small_config(iterations=3, stop_when_solved=1.0))
     train_run(tmp_path / "x", run, PLAIN)
     assert [row["validation_success"] for row in untimed(tmp_path / "x")] == ["1.0"]
 
 
+def test_validation_success_is_of_the_policy_after_the_iteration(tmp_path, monkeypatch):
+    """The value's bias counts iterations; tasks are solved where it is 2."""
+
+    def play(agent, params, *_):
+        return outcome(params["heads"]["params"]["value"]["bias"][:1] == 2)
+
+    replace_training(monkeypatch, count_up, play)
+    train_run(tmp_path / "x", small_run(iterations=2), PLAIN)
+    assert [row["validation_success"] for row in untimed(tmp_path / "x")] == ["0.0", "1.0"]
+
+
 def test_success_is_measured_within_the_limit_of_the_task_set(tmp_path, monkeypatch):
-    """Not within that of training."""
-    limits = []
-    played = program.evaluate
+    """Of 50 steps, whatever the limit of training."""
 
-    def record(agent, params, env, tasks, encoding):
-        limits.append(env.max_steps)
-        return played(agent, params, env, tasks, encoding)
+    def play(agent, params, env, *_):
+        return outcome(jnp.array([env.max_steps == 50]))
 
-    monkeypatch.setattr(program, "evaluate", record)
+    replace_training(monkeypatch, lambda *returned: returned, play)
     train_run(tmp_path / "x", small_run(iterations=1), PLAIN)
-    assert set(limits) == {50}
+    assert [row["validation_success"] for row in untimed(tmp_path / "x")] == ["1.0"]
 
 
 def test_without_evaluation_the_final_policy_is_tested_on_all_sets(tmp_path):
@@ -459,7 +508,16 @@ def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
             metrics["validation_success"][1] = True
         return metrics
 
+    tested = []
+    play = Evaluator.__call__
+
+    def record(evaluator, params):
+        tested.append(params)
+        return play(evaluator, params)
+
+    replace_training(monkeypatch, count_up)
     monkeypatch.setattr(program.Cohort, "advance", end)
+    monkeypatch.setattr(Evaluator, "__call__", record)
     config = small_config(iterations=3, stop_when_solved=1.0)
     runs = {tmp_path / f"{seed}": Run(config, seed) for seed in range(4)}
     RunFolder(tmp_path / "0").checkpoints.mkdir(parents=True)
@@ -471,8 +529,9 @@ def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
     assert isinstance(solved, Scores)
     assert isinstance(other, Scores)
     assert [final_state(path)[0] for path in runs if path.name != "0"] == [0, 2, 3]
-    (tested,) = read_rows(tmp_path / "2" / "evaluations.csv")["iteration"]
-    assert tested == 2
+    (iteration,) = read_rows(tmp_path / "2" / "evaluations.csv")["iteration"]
+    assert iteration == 2
+    assert_same(tested[0], agents.load(tmp_path / "2").params)
 
 
 def test_runs_of_one_program_differ_only_in_their_seed(tmp_path):

@@ -19,7 +19,8 @@ def configs(*settings, grid=None, **options):
 
 def test_a_grid_holds_every_combination_by_name():
     found = configs("learning_rate=1e-3,3e-4", "curiosity=icm,none", "clip_eps=0.3")
-    rates, names = ("1e-3", "3e-4"), ("icm", "none")
+    rates = ("1e-3", "3e-4")
+    names = ("icm", "none")
     assert list(found) == [f"learning_rate={x},curiosity={y}" for x in rates for y in names]
     last = found["learning_rate=3e-4,curiosity=none"]
     assert (last.learning_rate, last.curiosity, last.clip_eps) == (3e-4, "none", 0.3)
@@ -45,7 +46,7 @@ def test_a_setting_may_have_no_effect_at_some_points():
     assert {config.intrinsic_coef for config in found.values()} == {0.5}
 
 
-def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, own_task_sets):
+def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, fresh_task_sets):
     monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
     given = Options(("curiosity=none,icm",), ("agents.examples.near_food",), seeds=2, seed=3)
     given = dataclasses.replace(given, env="near-food", out=tmp_path)

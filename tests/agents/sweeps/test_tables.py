@@ -95,6 +95,62 @@ def test_success_is_by_set_and_algorithm_with_the_papers_figures():
     assert "PPO, paper" not in other["Test tasks solved, %"]
 
 
+def test_differences_are_from_the_first_algorithm_and_corrected_for_their_number():
+    tested = tables.reported(
+        pd.DataFrame(
+            rows("best", [5, 6, 7])
+            + rows("worse", [1, 2, 3])
+            + rows("alike", [5, 6, 7])
+            + rows("single", [1])
+            + [
+                row
+                for name in ("best", "worse")
+                for row in rows(name, [1, 5], task_set="st", layouts=1)
+            ]
+        )
+    )
+    found = tables.differences(tested).set_index(["task_set", "algorithm"])
+    assert list(found.index.unique("algorithm")) == ["worse", "alike"]
+    assert list(found.index.unique("task_set")) == ["p", tables.MEAN]  # not st, of few layouts
+    # Welch: t = 40 / sqrt(100 / 3 + 100 / 3) at 4 degrees of freedom, p = 0.00806; twice, by Holm.
+    worse = found.loc[("p", "worse")]
+    assert worse["difference"] == pytest.approx(-40)
+    assert worse["p"] == pytest.approx(0.01612, abs=1e-4)
+    # t at 1 - 0.05 / 2 / 2 is 3.495.
+    np.testing.assert_allclose(worse[["low", "high"]].tolist(), [-68.54, -11.46], atol=0.01)
+    alike = found.loc[("p", "alike")]  # the larger p counts once: t at 1 - 0.05 / 2 is 2.776
+    np.testing.assert_allclose(alike[["low", "high"]].tolist(), [-22.67, 22.67], atol=0.01)
+    assert alike["p"] == 1
+    shown = tables.tables(tested, curves(), ABOUT)["Difference from best, points"]
+    assert shown.loc["{P}"].tolist() == ["-40.0 [-68.5, -11.5]*", "+0.0 [-22.7, 22.7]"]
+
+
+@pytest.mark.parametrize(
+    ("p", "corrected"),
+    [
+        ([0.01, 0.04, 0.03], [0.03, 0.06, 0.06]),  # Holm (1979): 3 * 0.01, 2 * 0.03, then no less
+        ([0.5, 0.02], [0.5, 0.04]),
+        ([0.0, 0.0, 0.1], [0.0, 0.0, 0.1]),
+        ([0.2], [0.2]),
+    ],
+)
+def test_holms_factors_never_let_a_larger_p_pass_a_smaller_one(p, corrected):
+    np.testing.assert_allclose(tables.holm_factors(np.array(p)) * p, corrected)
+
+
+def test_seeds_that_all_solve_as_much_differ_for_certain_or_not_at_all():
+    tested = pd.DataFrame(rows("a", [5, 5]) + rows("b", [5, 5]) + rows("c", [6, 6]))
+    found = tables.differences(tables.reported(tested)).set_index(["task_set", "algorithm"])
+    columns = ["difference", "low", "high", "p"]
+    np.testing.assert_allclose(found.loc[("p", "b"), columns].tolist(), [0, 0, 0, 1])
+    np.testing.assert_allclose(found.loc[("p", "c"), columns].tolist(), [10, 10, 10, 0])
+
+
+def test_algorithms_of_one_seed_are_not_compared():
+    tested = pd.DataFrame(rows("ppo", [5]) + rows("ppo+icm", [6, 7]))
+    assert len(tables.differences(tables.reported(tested))) == 0
+
+
 def test_training_is_summed_up_with_the_papers_trials():
     three = ((0, 1), (0, 0, 1), (0, 0, 0))
     made = pd.concat([curves("ppo+icm", three), curves("<b>", ((0.5,),))])
@@ -134,9 +190,9 @@ def test_many_algorithms_are_points_and_bars_but_not_lines(tmp_path):
     tested = pd.DataFrame([row for name in names for row in rows(name, [3, 4])])
     many = pd.concat(map(curves, names))
     (tmp_path / "curves.png").touch()  # of a smaller grid
-    (path,) = figures.save(tmp_path, tested, many, ABOUT)
-    assert list(tmp_path.iterdir()) == [path]
-    assert path.name == "success.png"
+    path, other = figures.save(tmp_path, tested, many, ABOUT)
+    assert sorted(tmp_path.iterdir()) == [other, path]
+    assert (path.name, other.name) == ("success.png", "differences.png")
     with Image.open(path) as picture:
         assert picture.width == 8.3 * figures.DPI
     axis = figures.draw_success(tables.reported(tested), ABOUT).axes[0]
@@ -152,7 +208,7 @@ def test_the_tables_of_the_records_fit_a_terminal(record, tmp_path):
     assert max(map(len, shown.splitlines())) <= records.WIDTH
 
 
-def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path, own_task_sets):
+def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path, fresh_task_sets):
     for short in ("NA", "other"):
         tt.register(f"{short}-v0", (tt.symbolic,), short=short)
     tested = rows("ppo", [3], task_set="NA") + rows("ppo", [4], task_set="other")

@@ -9,7 +9,9 @@ from trap_tube_jax.scoring.knowledge import choice_of_exit, first_push
 
 UP, DOWN, LEFT, RIGHT = range(4)
 # The tool is above the food's column. The agent is above the tool and carries it by grasping down.
-DOWNWARD, LEFTWARD, RIGHTWARD = (DOWN, DOWN), (DOWN, LEFT), (DOWN, RIGHT)
+DOWNWARD = (DOWN, DOWN)
+LEFTWARD = (DOWN, LEFT)
+RIGHTWARD = (DOWN, RIGHT)
 NONE = (0, 0)
 
 

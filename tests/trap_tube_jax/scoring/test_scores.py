@@ -41,10 +41,15 @@ def test_few_layouts_are_counted_and_have_no_interval():
     assert " 23.7-76.3 |" in str(Scores(1, "0", None, (score,)))
 
 
-def test_a_printed_table_fits_a_terminal():
-    solved = np.array([True, False])
-    found = Optimality.of(solved, np.array([20, 50]), np.array([10, 11]), 50)
-    score = Score.of("pstsy", "{P, St, Sy}", solved, np.array([20, 50]), optimality=found)
-    text = str(Scores(1, "0.2.0", 0, (score,)))
-    assert " 0.500 |" in text
-    assert max(map(len, text.splitlines())) <= 80
+def test_a_printed_table_holds_the_numbers_and_fits_a_terminal():
+    """One of four tasks has no plan, and one none within 50 steps."""
+    solved = np.array([True, True, False, False])
+    length = np.array([20, 40, 50, 50])
+    found = Optimality.of(solved, length, np.array([10, 10, -1, 51]), 50)
+    score = Score.of("pstsy", "{P, St, Sy}", solved, length, optimality=found)
+    lines = str(Scores(1, "0.2.0", 0, (score,))).splitlines()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    # Shares, Wilson's interval and mean steps; then shares of the solvable, and 10/20 and 10/40.
+    assert rows[2] == ["{P, St, Sy}", "4", "2", "50.0", "15.0-85.0", "-", "30.0"]
+    assert rows[6] == ["{P, St, Sy}", "100.0", "0.375"]
+    assert max(map(len, lines)) <= 80

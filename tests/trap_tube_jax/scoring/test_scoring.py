@@ -1,5 +1,6 @@
 """Scores by the benchmark's protocol: fixed tasks, and agents of any kind."""
 
+import dataclasses
 import json
 import re
 import zlib
@@ -144,7 +145,7 @@ def test_a_policy_is_scored_on_the_fixed_tasks(scores):
         ("sy", [0, 1, 2], [0, 1, 2]),
     ],
 )
-def test_few_layouts_are_those_that_return(name, rows, numbers):
+def test_a_set_has_few_layouts_if_its_tasks_repeat_five_or_fewer(name, rows, numbers):
     cells = jnp.stack([jnp.array(rows)] * 2, axis=1)
     tasks = jax.tree.map(lambda x: np.broadcast_to(x, (len(rows), *x.shape)), tt.base_state())
     layout = layout_numbers(name, tasks.replace(agent=cells))
@@ -187,11 +188,13 @@ def test_blocks_change_nothing_but_the_keys_of_draws(near, scores, monkeypatch):
 
 
 @pytest.mark.parametrize(("max_steps", "counts"), [(2, False), (3, True)])
-def test_the_sets_own_limit_holds(near, max_steps, counts):
+def test_the_step_limit_of_the_task_set_holds(near, max_steps, counts):
     """Three steps lead to the food."""
     name = f"Near{max_steps}"
     tt.register(name, near.transfers, base=near.base, max_steps=max_steps)
-    assert (tt.score(Rightward(), [name], tasks=20)[name].solved > 0) == counts
+    score = tt.score(Rightward(), [name], tasks=20)
+    assert (score[name].solved > 0) == counts
+    assert tt.score_gymnasium(Single((UP, RIGHT)), [name], tasks=20)[name] == score[name]
 
 
 class Ends(NamedTuple):
@@ -203,7 +206,7 @@ class Ends(NamedTuple):
 
 
 def test_a_suite_plays_all_sets_in_equal_blocks_up_to_their_limits(near, monkeypatch):
-    """The program solves every task in four steps."""
+    """The program solves every task in five steps; the limits are 5, 50, 3 and 50."""
     monkeypatch.setattr(suite, "BLOCK", 8)
     tt.register("Near3", near.transfers, base=near.base, max_steps=3)
     tasks = Suite.of_sets(["near", "{P}", "Near3", "base"], 6)
@@ -212,20 +215,22 @@ def test_a_suite_plays_all_sets_in_equal_blocks_up_to_their_limits(near, monkeyp
 
     def program(states):
         blocks.append(len(states.time))
-        four = jnp.full(blocks[-1], 4)
-        return Ends(four > 0, four, states.food)
+        five = jnp.full(blocks[-1], 5)
+        return Ends(five > 0, five, states.food)
 
     outcomes = tasks.play(program)
     assert blocks == [8, 8, 8], "of 19 tasks"
     for name, states in tasks.tasks.items():
         np.testing.assert_array_equal(outcomes[name].food, states.food)
+    np.testing.assert_array_equal(outcomes["Near3"].length, 3)
     shortest = {name: np.array([2, 4, 1])[: len(x.time)] for name, x in tasks.tasks.items()}
     scores = tasks.scores(outcomes, shortest=shortest, seed=7)
     assert [(x.set, x.tasks, x.solved) for x in scores.sets] == [
         *[("near", 6, 6), ("p", 6, 6), ("Near3", 6, 0), ("base", 1, 1)]
     ]
-    assert (scores["p"].mean_steps, scores.seed, scores.protocol) == (4, 7, PROTOCOL)
-    assert scores["p"].optimality == Optimality(3, 100, 7 / 12, 1 / 4)
+    assert (scores["p"].mean_steps, scores.seed, scores.protocol) == (5, 7, PROTOCOL)
+    found: Any = scores["p"].optimality
+    assert dataclasses.astuple(found) == pytest.approx((3, 100, 7 / 15, 1 / 5))
     assert_refused(["name at least one"], Suite.of_sets, [], 6)
 
 
@@ -247,7 +252,7 @@ def test_scores_are_records(scores):
         scores["p"]
 
 
-def test_optimality_of_what_is_solved(near):
+def test_optimality_compares_solved_tasks_with_shortest_plans(near):
     """Two steps are lost on the detour. What is not in the agent's row is beyond 5 steps."""
 
     def far_if_below(key, state):
@@ -263,7 +268,7 @@ def test_optimality_of_what_is_solved(near):
     assert score.optimality == Optimality(near_ones, 100, 3 / 5, 3 / 5)
 
 
-def test_draws_are_those_of_the_seed_whatever_else_is_scored(near):
+def test_draws_depend_on_seed_and_set_alone(near):
     one: Any = np.int64(1)
     first, other = (tt.score(Random(), ["near"], 64, seed=seed) for seed in (0, one))
     assert json.loads(json.dumps(other.to_dict()))["seed"] == 1
@@ -296,7 +301,7 @@ def test_an_agent_may_keep_a_state(near):
     assert scores["Above-v0"].mean_steps == 4
 
 
-def test_a_model_trained_behind_vecnormalize_sees_what_it_was_trained_on(near, scores):
+def test_a_model_trained_behind_vecnormalize_sees_normalised_observations(near, scores):
     """The task looks the same to both agents; one reads scaled observations."""
 
     class Normalizer:

@@ -107,7 +107,7 @@ def assert_paid_exactly_at_the_end(states: tt.State, plans: tt.Plan):
 @pytest.mark.parametrize(
     ("code", "length"), [(TOOL, 11), (TUBE1, 10), (TUBE2, 8), (TRAP, 10), (EXIT, 16)]
 )
-def test_lengths_of_the_symbolic_tasks(code, length):
+def test_symbolic_tasks_have_the_known_plan_lengths(code, length):
     state = swap_with_tool(tt.base_state(), jnp.int32(code))
     plan = tt.solve(state)
     assert (plan.length, plan.solvable, plan.actions.shape) == (length, True, (length, 2))
@@ -153,7 +153,7 @@ def test_random_actions_solve_the_base_task_as_rarely_as_environment_md_says():
     assert f"in {1e6 * total:.2f} of 1,000,000 episodes" in page.read_text()
 
 
-def test_plans_are_those_of_brute_force_and_a_batch_those_of_single_tasks(rooms, room_plans):
+def test_plans_equal_brute_forces_alone_and_in_a_batch(rooms, room_plans):
     longest = room_plans.length.max()
     assert room_plans.actions.shape == (NUM_ROOMS, longest, 2)
     for index, room in enumerate(rooms):
@@ -184,7 +184,7 @@ def test_plans_are_those_of_brute_force_and_a_batch_those_of_single_tasks(rooms,
     ],
     ids=lambda change: next(iter(change)),
 )
-def test_tasks_of_a_batch_that_differ_in_anything_have_plans_of_their_own(change):
+def test_tasks_of_a_batch_that_differ_in_one_field_have_different_plans(change):
     parts = {"agent": (1, 0), "food": (1, 4), "tool": (0, 2), "tool_extent": (1, 1)}
     board = np.full((12, 12), TUBE1)
     states = []
@@ -200,7 +200,7 @@ def test_tasks_of_a_batch_that_differ_in_anything_have_plans_of_their_own(change
         np.testing.assert_array_equal(found.actions[: found.length], plan.actions)
 
 
-def test_colours_play_no_part(base_plan):
+def test_plans_do_not_depend_on_colours(base_plan):
     base = tt.base_state()
     plans = tt.solve_batch(stack([base, base.replace(palette=base.palette[::-1])]))
     expected = base_plan.actions
@@ -208,7 +208,7 @@ def test_colours_play_no_part(base_plan):
         np.testing.assert_array_equal(actions, expected)
 
 
-def test_a_task_without_a_way_to_the_goal():
+def test_a_task_that_cannot_be_solved_has_an_empty_plan():
     state = tt.State.from_ascii(WALLED_IN)
     plan = tt.solve(state)
     assert (plan.length, plan.solvable, plan.actions.shape) == (-1, False, (0, 2))
@@ -231,9 +231,7 @@ def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
     np.testing.assert_array_equal(tt.solve(state).actions, base_plan.actions[4:])
 
 
-def test_distances_are_those_of_brute_force_and_count_down_along_the_plan(
-    workshop, workshop_distances
-):
+def test_distances_equal_brute_forces_and_count_down_along_the_plan(workshop, workshop_distances):
     found = workshop_distances
     expected = brute_force.graph(workshop)
     assert found.num_reachable == len(expected.positions)
@@ -248,7 +246,7 @@ def test_distances_are_those_of_brute_force_and_count_down_along_the_plan(
     assert left == list(range(plan.length, -1, -1))
 
 
-def test_states_without_a_future_are_refused():
+def test_finished_and_invalid_states_are_refused():
     base = tt.base_state()
     solved = base.replace(agent=base.food, terminated=jnp.array(True))
     trapped = base.replace(agent=jnp.array([4, 4], jnp.int32))

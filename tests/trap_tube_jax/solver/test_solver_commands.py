@@ -58,8 +58,8 @@ def test_text_needs_no_library_of_pictures(arguments, text, tmp_path, capsys, mo
     assert hint in refused(capsys, main, *arguments, "--output", asked)
 
 
-@pytest.mark.usefixtures("own_task_sets")
-def test_sets_of_the_same_transfers_have_a_row_each(tmp_path, capsys):
+@pytest.mark.usefixtures("fresh_task_sets")
+def test_sets_of_the_same_transfers_have_rows_of_their_names(tmp_path, capsys):
     tt.register("Own-v0", (tt.symbolic,), short="own", base=EASY)
     picture = str(tmp_path / "histogram.png")
     main(["--tasks", "2", "--output", picture, "--sets", "sy", "own", "{Sy}"])

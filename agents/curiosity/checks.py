@@ -1,0 +1,78 @@
+"""Checks that a registered curiosity keeps its contract, so that the learner need not."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from agents.config import Config
+from agents.curiosity.base import Curiosity, Experience, Params
+from agents.networks.layers import assert_floats
+from agents.registry import contract
+from trap_tube_jax.objects import BOARD_SIZE
+
+TAKEN = ("policy_loss", "value_loss", "entropy_loss", "motion_loss")  # terms of the learner's loss
+
+
+class CheckedCuriosity(Curiosity):
+    """A curiosity whose results are checked while they are traced.
+
+    Methods raise ValueError with the curiosity's name.
+    """
+
+    def __init__(self, config: Config, curiosity: Curiosity):
+        """Checks the curiosity's parameters and features.
+
+        Raises:
+          ValueError: it is no `Curiosity`, or breaks the contract.
+        """
+        self.name = config.curiosity
+        self.curiosity = curiosity
+        with self._contract():
+            kind = type(curiosity).__name__
+            assert isinstance(curiosity, Curiosity), f"{kind} is no agents.curiosity.Curiosity"
+            boards = jnp.zeros((2, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
+            params = jax.eval_shape(curiosity.init, jax.random.key(0), boards[:1])
+            assert_floats(params)
+            features = jax.eval_shape(curiosity.encode, params, boards)
+            assert isinstance(features, jax.ShapeDtypeStruct), "encode must return an array"
+            chex.assert_shape(features, (len(boards), None))
+            chex.assert_type(features, jnp.float32)
+        self.needs_next_embedding = curiosity.needs_next_embedding
+        self.init = curiosity.init
+        self.memory = curiosity.memory
+        self.encode = curiosity.encode
+
+    def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
+        """Returns reward and memory; see `Curiosity.reward`."""
+        with self._contract():
+            returned = self.curiosity.reward(params, memory, experience)
+            assert_like(returned, (experience.episodes.mask, memory))
+        return returned
+
+    def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
+        """Returns terms of the loss; see `Curiosity.losses`."""
+        with self._contract():
+            found = self.curiosity.losses(params, experience)
+            assert isinstance(found, dict), f"losses are {type(found).__name__}, not a dict"
+            wrong = [name for name in found if name in TAKEN or not name.endswith("_loss")]
+            assert not wrong, (
+                f"names of losses must end in '_loss' and differ from {', '.join(TAKEN)}; "
+                f"got {', '.join(wrong)}"
+            )
+            assert_like(found, dict.fromkeys(found, experience.episodes.mask))
+        return found
+
+    @contextmanager
+    def _contract(self) -> Iterator[None]:
+        with contract("curiosity", self.name):
+            yield
+
+
+def assert_like(returned: Any, wanted: Any) -> None:
+    """Raises AssertionError unless two trees agree in structure, shapes and dtypes."""
+    shapes = jax.eval_shape(lambda: returned)
+    chex.assert_trees_all_equal_shapes_and_dtypes(shapes, wanted)
