@@ -62,7 +62,7 @@ def find_runs(paths: Paths) -> list[RunFolder]:
     """Returns the runs in folders, sorted by path, a folder once whatever links lead to it.
 
     Raises:
-      ValueError: a folder holds no run.
+      ValueError: a folder holds no run, or there is no folder.
       OSError: a folder cannot be opened.
     """
     found: dict[str, Path] = {}
@@ -72,6 +72,8 @@ def find_runs(paths: Paths) -> list[RunFolder]:
             raise ValueError(f"{path} holds no run; {runs_near(path)}")
         for run in runs:
             found.setdefault(os.path.realpath(run), run)
+    if not found:
+        raise ValueError("paths must name at least one folder")
     return list(map(RunFolder, found.values()))
 
 

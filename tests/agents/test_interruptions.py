@@ -2,6 +2,10 @@
 
 import json
 import signal
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,52 +16,82 @@ from helpers.tiny_policy import random_policy
 ENDLESS = [*small_runs.options(), "--iterations", 1_000_000, "--sets", "base"]
 SHORT = [*small_runs.options(), "--iterations", 1]
 GRID = ["--settings", *(f"{k}={json.dumps(v)}" for k, v in small_runs.SETTINGS.items())]
-RESUME = "Stopped. Continue with: python -m agents.train --resume "
+POLICY = ["policy.safetensors", "--import", "says_ready"]
+RESUME = "Stopped. Continue with: python -m agents.train --resume runs/x"
 AGAIN = "Stopped. The same command starts again."
 CONTINUES = "Stopped. The same command continues."
 
-# Command, arguments, the beginning of a line that tells the phase, the stream, and the last line.
+# Command, arguments, the beginning of a line that tells the phase, and the last line.
 PHASES = {
-    "compiling": ("agents.train", [*ENDLESS, "--name", "x"], "", "stdout", RESUME),
-    "training": ("agents.train", [*ENDLESS, "--name", "x"], "iteration 1", "stdout", RESUME),
-    "evaluation": ("agents.train", [*SHORT, "--name", "x"], "Playing", "stdout", RESUME),
-    "start of a sweep": ("agents.sweep", GRID, "1 run(s)", "stdout", CONTINUES),
-    "table of a sweep": (
-        "agents.sweep",
-        [*GRID, "iterations=1"],
-        "[1/1]",
-        "stdout",
-        CONTINUES,
-    ),
-    "evaluate": ("agents.evaluate", ["POLICY", "--import", "says_ready"], "ready", "stdout", AGAIN),
-    "solver": ("trap_tube_jax.solver", ["--tasks", 100_000], "Solving", "stderr", AGAIN),
+    "compiling": ("agents.train", [*ENDLESS, "--name", "x"], "runs/x: ", RESUME),
+    "training": ("agents.train", [*ENDLESS, "--name", "x"], "iteration 1", RESUME),
+    "evaluation": ("agents.train", [*SHORT, "--name", "x"], "Playing", RESUME),
+    "report": ("agents.train", [*SHORT, "--name", "x"], "Drawing", RESUME),
+    "start of a sweep": ("agents.sweep", GRID, "1 run(s)", CONTINUES),
+    "a sweep": ("agents.sweep", [*GRID, "iterations=1000000"], "0% of 1 run(s)", CONTINUES),
+    "table of a sweep": ("agents.sweep", [*GRID, "iterations=1"], "[1/1]", CONTINUES),
+    "named grid": ("agents.experiments", ["fast", "--seeds", 1, *GRID], "1 run(s)", CONTINUES),
+    "evaluate": ("agents.evaluate", POLICY, "ready", AGAIN),
+    "profile": ("agents.profile", [*POLICY, "--parts", "kind", "--tasks", 2], "ready", AGAIN),
+    "solver": ("trap_tube_jax.solver", ["--tasks", 100_000], "Solving", AGAIN),
+    "benchmark": ("benchmarks.env_throughput", ["--repeats", 1_000_000], "{", AGAIN),
 }
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+SILENT = ("a sweep", "solver", "benchmark")  # so they do not see that a pipe is closed
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("times", [1, 2])
 @pytest.mark.parametrize("phase", PHASES)
-def test_an_interrupted_command_says_how_to_go_on(phase, times, tmp_path):
-    module, arguments, line, stream, last = PHASES[phase]
-    number = SIGNALS[(list(PHASES).index(phase) + times) % len(SIGNALS)]
-    (tmp_path / "says_ready.py").write_text("print('ready', flush=True)")
-    save(tmp_path / "policy.safetensors", random_policy())
-    given = [tmp_path / "policy.safetensors" if x == "POLICY" else x for x in arguments]
-    if module.startswith("agents") and module != "agents.evaluate":
-        given += ["--out", tmp_path]
-    process = small_runs.start(module, *given, cwd=tmp_path)
-    source = getattr(process, stream)
-    while not (found := source.readline()).startswith(line):
-        assert found, process.communicate()
-    for _ in range(times):
+def test_an_interrupted_command_says_how_to_go_on(phase, tmp_path):
+    """By every signal, once and twice in turn from phase to phase, and by a closed pipe."""
+    with ExitStack() as stack:
+        started = {}
+        for order, number in enumerate(signals(phase), list(PHASES).index(phase)):
+            folder = tmp_path / number.name
+            started[number] = (stack.enter_context(start(phase, folder)), folder, 1 + order % 2)
+        for number, (process, folder, times) in started.items():
+            await_line(phase, process)
+            errors = interrupt(process, number, times)
+            check_end(phase, number, process.returncode, errors)
+            if phase == "training" and times == 1:
+                assert small_runs.final_state(folder / "runs" / "x")[0] >= 1, "saved"
+
+
+def signals(phase: str) -> Iterator[signal.Signals]:
+    yield from SIGNALS
+    if phase not in SILENT:
+        yield signal.SIGPIPE
+
+
+def start(phase: str, folder: Path) -> Any:
+    module, arguments, *_ = PHASES[phase]
+    folder.mkdir()
+    (folder / "says_ready.py").write_text("print('ready', flush=True)")
+    save(folder / "policy.safetensors", random_policy())
+    return small_runs.start(module, *arguments, cwd=folder)
+
+
+def await_line(phase: str, process: Any) -> None:
+    stream = process.stderr if phase == "solver" else process.stdout
+    while not (line := stream.readline()).startswith(PHASES[phase][2]):
+        assert line, process.communicate()
+
+
+def interrupt(process: Any, number: signal.Signals, times: int) -> str:
+    """Returns what the process writes to stderr from then on to its end."""
+    if number == signal.SIGPIPE:
+        process.stdout.close()
+        process.stdout = None
+    for _ in range(times if number != signal.SIGPIPE else 0):
         process.send_signal(number)
-    assert process.stderr is not None
-    errors = process.stderr.read()
-    process.communicate()
-    assert process.returncode == 128 + number, errors
+    return process.communicate()[1]
+
+
+def check_end(phase: str, number: signal.Signals, code: int, errors: str) -> None:
+    assert code == 128 + number, errors
     assert "Traceback" not in errors
-    assert errors.splitlines()[-1].startswith(last)
-    if module == "agents.train":
-        trained, _ = small_runs.final_state(tmp_path / "x")
-        assert trained >= (phase == "training" and times == 1), "saved"
+    last = PHASES[phase][-1]
+    if number == signal.SIGPIPE and last == AGAIN:  # as in `command | head -1`
+        assert "Stopped" not in errors
+    else:
+        assert errors.splitlines()[-1].startswith(last), errors

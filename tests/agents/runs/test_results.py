@@ -56,6 +56,7 @@ def test_a_folder_without_runs_is_refused_and_near_ones_are_named(runs, monkeypa
     monkeypatch.chdir(runs.parent)
     assert_refused(["none holds no run; runs in .: none"], agents.results, "none")
     assert_refused(["a holds no run; did you mean runs/a?"], agents.results, "a")
+    assert_refused(["at least one folder"], agents.results, [])
 
 
 def test_a_leading_tilde_is_the_home_folder_for_every_path(runs, monkeypatch):
