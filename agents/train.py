@@ -1,6 +1,7 @@
 """Training from the command line: python -m agents.train --help."""
 
 import dataclasses
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from agents.command_line import option, parse_all
 from agents.config import Config
 from agents.parallel import processes
 from agents.parallel.devices import split_cpu
-from agents.runs import compilation, display
+from agents.runs import compilation
 from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder, check_name
+from agents.runs.metrics import read_rows
 from agents.runs.run import DeviceOptions, Run, RunOptions
 from agents.runs.session import train_run
 from trap_tube_jax.command_line import plain_errors
@@ -26,8 +28,7 @@ PROGRAM = "python -m agents.train"
 class Options:
     """Trains an agent, evaluates it on all task sets and writes a folder of results.
 
-    Ctrl-C stops after the current iteration and saves; --resume continues to the same result.
-    A second Ctrl-C stops at once.
+    Ctrl-C saves and stops; --resume continues to the same result.
 
     Attributes:
       preset: initial settings (fast, best or paper).
@@ -103,12 +104,12 @@ def train(options: Options, run: Run, run_options: RunOptions) -> None:
     console = CommandConsole(quiet=not is_first, highlight=False)
     compilation.enable_cache()
     try:
-        with stopping(lambda: display.resume_hint(folder, run) if is_first else ""):
+        with stopping(lambda: resume_hint(folder, run) if is_first else ""):
             train_run(folder.path, run, run_options, console=console)
-            for line in display.summary(folder, run):
+            for line in summary(folder, run):
                 console.out(line)
     except OSError as error:
-        raise OSError(f"{error}. {display.resume_hint(folder, run)}") from error
+        raise OSError(f"{error}. {resume_hint(folder, run)}") from error
 
 
 def run_path(options: Options, run: Run) -> Path:
@@ -119,6 +120,42 @@ def run_path(options: Options, run: Run) -> Path:
     name = options.name or f"{options.preset}-{short}-{run.seed}"
     check_name(name)
     return options.out / name
+
+
+def summary(folder: RunFolder, run: Run) -> list[str]:
+    """Summarises a finished run, one fact per line."""
+    lines = []
+    config = run.config
+    train_set = tt.task_set(config.env_id).label
+    threshold = config.stop_when_solved or 1.0
+    solving = read_rows(folder.metrics).query("validation_success >= @threshold")["episodes"]
+    if len(solving):
+        share = "" if threshold == 1 else f"{100 * threshold:g} % of "
+        more = "; --stop-when-solved 0 trains on" if config.stop_when_solved else ""
+        lines.append(f"First solved {share}{train_set} after {solving.min():,} episodes{more}.")
+    if folder.page.exists():
+        lines.append(f"Report with curves and episodes to step through: {folder.page}")
+    has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init
+    if config.stop_when_solved and len(solving):
+        more = "python -m agents.train --preset best"
+        lines.append(f"Next, learn all transfers in 40 minutes: {more}")
+    elif not has_schedule and config.max_transitions is None:
+        again = resume_command(folder, run)
+        lines.append(f"Train longer: {again} --iterations {2 * config.iterations}")
+    return lines
+
+
+def resume_hint(folder: RunFolder, run: Run) -> str:
+    """Returns the command that resumes an interrupted run, in a sentence."""
+    if not folder.config.is_file():
+        return f"{folder.path} holds no run to continue."
+    return f"Continue with: {resume_command(folder, run)}"
+
+
+def resume_command(folder: RunFolder, run: Run) -> str:
+    """Returns the command that resumes a run."""
+    imports = [word for name in run.imports for word in ("--import", name)]
+    return shlex.join([*PROGRAM.split(), "--resume", str(folder.path), *imports])
 
 
 if __name__ == "__main__":

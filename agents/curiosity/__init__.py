@@ -1,9 +1,7 @@
 """Intrinsic rewards, one module each, with the names that `Config.curiosity` allows."""
 
-import trap_tube_jax as tt
-from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience
-from agents.curiosity.checks import CheckedCuriosity
+from agents.curiosity.checks import make_curiosity
 from agents.curiosity.effects import Effects
 from agents.curiosity.icm import ICM
 from agents.curiosity.noveld import NovelD
@@ -23,12 +21,3 @@ curiosities.update(
         "none": lambda config, env: Curiosity(),
     }
 )
-
-
-def make_curiosity(config: Config, env: tt.Environment) -> Curiosity:
-    """Builds the curiosity that `config.curiosity` names, for training in `env`.
-
-    Raises:
-      ValueError: a registered curiosity breaks its contract.
-    """
-    return CheckedCuriosity(config, curiosities.factory(config.curiosity)(config, env))

@@ -1,4 +1,4 @@
-"""Checks that a registered curiosity keeps its contract, so that the learner need not."""
+"""Makes curiosities, and checks that they keep their contract, so that the learner need not."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,13 +8,23 @@ import chex
 import jax
 import jax.numpy as jnp
 
+import trap_tube_jax as tt
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.networks.layers import assert_floats
-from agents.registry import contract
+from agents.registry import contract, curiosities
 from trap_tube_jax.objects import BOARD_SIZE
 
 TAKEN = ("policy_loss", "value_loss", "entropy_loss", "motion_loss")  # terms of the learner's loss
+
+
+def make_curiosity(config: Config, env: tt.Environment) -> Curiosity:
+    """Builds the curiosity that `config.curiosity` names, for training in `env`.
+
+    Raises:
+      ValueError: a registered curiosity breaks its contract.
+    """
+    return CheckedCuriosity(config, curiosities.factory(config.curiosity)(config, env))
 
 
 class CheckedCuriosity(Curiosity):

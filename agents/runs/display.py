@@ -1,6 +1,5 @@
-"""Shows a run's progress on one terminal line, and its results on a few lines."""
+"""Shows progress on one terminal line."""
 
-import shlex
 from typing import Any
 
 from rich.console import Console
@@ -14,10 +13,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
-import trap_tube_jax as tt
-from agents.runs.folder import RunFolder
-from agents.runs.metrics import Row, read_rows
-from agents.runs.run import Run
+from agents.runs.metrics import Row
 
 
 class ProgressLine(Progress):
@@ -65,39 +61,3 @@ class TrainingLine(ProgressLine):
         )
         head = f"iteration {row['iteration']} of {self.iterations}: "
         self.write(row["iteration"], text, head)
-
-
-def summary(folder: RunFolder, run: Run) -> list[str]:
-    """Summarises a finished run, one fact per line."""
-    lines = []
-    config = run.config
-    train_set = tt.task_set(config.env_id).label
-    threshold = config.stop_when_solved or 1.0
-    solving = read_rows(folder.metrics).query("validation_success >= @threshold")["episodes"]
-    if len(solving):
-        share = "" if threshold == 1 else f"{100 * threshold:g} % of "
-        more = "; --stop-when-solved 0 trains on" if config.stop_when_solved else ""
-        lines.append(f"First solved {share}{train_set} after {solving.min():,} episodes{more}.")
-    if folder.page.exists():
-        lines.append(f"Report with curves and episodes to step through: {folder.page}")
-    has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init
-    if config.stop_when_solved and len(solving):
-        more = "python -m agents.train --preset best"
-        lines.append(f"Next, learn all transfers in 40 minutes: {more}")
-    elif not has_schedule and config.max_transitions is None:
-        again = resume_command(folder, run)
-        lines.append(f"Train longer: {again} --iterations {2 * config.iterations}")
-    return lines
-
-
-def resume_hint(folder: RunFolder, run: Run) -> str:
-    """Returns the command that resumes an interrupted run, in a sentence."""
-    if not folder.config.is_file():
-        return f"{folder.path} holds no run to continue."
-    return f"Continue with: {resume_command(folder, run)}"
-
-
-def resume_command(folder: RunFolder, run: Run) -> str:
-    """Returns the command that resumes a run."""
-    imports = [word for name in run.imports for word in ("--import", name)]
-    return shlex.join(["python", "-m", "agents.train", "--resume", str(folder.path), *imports])

@@ -78,10 +78,11 @@ class RunFolder:
 
     def check_free(self) -> None:
         """Raises ValueError unless a new run can be created here."""
-        if self.config.is_file():
+        names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
+        if CONFIG_FILE in names:
             again = f"continue it with --resume {self.path}, or give another --name"
             raise ValueError(f"{self.path} holds a run; {again}")
-        if self.path.exists() and any(path.name != ".lock" for path in self.path.iterdir()):
+        if names - {".lock"}:
             raise ValueError(f"{self.path} exists, but holds no run; give another --name")
 
     def note(self, run: Run, options: RunOptions | None = None) -> None:

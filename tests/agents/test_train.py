@@ -16,11 +16,21 @@ from agents.files import read_json
 from agents.runs import program
 from agents.runs.folder import RunFolder
 from agents.runs.loading import save
+from agents.runs.metrics import append_rows
 from agents.runs.provenance import commit
 from agents.runs.run import Run, RunOptions
-from agents.train import Options, main, parse, run_path
+from agents.train import Options, main, parse, run_path, summary
 from helpers.refusal import refused
-from helpers.small_runs import final_state, options, read_iterations, run, start, untimed
+from helpers.small_runs import (
+    final_state,
+    metrics_row,
+    options,
+    read_iterations,
+    run,
+    small_config,
+    start,
+    untimed,
+)
 from helpers.tiny_policy import random_policy
 from trap_tube_jax import interruptions
 
@@ -273,3 +283,38 @@ def test_help_documents_every_setting(capsys, monkeypatch):
         assert f"--{field.name.replace('_', '-')}" in text
     assert "global norm of clipped gradients" in text
     assert "(fast, best or paper)" in text
+
+
+@pytest.mark.parametrize(
+    ("settings", "episodes", "expected"),
+    [
+        ({"stop_when_solved": 1.0}, 4321, "--preset best"),
+        ({"stop_when_solved": 1.0}, None, "--iterations 14"),
+        ({"stop_when_solved": 0.0, "lr_decay_fraction": 0.5}, None, "report.html"),
+        ({"stop_when_solved": 0.0, "max_transitions": 100}, None, "report.html"),
+    ],
+)
+def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
+    run = Run(small_config(iterations=7, **settings))
+    folder = RunFolder(tmp_path)
+    solved = [metrics_row(2, validation_success=1.0, episodes=episodes)] if episodes else []
+    rows = (
+        [metrics_row(1), *solved, metrics_row(3, validation_success=1.0, episodes=9999)]
+        if solved
+        else [metrics_row(1)]
+    )
+    append_rows(folder.metrics, rows)
+    assert "report.html" not in "".join(summary(folder, run)), "with --no-report"
+    folder.page.touch()
+    lines = summary(folder, run)
+    assert lines[-1].endswith(expected)
+    solved = "First solved base after 4,321 episodes; --stop-when-solved 0 trains on."
+    assert (solved in lines) == bool(episodes)
+
+
+def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
+    run = Run(small_config(stop_when_solved=0.995))
+    folder = RunFolder(tmp_path)
+    append_rows(folder.metrics, [metrics_row(1, validation_success=0.996)])
+    solved = "First solved 99.5 % of base after 8 episodes; --stop-when-solved 0 trains on."
+    assert summary(folder, run)[0] == solved

@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import math
 import re
 
 import jax
@@ -21,19 +20,12 @@ from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
 from agents.runs.provenance import commit, note_provenance
 from agents.runs.run import Run
-from helpers.small_runs import small_config
+from helpers.small_runs import metrics_row, small_config
 from helpers.tiny_policy import food_next_to_agent, random_params
 from trap_tube_jax.objects import DIRECTION_NAMES
 from trap_tube_jax.scoring import Suite, evaluation_tasks
 
 CONFIG = small_config(curiosity="effects", stop_when_solved=0.0)
-
-
-def row(iteration, **values):
-    counts = {"episodes": 8 * iteration, "transitions": 48 * iteration, "seconds": 1.0}
-    shares = {"success": 0.25, "validation_success": 0.5, "loss": math.nan, "policy_loss": math.nan}
-    rate = {"transitions_per_second": 6000.0, "intrinsic_reward": 0.1}
-    return {"iteration": iteration, **counts, **shares, **rate, **values}
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +43,7 @@ def page(played, tmp_path_factory):
     evaluator, outcome = played
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "<mine>")
     folder.path.mkdir()
-    append_rows(folder.metrics, [row(1), row(2, policy_loss=0.5)])
+    append_rows(folder.metrics, [metrics_row(1), metrics_row(2, policy_loss=0.5)])
     note_provenance(folder.provenance, "cpu")
     report.write(folder, Run(CONFIG), evaluator, outcome)
     start = '<script type="application/json" id="data">'
@@ -106,7 +98,9 @@ def test_a_page_shows_shortest_plans(played, page):
 def test_curves_have_as_many_panels_where_nothing_is_solved():
     heights = []
     for share in (0.0, 0.5):
-        rows = pd.DataFrame([row(i, success=share, validation_success=share) for i in (1, 2)])
+        rows = pd.DataFrame(
+            [metrics_row(i, success=share, validation_success=share) for i in (1, 2)]
+        )
         content = report.draw_curves(rows, "no formula: $^$")
         with Image.open(io.BytesIO(content)) as picture:
             heights.append(picture.height)
@@ -118,7 +112,7 @@ def test_figures_are_drawn_under_matplotlibs_defaults(played, tmp_path, monkeypa
     monkeypatch.setitem(mpl.rcParams, "text.usetex", True)
     monkeypatch.setenv("PATH", "")
     folder = RunFolder(tmp_path)
-    append_rows(folder.metrics, [row(1)])
+    append_rows(folder.metrics, [metrics_row(1)])
     report.write(folder, Run(CONFIG), *played)
     assert folder.curves.is_file()
     assert mpl.rcParams["text.usetex"]
@@ -132,7 +126,7 @@ def test_a_figure_that_fails_costs_a_line_and_leaves_the_other_files(
         raise RuntimeError("no font\nwas \x1b[2J found")
 
     folder = RunFolder(tmp_path)
-    append_rows(folder.metrics, [row(1)])
+    append_rows(folder.metrics, [metrics_row(1)])
     folder.curves.write_text("earlier")
     monkeypatch.setattr(report, "to_png", fail)
     report.write(folder, Run(CONFIG), *played)
@@ -160,7 +154,7 @@ def test_progress_is_one_line_on_a_terminal_and_a_line_an_iteration_elsewhere(is
     console = Console(file=file, force_terminal=is_terminal, width=100)
     with display.TrainingLine(console, 5) as progress:
         for iteration in (1, 2):
-            progress.show(row(iteration))
+            progress.show(metrics_row(iteration))
     text = file.getvalue()
     assert "25.0% solved, 50.0% greedily, 16 episodes, 6,000 steps/s" in text
     assert ("iteration 2 of 5: " in text) != is_terminal
@@ -171,36 +165,5 @@ def test_a_narrow_terminal_shows_total_time_left_and_success():
     console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
     with display.TrainingLine(console, 1150) as progress, console.capture() as shown:
         numbers = {"success": 1.0, "validation_success": 1.0, "episodes": 1_177_600}
-        progress.show(row(1149, **numbers))
+        progress.show(metrics_row(1149, **numbers))
     assert re.search(r"1149/1150 .* left, 100.0% solved, 100.0% greedily, ", shown.get())
-
-
-@pytest.mark.parametrize(
-    ("settings", "episodes", "expected"),
-    [
-        ({"stop_when_solved": 1.0}, 4321, "--preset best"),
-        ({"stop_when_solved": 1.0}, None, "--iterations 14"),
-        ({"stop_when_solved": 0.0, "lr_decay_fraction": 0.5}, None, "report.html"),
-        ({"stop_when_solved": 0.0, "max_transitions": 100}, None, "report.html"),
-    ],
-)
-def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected, tmp_path):
-    run = Run(small_config(iterations=7, **settings))
-    folder = RunFolder(tmp_path)
-    solved = [row(2, validation_success=1.0, episodes=episodes)] if episodes else []
-    rows = [row(1), *solved, row(3, validation_success=1.0, episodes=9999)] if solved else [row(1)]
-    append_rows(folder.metrics, rows)
-    assert "report.html" not in "".join(display.summary(folder, run)), "with --no-report"
-    folder.page.touch()
-    lines = display.summary(folder, run)
-    assert lines[-1].endswith(expected)
-    solved = "First solved base after 4,321 episodes; --stop-when-solved 0 trains on."
-    assert (solved in lines) == bool(episodes)
-
-
-def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
-    run = Run(small_config(stop_when_solved=0.995))
-    folder = RunFolder(tmp_path)
-    append_rows(folder.metrics, [row(1, validation_success=0.996)])
-    solved = "First solved 99.5 % of base after 8 episodes; --stop-when-solved 0 trains on."
-    assert display.summary(folder, run)[0] == solved

@@ -369,7 +369,7 @@ def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monke
     assert final_state(tmp_path / "x")[0] == 2
 
 
-def test_the_page_of_a_run_is_gone_while_it_trains_on(tmp_path, monkeypatch):
+def test_the_page_of_a_run_stays_until_new_scores_replace_it(tmp_path, monkeypatch):
     def diverge(after, metrics):
         return after, {**metrics, "intrinsic_reward": jnp.float32(np.nan)}
 
@@ -379,7 +379,7 @@ def test_the_page_of_a_run_is_gone_while_it_trains_on(tmp_path, monkeypatch):
     folder.page.touch()
     with pytest.raises(ValueError, match=r"'effects' returned a reward that is not finite in iter"):
         train_run(folder.path, small_run(), dataclasses.replace(PLAIN, report=True))
-    assert not folder.page.exists()
+    assert folder.page.exists()
 
 
 def test_a_run_stops_after_the_iteration_in_which_it_is_asked_to(tmp_path, monkeypatch):
