@@ -1,13 +1,11 @@
 """Runs from Python: what they write, how they continue, and how they end badly."""
 
 import dataclasses
-import functools
 import io
 import itertools
 import shutil
 from types import SimpleNamespace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -16,64 +14,30 @@ from rich.console import Console
 
 import agents
 import trap_tube_jax as tt
-from agents.acting.evaluation import Evaluation
 from agents.arrays import read_arrays, write_arrays
-from agents.ppo.learner import Learner
 from agents.runs import checkpoint, history, program, progress, session
-from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
 from agents.runs.progress import Progress
 from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
-from agents.runs.session import train_run, train_runs
+from agents.runs.session import train_run
 from helpers.small_runs import final_state, small_config, untimed
-from helpers.trees import assert_same
+from helpers.training import (
+    ITERATIONS,
+    PLAIN,
+    TRACKED,
+    count_up,
+    outcome,
+    replace_training,
+    small_run,
+)
 from trap_tube_jax.interruptions import Stopped
 from trap_tube_jax.scoring import suite
-from trap_tube_jax.scoring.scores import Scores
 from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks
 
-ITERATIONS = 6
-TRACKED = RunOptions(
-    checkpoint_every=3, evaluate_every=2, sets=("base", "p"), test_tasks=3, report=False
-)
-PLAIN = RunOptions(checkpoint_every=2, sets=("base",), report=False)
 ASKED: list[tuple[str, str]] = []  # sets and purposes of the tasks that `whole` has drawn
-
-
-def small_run(iterations=ITERATIONS, **values):
-    replay = {"replay_fractions": (0.25, 0.25), "replay_capacity": 5}
-    return Run(small_config(iterations=iterations, motion_coef=0.5, **replay), **values)
-
-
-def replace_training(monkeypatch, change, evaluate=None):
-    """Makes an iteration count and set its metrics to 0, then `change` what it returns.
-
-    Validation tasks are played by `evaluate`, or not solved.
-    """
-    iterate = Learner.iterate
-
-    def count(self, state):
-        _, metrics = jax.eval_shape(functools.partial(iterate, self), state)
-        metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
-        return change(state._replace(iteration=state.iteration + 1), metrics)
-
-    def fail(*_):
-        return outcome(jnp.array([False]))
-
-    monkeypatch.setattr(Learner, "iterate", count)
-    monkeypatch.setattr(program, "evaluate", evaluate or fail)
-
-
-def outcome(solved):
-    return Evaluation(solved, *jnp.ones((3, len(solved))))
-
-
-def count_up(state, metrics):
-    """Adds 1 to all parameters."""
-    return state._replace(params=jax.tree.map(lambda x: x + 1, state.params)), metrics
 
 
 @pytest.fixture(scope="module")
@@ -369,17 +333,13 @@ def test_divergence_stops_training_and_keeps_the_last_checkpoint(tmp_path, monke
     assert final_state(tmp_path / "x")[0] == 2
 
 
-def test_the_page_of_a_run_stays_until_new_scores_replace_it(tmp_path, monkeypatch):
+def test_a_reward_that_is_not_finite_names_its_curiosity(tmp_path, monkeypatch):
     def diverge(after, metrics):
         return after, {**metrics, "intrinsic_reward": jnp.float32(np.nan)}
 
     replace_training(monkeypatch, diverge)
-    folder = RunFolder(tmp_path / "x")
-    folder.path.mkdir()
-    folder.page.touch()
     with pytest.raises(ValueError, match=r"'effects' returned a reward that is not finite in iter"):
-        train_run(folder.path, small_run(), dataclasses.replace(PLAIN, report=True))
-    assert folder.page.exists()
+        train_run(tmp_path / "x", small_run(), PLAIN)
 
 
 def test_a_run_stops_after_the_iteration_in_which_it_is_asked_to(tmp_path, monkeypatch):
@@ -453,91 +413,3 @@ def test_without_evaluation_the_final_policy_is_tested_on_all_sets(tmp_path):
     assert rows["task_set"].tolist() == list(ALL_SETS)
     assert set(zip(rows["purpose"], rows["iteration"], strict=True)) == {("test", 1)}
     assert not RunFolder(tmp_path / "x").best.exists()
-
-
-SEEDS = (3, 4)
-
-
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    """Folders of two seeds that train alone for three iterations."""
-    root = tmp_path_factory.mktemp("alone")
-    for seed in SEEDS:
-        train_run(root / f"{seed}", small_run(3, seed=seed), TRACKED)
-    return root
-
-
-def assert_same_rows(found, wanted):
-    for seed in SEEDS:
-        ours, theirs = (pd.DataFrame(untimed(root / f"{seed}")) for root in (found, wanted))
-        pd.testing.assert_frame_equal(ours.astype(float), theirs.astype(float), rtol=1e-3)
-
-
-def test_seeds_of_one_program_equal_seeds_alone(alone, tmp_path):
-    runs = {tmp_path / f"{seed}": small_run(3, seed=seed) for seed in SEEDS}
-    assert all(train_runs(runs, TRACKED).values())
-    assert_same_rows(tmp_path, alone)
-    for path in runs:
-        ours, theirs = (
-            read_rows(root / path.name / "evaluations.csv") for root in (tmp_path, alone)
-        )
-        pd.testing.assert_frame_equal(ours, theirs)
-        assert final_state(path)[0] == read_policy(RunFolder(path).best).iteration + 1 == 3
-
-
-@pytest.mark.slow
-def test_seeds_of_one_program_stop_together_and_go_on_from_where_they_stand(alone, tmp_path):
-    """The first is one iteration ahead."""
-    runs = {tmp_path / f"{seed}": small_run(3, seed=seed) for seed in SEEDS}
-    train_run(tmp_path / "3", small_run(1, seed=3), TRACKED)
-    outcomes = train_runs(runs, TRACKED, stop=lambda: True)
-    assert all(isinstance(outcome, Stopped) for outcome in outcomes.values())
-    assert [final_state(path)[0] for path in runs] == [2, 1]
-    train_runs(runs, TRACKED)
-    assert_same_rows(tmp_path, alone)
-
-
-def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
-    """Seed 0 cannot be begun, 1 diverges in iteration 2, 2 is solved then, 3 goes on."""
-    advance = program.Cohort.advance
-
-    def end(cohort):
-        metrics = {name: np.array(values) for name, values in advance(cohort).items()}
-        if metrics["episodes"].max() == 2 * 8:
-            metrics["loss"][0] = np.nan
-            metrics["validation_success"][1] = True
-        return metrics
-
-    tested = []
-    play = Evaluator.__call__
-
-    def record(evaluator, params):
-        tested.append(params)
-        return play(evaluator, params)
-
-    replace_training(monkeypatch, count_up)
-    monkeypatch.setattr(program.Cohort, "advance", end)
-    monkeypatch.setattr(Evaluator, "__call__", record)
-    config = small_config(iterations=3, stop_when_solved=1.0)
-    runs = {tmp_path / f"{seed}": Run(config, seed) for seed in range(4)}
-    RunFolder(tmp_path / "0").checkpoints.mkdir(parents=True)
-    costs = {"iteration": 1, "episodes": 8, "transitions": 48, "seconds": 1.0}
-    append_rows(tmp_path / "0" / "metrics.csv", [{**costs, "validation_success": 0.0}])
-    failed, diverged, solved, other = train_runs(runs, PLAIN).values()
-    assert "no checkpoint" in str(failed)
-    assert "diverged in iteration 2" in str(diverged)
-    assert isinstance(solved, Scores)
-    assert isinstance(other, Scores)
-    assert [final_state(path)[0] for path in runs if path.name != "0"] == [0, 2, 3]
-    (iteration,) = read_rows(tmp_path / "2" / "evaluations.csv")["iteration"]
-    assert iteration == 2
-    assert_same(tested[0], agents.load(tmp_path / "2").params)
-
-
-def test_runs_of_one_program_differ_only_in_their_seed(tmp_path):
-    runs = {tmp_path / "a": small_run(), tmp_path / "b": small_run(7)}
-    with pytest.raises(ValueError, match="differ only in their seed"):
-        train_runs(runs)
-    runs = {tmp_path / "a": small_run(), tmp_path / "b": small_run(seed=1)}
-    with pytest.raises(ValueError, match="use one device"):
-        train_runs(runs, RunOptions(devices=2))
