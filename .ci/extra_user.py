@@ -23,9 +23,10 @@ with LocalCluster(n_workers=1, threads_per_worker=1) as cluster:
 """
 COMPARE_PEERS = """
 from benchmarks import peers
+from benchmarks.env_throughput import task_set_subject
 
 options = peers.Options(sets=("base",), num_envs=(2,), num_steps=2, repeats=1)
-_, skipped = peers.measure(options)
+_, skipped = peers.measure(options, [task_set_subject("base")])
 assert not skipped, skipped
 """
 WHEEL_ALONE = ("pictures", "gymnasium", "gymnax")
