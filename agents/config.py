@@ -317,7 +317,7 @@ def _check_known_colors(env: tt.Environment) -> None:
     known = tt.base_palette(env.num_features)[[AGENT, FOOD]].tolist()
     palettes: Any = [env.base.palette]
     if not set(env.transfers) <= KEEP_COLORS:
-        states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 16))
+        states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 1024))
         palettes = states.palette
     for palette in np.asarray(palettes)[:, [AGENT, FOOD]].tolist():
         if palette != known:

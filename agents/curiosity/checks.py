@@ -1,7 +1,5 @@
 """Makes curiosities, and checks that they keep their contract, so that the learner need not."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import chex
@@ -41,7 +39,7 @@ class CheckedCuriosity(Curiosity):
         """
         self.name = config.curiosity
         self.curiosity = curiosity
-        with self._contract():
+        with contract("curiosity", self.name):
             kind = type(curiosity).__name__
             assert isinstance(curiosity, Curiosity), f"{kind} is no agents.curiosity.Curiosity"
             boards = jnp.zeros((2, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
@@ -58,14 +56,14 @@ class CheckedCuriosity(Curiosity):
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns reward and memory; see `Curiosity.reward`."""
-        with self._contract():
+        with contract("curiosity", self.name):
             returned = self.curiosity.reward(params, memory, experience)
             assert_like(returned, (experience.episodes.mask, memory))
         return returned
 
     def losses(self, params: Params, experience: Experience) -> dict[str, jax.Array]:
         """Returns terms of the loss; see `Curiosity.losses`."""
-        with self._contract():
+        with contract("curiosity", self.name):
             found = self.curiosity.losses(params, experience)
             assert isinstance(found, dict), f"losses are {type(found).__name__}, not a dict"
             wrong = [name for name in found if name in TAKEN or not name.endswith("_loss")]
@@ -75,11 +73,6 @@ class CheckedCuriosity(Curiosity):
             )
             assert_like(found, dict.fromkeys(found, experience.episodes.mask))
         return found
-
-    @contextmanager
-    def _contract(self) -> Iterator[None]:
-        with contract("curiosity", self.name):
-            yield
 
 
 def assert_like(returned: Any, wanted: Any) -> None:

@@ -45,6 +45,7 @@ class Agent:
             # Only Flax's own layers, in a registered encoder, use the folded key; see `draw`.
             features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
             chex.assert_shape(features, (1, None))  # [M, F]
+            chex.assert_axis_dimension_gt(features, 1, 0)
             chex.assert_type(features, jnp.float32)
             assert_only_params(encoder)
         state = jnp.zeros((1, self.config.hidden), jnp.float32)

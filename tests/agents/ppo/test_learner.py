@@ -1,4 +1,4 @@
-"""One iteration of training: tasks, weights of rewards, gradient steps, and what it refuses.
+"""One iteration of training: tasks, weights of rewards, gradient steps, settings it refuses.
 
 Play and gradient steps are replaced where they are not tested.
 """
@@ -7,13 +7,11 @@ import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from flax import nnx
 
 import trap_tube_jax as tt
 from agents import Config, make_learner
@@ -22,13 +20,10 @@ from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
 from agents.acting.symmetry import Symmetry
 from agents.arrays import to_arrays
-from agents.curiosity import Curiosity, Experience
-from agents.networks.encoder import Encoder
-from agents.networks.layers import init_module
-from agents.parallel.devices import EpisodeAxis
+from agents.curiosity import Experience
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
-from agents.registry import curiosities, encoders
+from helpers.curiosities import Returning
 from helpers.small_runs import SETTINGS
 from helpers.trees import assert_same, rows
 from trap_tube_jax.objects import AGENT
@@ -55,6 +50,16 @@ def recolour(key: jax.Array, state: tt.State) -> tt.State:
 
 
 RECOLOURED = tt.Environment((tt.perceptual, recolour))
+
+
+def recolour_rarely(key: jax.Array, state: tt.State) -> tt.State:
+    """Draws a colour for the agent in 5 % of tasks."""
+    chosen = jax.random.bernoulli(key, 0.05)
+    color = jnp.where(chosen, 7, state.palette[AGENT])
+    return state.replace(palette=state.palette.at[AGENT].set(color))
+
+
+RARELY_RECOLOURED = tt.Environment((recolour_rarely,))
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
 
@@ -266,22 +271,6 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
 
 
-class Returning(Curiosity):
-    """Returns what it was given, whatever that is."""
-
-    def __init__(self, reward=None, given=None, losses=None):
-        self.memory = lambda: jnp.zeros((), jnp.int32)
-        self.reward = lambda params, memory, experience: (
-            experience.episodes.reward if reward is None else reward,
-            memory if given is None else given,
-        )
-        self.losses = lambda params, experience: (
-            losses
-            if type(losses) is dict
-            else dict.fromkeys(losses or (), experience.episodes.reward)
-        )
-
-
 class Known(Learner):
     """Has seen an episode of two steps, of which the second is padding."""
 
@@ -324,20 +313,10 @@ def test_the_loss_adds_weighted_terms_of_the_steps_that_were_taken():
     assert found["entropy"] == pytest.approx(2 * np.log(4)), "a mean over steps taken"
 
 
-@pytest.fixture
-def with_curiosity(monkeypatch):
-    """Builds a learner with a curiosity."""
-
-    def build(curiosity, **arguments):
-        monkeypatch.setattr(curiosities, "factory", lambda name: lambda config, env: curiosity)
-        return make_learner(PLAIN, **arguments)
-
-    return build
-
-
-def test_an_intrinsic_reward_is_zero_after_the_end_of_an_episode(with_curiosity):
+def test_an_intrinsic_reward_is_zero_after_the_end_of_an_episode():
     nothing: Any = None
-    learner = Known(**vars(with_curiosity(Returning(reward=jnp.ones((1, 2))))))
+    custom = Returning(reward=jnp.ones((1, 2)))
+    learner = Known(**{**vars(make_learner(PLAIN)), "curiosity": custom})
     mask = jnp.array([[1.0, 0.0]])
     episodes = Episodes(nothing, nothing, nothing, nothing, nothing, mask)
     state: Any = SimpleNamespace(params={"curiosity": {}}, memory=jnp.int32(7))
@@ -347,142 +326,12 @@ def test_an_intrinsic_reward_is_zero_after_the_end_of_an_episode(with_curiosity)
     assert memory == 7
 
 
-@pytest.mark.parametrize(
-    ("returned", "message"),
-    [
-        ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(2, 6\)"),
-        ({"reward": jnp.zeros((2, 6), jnp.int32)}, "'none' .*int32 != float32"),
-        ({"given": jnp.zeros(2, jnp.int32)}, r"'none' .*\(2,\) != \(\)"),
-        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got policy_loss"),
-        ({"losses": ["mine"]}, "'none' .* motion_loss; got mine"),
-        ({"losses": {"my_loss": jnp.ones(3)}}, r"'none' .*\(3,\)"),
-    ],
-)
-def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returned, message):
-    custom = with_curiosity(Returning(**returned))
-    with pytest.raises(ValueError, match=message):
-        jax.eval_shape(custom.iterate, custom.init(jax.random.key(0)))
-
-
-class Broken(Curiosity):
-    """Has other methods."""
-
-    def __init__(self, **methods):
-        vars(self).update(methods)
-
-
-@pytest.mark.parametrize(
-    ("curiosity", "message"),
-    [
-        (None, "NoneType is no agents.curiosity.Curiosity"),
-        (Broken(init=lambda *_: {"n": jnp.arange(3)}), r"parameter \['n'\] is int32"),
-        (Broken(init=lambda key, x: init_module(Normalised(), key, x)), "batch_stats"),
-        (Broken(encode=lambda *_: None), "encode must return an array"),
-        (Broken(encode=lambda *_: jnp.zeros((1, 4))), r"\(1, 4\)"),
-        (Broken(encode=lambda params, x: jnp.zeros((len(x), 4), int)), "int32"),
-        (Broken(reward=lambda *_: None), "'none' breaks its contract"),
-        (Broken(reward=lambda *_: (0.0, ())), r"\(\) != \(2, 6\)"),
-        (Broken(losses=lambda *_: None), "losses are NoneType, not a dict"),
-        (Broken(losses=lambda *_: {"my_loss": None}), "'none' breaks its contract"),
-    ],
-)
-def test_whatever_a_curiosity_returns_is_refused_in_one_line(curiosity, message, with_curiosity):
-    def train() -> None:
-        made = with_curiosity(curiosity)
-        jax.eval_shape(made.iterate, jax.eval_shape(made.init, jax.random.key(0)))
-
-    with pytest.raises(ValueError, match=message) as error:
-        train()
-    assert "\n" not in str(error.value)
-
-
-class Maps(nn.Module):
-    """Returns maps instead of vectors."""
-
-    def __call__(self, observation):
-        return observation.astype(jnp.float32)
-
-
-class Whole(nn.Module):
-    """Returns integers."""
-
-    def __call__(self, observation):
-        return observation.reshape(len(observation), -1)
-
-
-class Normalised(nn.Module):
-    """Has statistics besides parameters."""
-
-    @nn.compact
-    def __call__(self, observation):
-        flat = observation.reshape(len(observation), -1) / jnp.float32(255)
-        return nn.BatchNorm(use_running_average=False)(flat)
-
-
-class Integer(nn.Module):
-    """Has a parameter that no gradient trains."""
-
-    @nn.compact
-    def __call__(self, observation):
-        count = self.param("count", lambda key: 3)
-        return observation.reshape(len(observation), -1) * jnp.float32(count)
-
-
-class Noisy(nn.Module):
-    """Draws at random."""
-
-    @nn.compact
-    def __call__(self, observation):
-        flat = observation.reshape(len(observation), -1) / jnp.float32(255)
-        return nn.Dropout(0.5, deterministic=False)(flat)
-
-
-@pytest.mark.parametrize(
-    ("module", "message"),
-    [
-        (Maps(), r"encoder 'mine' .*\(1, 12, 12, 3\)"),
-        (Whole(), "encoder 'mine' .*uint8"),
-        (Normalised(), "encoder 'mine' .*batch_stats"),
-        (Integer(), "encoder 'mine' .*count.* is int32"),
-        (Noisy(), "encoder 'mine' .*dropout"),
-        (nnx.Linear(3, 4, rngs=nnx.Rngs(0)), "must be a flax.linen.Module, got Linear"),
-        (None, "must be a flax.linen.Module, got NoneType"),
-    ],
-)
-def test_an_encoder_that_breaks_its_contract_is_refused_in_one_line(module, message, monkeypatch):
-    monkeypatch.setitem(encoders, "mine", lambda config: module)
-
-    def train() -> None:
-        made = make_learner(Config(encoder="mine"))
-        jax.eval_shape(made.iterate, made.init(jax.random.key(0)))
-
-    with pytest.raises(ValueError, match=message) as error:
-        train()
-    assert "\n" not in str(error.value)
-
-
-def test_two_encoders_of_one_module_share_no_parameters(monkeypatch):
-    """The predictor of `rnd` must not be its target."""
-    shared = Encoder((2, 2))
-    monkeypatch.setitem(encoders, "mine", lambda config: shared)
-    config = Config(**{**SETTINGS, "encoder": "mine", "curiosity": "rnd"})
-    params = make_learner(config).init(jax.random.key(0)).params["curiosity"]["params"]
-    assert set(params) == {"target", "predictor", "hidden", "output"}
-    target, predictor = (params[name]["conv1"]["kernel"] for name in ("target", "predictor"))
-    assert not np.any(np.isclose(target, predictor))
-
-
 @pytest.mark.parametrize("backend", ["gpu", "tpu"])
 def test_an_accelerator_takes_the_plain_path(backend, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     made = make_learner(PLAIN)
     assert made.path == "plain"
     assert made.agent.core.scan_unroll > 1
-
-
-def test_devices_average_floats_only(with_curiosity):
-    with pytest.raises(ValueError, match="'none' cannot train on several devices"):
-        with_curiosity(Returning(), axis=EpisodeAxis(2))
 
 
 @pytest.mark.parametrize(
@@ -494,6 +343,7 @@ def test_devices_average_floats_only(with_curiosity):
         ({"encoder": "objects"}, OWN_COLORS, "know agent and food by the colours"),
         ({"align_to_food": True}, OWN_COLORS, "know agent and food by the colours"),
         ({"align_to_food": True}, RECOLOURED, "know agent and food by the colours"),
+        ({"align_to_food": True}, RARELY_RECOLOURED, "know agent and food by the colours"),
         ({"iterations": 2**20, "epochs": 10_000, "max_steps": 1}, None, "gradient steps"),
     ],
 )

@@ -1,0 +1,168 @@
+"""Registered curiosities and encoders: each breach of their contract is refused in one line."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from agents import Config, make_learner
+from agents.curiosity import Curiosity
+from agents.networks.encoder import Encoder
+from agents.networks.layers import init_module
+from agents.parallel.devices import EpisodeAxis
+from agents.registry import curiosities, encoders
+from helpers.curiosities import Returning
+from helpers.small_runs import SETTINGS
+
+PLAIN = Config(**{**SETTINGS, "episodes_per_iteration": 2, "minibatch_size": 2}, curiosity="none")
+
+
+@pytest.fixture
+def with_curiosity(monkeypatch):
+    """Builds a learner with a curiosity."""
+
+    def build(curiosity, **arguments):
+        monkeypatch.setattr(curiosities, "factory", lambda name: lambda config, env: curiosity)
+        return make_learner(PLAIN, **arguments)
+
+    return build
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        ({"reward": jnp.zeros(3, jnp.float32)}, r"'none' .*\(3,\) != \(2, 6\)"),
+        ({"reward": jnp.zeros((2, 6), jnp.int32)}, "'none' .*int32 != float32"),
+        ({"given": jnp.zeros(2, jnp.int32)}, r"'none' .*\(2,\) != \(\)"),
+        ({"losses": ["policy_loss"]}, "must end in '_loss' .* got policy_loss"),
+        ({"losses": ["mine"]}, "'none' .* motion_loss; got mine"),
+        ({"losses": {"my_loss": jnp.ones(3)}}, r"'none' .*\(3,\)"),
+    ],
+)
+def test_a_curiosity_that_breaks_its_contract_is_refused(with_curiosity, returned, message):
+    custom = with_curiosity(Returning(**returned))
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(custom.iterate, custom.init(jax.random.key(0)))
+
+
+class Broken(Curiosity):
+    """Has other methods."""
+
+    def __init__(self, **methods):
+        vars(self).update(methods)
+
+
+@pytest.mark.parametrize(
+    ("curiosity", "message"),
+    [
+        (None, "NoneType is no agents.curiosity.Curiosity"),
+        (Broken(init=lambda *_: {"n": jnp.arange(3)}), r"parameter \['n'\] is int32"),
+        (Broken(init=lambda key, x: init_module(Normalised(), key, x)), "batch_stats"),
+        (Broken(encode=lambda *_: None), "encode must return an array"),
+        (Broken(encode=lambda *_: jnp.zeros((1, 4))), r"\(1, 4\)"),
+        (Broken(encode=lambda params, x: jnp.zeros((len(x), 4), int)), "int32"),
+        (Broken(reward=lambda *_: None), "'none' breaks its contract"),
+        (Broken(reward=lambda *_: (0.0, ())), r"\(\) != \(2, 6\)"),
+        (Broken(losses=lambda *_: None), "losses are NoneType, not a dict"),
+        (Broken(losses=lambda *_: {"my_loss": None}), "'none' breaks its contract"),
+    ],
+)
+def test_whatever_a_curiosity_returns_is_refused_in_one_line(curiosity, message, with_curiosity):
+    def train() -> None:
+        made = with_curiosity(curiosity)
+        jax.eval_shape(made.iterate, jax.eval_shape(made.init, jax.random.key(0)))
+
+    with pytest.raises(ValueError, match=message) as error:
+        train()
+    assert "\n" not in str(error.value)
+
+
+class Maps(nn.Module):
+    """Returns maps instead of vectors."""
+
+    def __call__(self, observation):
+        return observation.astype(jnp.float32)
+
+
+class Whole(nn.Module):
+    """Returns integers."""
+
+    def __call__(self, observation):
+        return observation.reshape(len(observation), -1)
+
+
+class Nothing(nn.Module):
+    """Returns no features."""
+
+    def __call__(self, observation):
+        return jnp.zeros((len(observation), 0))
+
+
+class Normalised(nn.Module):
+    """Has statistics besides parameters."""
+
+    @nn.compact
+    def __call__(self, observation):
+        flat = observation.reshape(len(observation), -1) / jnp.float32(255)
+        return nn.BatchNorm(use_running_average=False)(flat)
+
+
+class Integer(nn.Module):
+    """Has a parameter that no gradient trains."""
+
+    @nn.compact
+    def __call__(self, observation):
+        count = self.param("count", lambda key: 3)
+        return observation.reshape(len(observation), -1) * jnp.float32(count)
+
+
+class Noisy(nn.Module):
+    """Draws at random."""
+
+    @nn.compact
+    def __call__(self, observation):
+        flat = observation.reshape(len(observation), -1) / jnp.float32(255)
+        return nn.Dropout(0.5, deterministic=False)(flat)
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (Maps(), r"encoder 'mine' .*\(1, 12, 12, 3\)"),
+        (Whole(), "encoder 'mine' .*uint8"),
+        (Nothing(), "encoder 'mine' .*greater than '0' on axis '1'"),
+        (Normalised(), "encoder 'mine' .*batch_stats"),
+        (Integer(), "encoder 'mine' .*count.* is int32"),
+        (Noisy(), "encoder 'mine' .*dropout"),
+        (nnx.Linear(3, 4, rngs=nnx.Rngs(0)), "must be a flax.linen.Module, got Linear"),
+        (None, "must be a flax.linen.Module, got NoneType"),
+    ],
+)
+def test_an_encoder_that_breaks_its_contract_is_refused_in_one_line(module, message, monkeypatch):
+    monkeypatch.setitem(encoders, "mine", lambda config: module)
+
+    def train() -> None:
+        made = make_learner(Config(encoder="mine"))
+        jax.eval_shape(made.iterate, made.init(jax.random.key(0)))
+
+    with pytest.raises(ValueError, match=message) as error:
+        train()
+    assert "\n" not in str(error.value)
+
+
+def test_two_encoders_of_one_module_share_no_parameters(monkeypatch):
+    """The predictor of `rnd` must not be its target."""
+    shared = Encoder((2, 2))
+    monkeypatch.setitem(encoders, "mine", lambda config: shared)
+    config = Config(**{**SETTINGS, "encoder": "mine", "curiosity": "rnd"})
+    params = make_learner(config).init(jax.random.key(0)).params["curiosity"]["params"]
+    assert set(params) == {"target", "predictor", "hidden", "output"}
+    target, predictor = (params[name]["conv1"]["kernel"] for name in ("target", "predictor"))
+    assert not np.any(np.isclose(target, predictor))
+
+
+def test_devices_average_floats_only(with_curiosity):
+    with pytest.raises(ValueError, match="'none' cannot train on several devices"):
+        with_curiosity(Returning(), axis=EpisodeAxis(2))
