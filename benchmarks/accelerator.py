@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 from benchmarks import harness
+from trap_tube_jax.interruptions import Stopped, deferring, stopping
 
 # The module and its options, by the name of the record. `gpu_best_second_start` finds the programs
 # that `gpu_best_first_start` has compiled.
@@ -74,14 +75,18 @@ def run(name: str, words: list[str], options: Options) -> bool:
         command += ["--output", str(options.output / f"{name}.json")]
     print(f"== {name}: {' '.join(command[1:])}", flush=True)
     start = time.perf_counter()
-    try:
-        code = subprocess.run(command, timeout=options.limit, check=False).returncode
-    except subprocess.TimeoutExpired:
-        code = None
-    outcome = "stopped" if code is None else f"exit code {code}"
+    outcome = "stopped"
+    with subprocess.Popen(command) as process, deferring(process.terminate) as request:
+        try:
+            outcome = f"exit code {process.wait(options.limit)}"
+        except subprocess.TimeoutExpired:
+            process.kill()
+    if number := request():
+        raise Stopped(number)
     print(f"== {name}: {outcome} after {time.perf_counter() - start:.0f} s", flush=True)
-    return code == 0
+    return process.returncode == 0
 
 
 if __name__ == "__main__":
-    harness.run(lambda options: sys.exit(bool(main(options))), Options, "accelerator")
+    with stopping(lambda: "The same command starts again."):
+        harness.run(lambda options: sys.exit(bool(main(options))), Options, "accelerator")
