@@ -65,7 +65,7 @@ class Progress:
         done = self.iteration
         if done > (limit := run.config.iterations):
             raise ValueError(f"iterations must be at least {done}, which are done, got {limit}")
-        check_rows(stored, done)
+        check_rows(stored, run, done, program.sets, program.options.evaluate_every)
         if program.validation:
             check_best(stored, done, program.sets)
         first = program.init(run.seed) if restored is None else restored

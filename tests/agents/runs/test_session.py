@@ -254,6 +254,27 @@ def test_other_sets_are_compared_by_those_in_common(copy):
     assert contents(copy) == before
 
 
+@pytest.mark.parametrize("changed", [{"sets": ("p",)}, {"evaluate_every": 0}])
+def test_evaluations_that_would_not_be_made_again_are_kept(copy, changed):
+    remove(copy / "checkpoints" / "6.safetensors")
+    before = contents(copy)
+    message = "has the evaluation of iteration 4 on base, which is after the newest checkpoint"
+    with pytest.raises(ValueError, match=message):
+        train_run(copy, small_run(), dataclasses.replace(TRACKED, **changed))
+    assert contents(copy) == before
+
+
+def test_evaluations_after_the_newest_checkpoint_are_made_again(copy):
+    rows = (copy / "evaluations.csv").read_text()
+    remove(copy / "checkpoints" / "6.safetensors")
+    rarely = dataclasses.replace(TRACKED, evaluate_every=4)
+    with pytest.raises(ValueError, match="has the evaluation of iteration 6 on base"):
+        train_run(copy, small_run(iterations=ITERATIONS + 1), rarely)
+    train_run(copy, small_run(), TRACKED)
+    again = (copy / "evaluations.csv").read_text()
+    assert sorted(again.splitlines()) == sorted(rows.splitlines())
+
+
 def test_scores_of_new_sets_are_recorded(copy):
     more = dataclasses.replace(TRACKED, sets=("p", "st"))
     scores = train_run(copy, small_run(), more)
