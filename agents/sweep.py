@@ -11,7 +11,7 @@ from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder
 from agents.sweeps import records
 from agents.sweeps.grids import Grid
-from agents.sweeps.launcher import group_runs, launch
+from agents.sweeps.launcher import launch
 from agents.sweeps.workers import capacity, make_executor
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import run_command, stopping
@@ -41,8 +41,7 @@ def main(
             with workers as executor, RunFolder(root).lock():
                 records.check(root)
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
-                groups = group_runs(runs, run_options, executor, options.seeds_per_program)
-                failed = launch(groups, run_options, executor, console)
+                failed = launch(runs, run_options, executor, console, options.seeds_per_program)
                 if any(RunFolder(path).metrics.exists() for path in runs):
                     records.collect(root, f"{program} {shlex.join(arguments)}".strip())
                     console.out(records.write_tables(root))

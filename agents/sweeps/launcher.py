@@ -1,7 +1,7 @@
 """Trains the runs of a grid, several at a time, by any executor."""
 
 import multiprocessing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 
@@ -53,21 +53,27 @@ def group_runs(
 
 
 def launch(
-    groups: Sequence[Group], options: RunOptions, executor: Executor, console: Console
+    runs: Group,
+    options: RunOptions,
+    executor: Executor,
+    console: Console,
+    size: int | None = None,
 ) -> list[Path]:
     """Trains all runs, whose folders share a parent, and returns the folders of those that failed.
 
-    The executor's workers share this file system. The console shows outcomes and progress.
+    The executor's workers share this file system. The console shows outcomes and progress. `size`
+    is the largest number of seeds in a program; see `group_runs`.
 
     Raises:
       Stopped: on a signal, after all runs have saved their current iteration.
       KeyboardInterrupt: on a second signal; processes of this machine are killed.
     """
-    runs = {path: run for group in groups for path, run in group.items()}
+    # First, because the workers of a lost launcher are busy until they learn of this one.
     present = Launch.begin(next(iter(runs)).parent)
     failed: list[Path] = []
     count = 0
     try:
+        groups = group_runs(runs, options, executor, size)
         with deferring(present.end) as request, Overview(console, runs) as overview:
             calls = {executor.submit(*_call(group, options, present)): group for group in groups}
             pending = set(calls)

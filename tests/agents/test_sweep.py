@@ -38,9 +38,9 @@ def launch_three(monkeypatch, tmp_path, train_runs, names=("a", "b", "c")):
     """Launches runs in a thread; returns the failed ones' names and what was printed."""
     monkeypatch.setattr(workers, "train_runs", train_runs)
     console = Console(record=True, width=60)
-    groups = [{tmp_path / name: Run(Config())} for name in names]
+    runs = {tmp_path / name: Run(Config()) for name in names}
     with ThreadPoolExecutor(1) as executor:
-        failed = launch(groups, RunOptions(), executor, console)
+        failed = launch(runs, RunOptions(), executor, console)
     return [path.name for path in failed], console.export_text()
 
 
@@ -126,7 +126,7 @@ def test_calls_that_are_lost_are_failures_unless_their_runs_have_ended(tmp_path)
     runs = {tmp_path / name: Run(Config()) for name in "ab"}
     end(tmp_path / "a")
     console = Console(record=True)
-    assert launch([runs], RunOptions(), Lost(), console) == [tmp_path / "b"]
+    assert launch(runs, RunOptions(), Lost(), console) == [tmp_path / "b"]
     assert "b: failed: its worker, or the scheduler" in console.export_text()
     assert not (tmp_path / ".launch").exists(), "orphans stop"
 
@@ -368,6 +368,29 @@ def test_a_lost_scheduler_is_a_failure(tmp_path, cluster):
         assert f"fast-seed{seed}: failed" in output
     assert "unfinished" in output
     assert not (tmp_path / "x" / ".launch").exists(), "its workers would train on"
+
+
+@pytest.mark.slow
+def test_a_run_of_a_lost_launcher_goes_on_with_the_next(tmp_path, cluster):
+    """The cluster's worker trains on, until the same command is given again."""
+    arguments = ["--cluster", cluster[1]]
+    lost = start_endless(tmp_path, *arguments)
+    lost.kill()
+    lost.communicate()
+    folder = tmp_path / "x" / "fast-seed0"
+    assert workers.is_being_written(folder)
+    process = start_endless(tmp_path, *arguments)
+    log = workers.log_of(folder)
+    while log.read_text().count("Compiling") < 2:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.2)
+            pytest.fail(str(process.communicate()))
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate()
+    assert (process.returncode, output.count(": stopped\n")) == (130, 2), errors
+    iterations = [row["iteration"] for row in small_runs.untimed(folder)]
+    assert iterations == list(map(str, range(1, len(iterations) + 1)))
+    assert small_runs.final_state(folder)[0] == len(iterations)
 
 
 @pytest.mark.slow
