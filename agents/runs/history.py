@@ -31,13 +31,11 @@ def restore(folder: RunFolder, shapes: TrainState) -> tuple[TrainState | None, R
     return state, row if done else None
 
 
-def check_rows(
-    folder: RunFolder, run: Run, iteration: int, sets: Sequence[str], evaluate_every: int
-) -> None:
+def check_rows(folder: RunFolder, iteration: int) -> None:
     """Raises ValueError unless a run's rows lead up to its newest checkpoint, at `iteration`.
 
-    Rows may go on after the checkpoint if training with these options makes them again. Without a
-    checkpoint it would replace all of them, which may be the only results.
+    Rows may go on after the checkpoint: training makes them again. Without a checkpoint it would
+    replace all of them, which may be the only results.
     """
     rows = read_rows(folder.metrics)
     evaluated = read_rows(folder.evaluations)
@@ -52,16 +50,6 @@ def check_rows(
             f"{folder.metrics} ends before the checkpoint of iteration {iteration}; restore it, or "
             "train under another --name"
         )
-    is_end = {row["iteration"]: is_last(row, run.config) for row in rows.to_dict("records")}
-    for row in evaluated[evaluated["iteration"] > iteration].to_dict("records"):
-        done = row["iteration"]
-        is_due = evaluate_every and (done % evaluate_every == 0 or is_end.get(done))
-        if row["task_set"] not in sets or not (row["purpose"] == "test" or is_due):
-            raise ValueError(
-                f"{folder.evaluations} has the evaluation of iteration {done} on "
-                f"{row['task_set']}, which is after the newest checkpoint and would not be made "
-                "again; continue with the --sets and --evaluate-every of before"
-            )
 
 
 def has_ended(folder: RunFolder, run: Run) -> bool:

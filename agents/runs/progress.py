@@ -65,7 +65,8 @@ class Progress:
         done = self.iteration
         if done > (limit := run.config.iterations):
             raise ValueError(f"iterations must be at least {done}, which are done, got {limit}")
-        check_rows(stored, run, done, program.sets, program.options.evaluate_every)
+        check_rows(stored, done)
+        self._check_evaluations()
         if program.validation:
             check_best(stored, done, program.sets)
         first = program.init(run.seed) if restored is None else restored
@@ -169,6 +170,22 @@ class Progress:
             self.console.out("Drawing the report, which takes up to half a minute ...")
             report.write(self.folder, self.run, evaluator, played)
         return scores
+
+    def _check_evaluations(self) -> None:
+        """Raises ValueError if evaluations after the checkpoint would not be made again."""
+        every = self.program.options.evaluate_every
+        metrics = read_rows(self.stored.metrics).to_dict("records")
+        ends = {row["iteration"] for row in metrics if is_last(row, self.run.config)}
+        rows = read_rows(self.stored.evaluations)
+        for row in rows[rows["iteration"] > self.iteration].to_dict("records"):
+            done = row["iteration"]
+            is_due = every and (done % every == 0 or done in ends)
+            if row["task_set"] not in self.program.sets or not (row["purpose"] == "test" or is_due):
+                raise ValueError(
+                    f"{self.stored.evaluations} has the evaluation of iteration {done} on "
+                    f"{row['task_set']}, which is after the newest checkpoint and would not be "
+                    "made again; continue with the --sets and --evaluate-every of before"
+                )
 
     def _row(self, metrics: Metrics, seconds: float) -> Row:
         """Returns a row of metrics.
