@@ -24,7 +24,7 @@ SETTINGS = {
     "jax_compilation_cache_dir": str(Path(os.environ["XDG_CACHE_HOME"], "trap_tube_jax", "jax")),
     "jax_persistent_cache_min_compile_time_secs": 0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
-    # One core each for tests that run side by side.
+    # Tests that run side by side use one core per process.
     "jax_num_cpu_devices": 1,
     # An accidental broadcast between ranks is a bug that a shape test may not see.
     "jax_numpy_rank_promotion": "raise",

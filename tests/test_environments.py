@@ -28,7 +28,7 @@ READ_ONLY = "/proc/self"  # a home in which nobody can write
 def test_the_suite_passes_under_settings_of_users(settings):
     environment = {**os.environ, **settings}
     environment = {name: value for name, value in environment.items() if value is not None}
-    for name in ("PYTEST_XDIST_WORKER", "XDG_CACHE_HOME"):  # the suite's own
+    for name in ("PYTEST_XDIST_WORKER", "XDG_CACHE_HOME"):  # set by the test suite
         environment.pop(name, None)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
     done = subprocess.run(

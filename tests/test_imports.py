@@ -13,7 +13,7 @@ import tomllib
 import trap_tube_jax as tt
 from helpers.paths import ROOT
 
-# Lower rooms never import higher ones. Modules of a package itself are rooms of their own.
+# Lower rooms never import higher ones. A module directly in a package is a room, too.
 ENVIRONMENT = (
     ("_version", "by_value", "checks", "imports", "interruptions", "command_line", "tables"),
     ("objects", "geometry", "prng"),

@@ -147,7 +147,7 @@ def percent_solved(record: str) -> Any:
 
 
 def steps(record: str) -> Any:
-    """Returns the environment steps of each seed of a record."""
+    """Returns the environment steps of a record's seeds."""
     return rows_of(record, "curves").groupby("seed")["transitions"].max()
 
 

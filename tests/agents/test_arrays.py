@@ -1,4 +1,4 @@
-"""Pytrees as tables of arrays: inverse of each other, and misfits are named."""
+"""Pytrees to tables of arrays and back; errors name what does not fit."""
 
 import jax
 import jax.numpy as jnp

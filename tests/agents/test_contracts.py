@@ -1,4 +1,4 @@
-"""Registered curiosities and encoders: each breach of their contract is refused in one line."""
+"""Registered curiosities and encoders: a breach of their contract is refused in one line."""
 
 import flax.linen as nn
 import jax

@@ -1,4 +1,4 @@
-"""The page on own curiosities, encoders and tasks: its module and its commands, as they are."""
+"""Runs the module and the commands of extending.md as they are printed."""
 
 import os
 import re

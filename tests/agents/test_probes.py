@@ -1,4 +1,4 @@
-"""The whole learner on environments that isolate one ability each."""
+"""The whole learner on environments that isolate one ability."""
 
 from collections.abc import Callable
 

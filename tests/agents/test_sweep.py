@@ -45,7 +45,7 @@ def launch_three(monkeypatch, tmp_path, train_runs, names=("a", "b", "c")):
 
 
 def end(path):
-    """Makes a run's files those of a run that has ended."""
+    """Writes the files of a run that has ended."""
     folder = RunFolder(path)
     folder.path.mkdir(exist_ok=True)
     costs = {"iteration": 250, "episodes": 9, "transitions": 5, "seconds": 1.0}
@@ -113,7 +113,7 @@ def test_a_signal_stops_all_runs_and_they_go_on_with_the_next_launch(monkeypatch
 
 
 class Lost(Executor):
-    """An executor whose calls are lost as those of a Dask cluster are without its scheduler."""
+    """An executor whose calls are lost, as by a Dask cluster without its scheduler."""
 
     def submit(self, function, /, *args, **kwargs):
         call = Future()
@@ -197,7 +197,7 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
         (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
         (["--settings", "max_transitions=5"], "max_transitions must allow an iteration"),
         (["--only", "fst"], "no point 'fst'; allowed: fast"),
-        ([*NEAR_FOOD, "--only", "x"], "no point 'x'"),  # names of own sets are known in time
+        ([*NEAR_FOOD, "--only", "x"], "no point 'x'"),  # the module registers the set first
         (["--seeds", "0"], "seeds must be an integer >= 1 and <= 10000, got 0"),
         (["--seeds", "2000000000"], "seeds must be an integer >= 1 and <= 10000"),
         (["--seeds", "9", "--settings", MANY], "a grid has at most 10,000 runs, got 18,000"),

@@ -95,7 +95,7 @@ def results_of(name):
 
 
 def test_stated_speeds_are_of_their_records():
-    """A table marked `<!-- speeds: NAME NAME -->` has a row for each batch size of a record."""
+    """A table marked `<!-- speeds: NAME NAME -->` has a row per batch size of a record."""
     page = (RESULTS / "throughput.md").read_text()
     tables = re.findall(r"<!-- speeds: (.*?) -->\n\n(.*?)\n\n", page, re.DOTALL)
     assert len(tables) == 2

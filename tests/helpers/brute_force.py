@@ -39,7 +39,7 @@ class Graph(NamedTuple):
 
 
 def levels(state) -> Iterator[Level]:
-    """Yields the unsolved positions by fewest steps from the state, each once."""
+    """Yields the unsolved positions once, those with the fewest steps from the state first."""
     layout = spec.Layouts(np.asarray(state.board), np.asarray(state.tool_extent))
     cells = (state.agent, state.tool, state.food)
     positions = (np.stack(cells) @ (12, 1))[None]

@@ -1,4 +1,4 @@
-"""Tiny environments, each solvable only by an agent with one certain ability.
+"""Tiny environments that only an agent with one certain ability solves.
 
 They keep the trap-tube's states and observations, and replace what a step does. All are
 one environment of three steps whose kind is an array, so that they compile together.

@@ -38,7 +38,7 @@ def tally(shape: tuple[int, ...], *indices: np.ndarray) -> np.ndarray:
 
 
 def find_boards(boards: np.ndarray) -> np.ndarray:
-    """The index of each board among the 72 possible ones; -1 for any other."""
+    """Returns the indices of boards among the 72 possible ones; -1 for any other board."""
     weights = np.random.default_rng(0).integers(1, 2**40, 144)
     known = BOARDS.reshape(-1, 144).astype(np.int64) @ weights
     order = np.argsort(known)
@@ -49,7 +49,7 @@ def find_boards(boards: np.ndarray) -> np.ndarray:
 
 
 class Layout(NamedTuple):
-    """The choices of perceptual draws, each i64[n]; cells as flat indices."""
+    """Returns the choices i64[n] of perceptual draws; cells are flat indices."""
 
     outline: np.ndarray
     variant: np.ndarray

@@ -73,7 +73,7 @@ def unequal_copies(state):
 
 
 def gradient_gap():
-    """The largest relative difference between the gradient of a batch and that of two halves."""
+    """Returns the largest relative difference between the gradients of a batch and its halves."""
     learner = small_learner()
     state = jax.jit(learner.init)(jax.random.key(1))
 

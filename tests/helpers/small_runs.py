@@ -20,7 +20,10 @@ SETTINGS = {
     "embedding": 2,
     "eval_episodes": 2,
 }
-TIMING_COLUMNS = ("seconds", "transitions_per_second")  # of the metrics; differ each time
+TIMING_COLUMNS = (
+    "seconds",
+    "transitions_per_second",
+)  # differ between equal runs
 
 
 def small_config(**settings):

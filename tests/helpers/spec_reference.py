@@ -67,7 +67,7 @@ class Layouts(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Flags of one step: things that moved by one cell, and success."""
+    """Flags of a step: which objects moved by a cell, and success."""
 
     food: np.ndarray
     tool: np.ndarray
@@ -89,7 +89,7 @@ def on_board(cell: Cell) -> np.ndarray:
 
 
 def step(layouts: Layouts, agent: Cell, tool: Cell, food: Cell, action: tuple) -> Moved:
-    """One step of an action (grasp, move). All arrays broadcast against each other."""
+    """Takes a step with an action (grasp, move). All arrays broadcast."""
     grasp, move = action
     d = Cell(*np.moveaxis(DIRECTIONS[move], -1, 0))
     next_to = agent.shifted(Cell(*np.moveaxis(DIRECTIONS[grasp], -1, 0)))

@@ -21,7 +21,7 @@ CONFIG = Config(
     embedding=2,
     curiosity="none",
 )
-# The food next to the agent, on each side in turn: the first move of any policy solves one.
+# The food is next to the agent, on one of four sides: any first move solves one of the tasks.
 FOOD_CELLS = [(8, 1), (10, 1), (9, 0), (9, 2)]
 
 

@@ -8,7 +8,7 @@ import trap_tube_jax as tt
 
 @pytest.fixture(autouse=True)
 def _allow_rank_promotion():
-    """Other libraries broadcast between ranks; our own tests elsewhere forbid it."""
+    """Allows broadcasting between ranks, which other libraries use and the other tests forbid."""
     with jax.numpy_rank_promotion("allow"):
         yield
 

@@ -1,4 +1,4 @@
-"""The adapters without their libraries, and the batch that resets in a step of its own."""
+"""The adapters without their libraries, and the batch whose resets take a step."""
 
 import importlib
 import sys

@@ -115,7 +115,7 @@ OVER = EASY.replace(time=jnp.int32(1), truncated=jnp.array(True))
 
 
 @pytest.mark.parametrize(
-    ("state", "actions", "expected"),  # reward, terminated, truncated and discount of each step
+    ("state", "actions", "expected"),  # per step: reward, terminated, truncated and discount
     [
         (EASY, [RIGHT, RIGHT, DOWN], [(0, 0, 0, 1), (1, 1, 0, 0), (0, 1, 0, 0)]),
         (EASY, [DOWN, RIGHT, RIGHT], [(0, 0, 0, 1), (0, 0, 1, 1), (0, 0, 1, 1)]),

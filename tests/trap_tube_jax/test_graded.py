@@ -142,7 +142,7 @@ def test_structural_of_strength_0_keeps_every_palette(num_features):
 
 
 def directions(palette: np.ndarray) -> np.ndarray:
-    """f64[..., N]: the middle of what becomes each feature, scaled to length 1."""
+    """Returns the middles f64[..., N] of the intervals of the features, scaled to length 1."""
     points = (palette.astype(float) + 0.5) / 255 * 2 - 1
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
 
@@ -169,7 +169,7 @@ def test_colours_turn_by_a_share_of_a_uniform_direction(strength, code):
 def test_structural_goes_to_every_side(strength):
     """Around the state's colour, no direction is preferred."""
     origin = directions(BASE.palette[spec.TOOL])
-    first = np.linalg.svd(origin[None])[2][1:]  # two vectors orthogonal to it and each other
+    first = np.linalg.svd(origin[None])[2][1:]  # two vectors orthogonal to it and to one another
     sides = directions(palettes(strength)[:, spec.TOOL]) @ first.T
     turns = np.arctan2(sides[:, 0], sides[:, 1]) / (2 * np.pi) % 1
     assert_fits(np.bincount((turns * 12).astype(int), minlength=12), np.full(12, 1 / 12))

@@ -1,4 +1,4 @@
-"""The first thing a user meets: `import trap_tube_jax`."""
+"""Importing `trap_tube_jax`: exports, documentation, and the registration with Gymnasium."""
 
 import re
 import sys

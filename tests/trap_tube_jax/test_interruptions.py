@@ -13,7 +13,7 @@ PROGRAM = """
 import hashlib, signal
 from trap_tube_jax.interruptions import Stopped, deferring, run_command, stopping
 
-def compute():  # as XLA does: Python's own handlers would wait for its end
+def compute():  # in C, as XLA does: Python's signal handlers wait until it returns
     print("ready", flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
 
@@ -78,7 +78,7 @@ def test_on_a_terminal_the_words_begin_a_line():
 
 
 def test_ignored_signals_stay_ignored():
-    """As `nohup` ignores that of a closed terminal."""
+    """As `nohup` ignores SIGHUP."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # which a new process inherits
     try:
         process = start(SAVES)

@@ -28,7 +28,7 @@ TRANSFERS = (
     tt.symbolic,
     raised_agent,
 )
-BASE = tt.base_state().replace(food=np.array([5, 6]))  # of NumPy's own 64 bits
+BASE = tt.base_state().replace(food=np.array([5, 6]))  # int64, NumPy's default
 STEPS = 4
 
 

@@ -1,4 +1,4 @@
-"""Counts of layouts: those of {P}, and those that a training run meets."""
+"""Counts of the layouts of {P}, and of those that a training run meets."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from trap_tube_jax.transfers import SYMBOLIC_OBJECTS
 
 @pytest.fixture(scope="module")
 def layouts() -> tuple[np.ndarray, np.ndarray]:
-    """Of layouts that are equally likely: the chance f64[K] of each, and how many i64[K] there are.
+    """Groups equally likely layouts: the probability f64[K] of one, and their number i64[K].
 
     Layouts that look the same are one.
     """

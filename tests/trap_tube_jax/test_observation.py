@@ -11,7 +11,7 @@ import trap_tube_jax as tt
 
 @pytest.fixture(scope="module")
 def scattered() -> list[tt.State]:
-    """States with everything anywhere, one thing over another included."""
+    """States with objects in any cells, also on top of one another."""
     random = np.random.default_rng(7)
     states = []
     for _ in range(200):

@@ -164,7 +164,7 @@ def read_until(terminal, text):
     return shown
 
 
-# Plays as a shell's child, and says whether the terminal is as before.
+# Plays as the child of a shell, and prints whether the terminal's modes were restored.
 SHELL = """
 import os, signal, subprocess, sys, termios
 os.login_tty(0)

@@ -89,7 +89,7 @@ def test_a_tool_may_reach_the_last_cell(extent):
     np.testing.assert_array_equal(state.tool, corner)
 
 
-# Arrays in place of the good ones, and the message's words.
+# Invalid arrays, and words of the error.
 BAD_ARRAYS = [
     ({"board": BOARD[1:]}, ["board", "[12, 12]", "[11, 12]"]),
     ({"board": BOARD * 1.0}, ["board", "integers", "float64"]),
@@ -158,7 +158,7 @@ def test_from_ascii_refuses(rows, keywords, words):
     assert_refused(words, tt.State.from_ascii, rows, **keywords)
 
 
-# Fields in place of those of a good state, and the message's words.
+# Invalid fields, and words of the error.
 BAD_FIELDS: list[tuple[dict[str, Any], list[str]]] = [
     ({"board": BOARD.astype(np.int32)}, ["state.board", "uint8[12, 12]", "int32[12, 12]"]),
     ({"agent": np.zeros((5, 2), np.int32)}, ["state.agent", "int32[5, 2]"]),

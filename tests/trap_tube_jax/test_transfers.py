@@ -14,7 +14,7 @@ from helpers.goodness_of_fit import assert_fits
 from helpers.samples import SAMPLES, Layout, draw, flat, read_layouts, tally
 
 SWAPPED = (spec.TOOL, spec.TUBE1, spec.TUBE2, spec.TRAP, spec.EXIT)
-# Every object in a colour of its own, the tubes too.
+# All objects have different colours, the tubes too.
 DISTINCT_PALETTE = np.arange(24, dtype=np.uint8).reshape(8, 3)
 
 
@@ -188,7 +188,7 @@ def _looks(state: tt.State) -> spec.Looks:
 
 
 def _assert_is_one_of(drawn: Any, outcomes: list[spec.Looks]) -> np.ndarray:
-    """i64[n]: which outcome each sample is, known by the tool's corner and then compared."""
+    """Returns the samples' outcomes i64[n], found by the tool's corner and then compared whole."""
     corners = flat(np.array([outcome.tool for outcome in outcomes]))
     assert len(set(corners.tolist())) == len(outcomes)
     matches = flat(drawn.tool)[:, None] == corners
@@ -211,7 +211,7 @@ def test_the_base_task_has_five_equally_likely_swaps(palette):
 
 
 def test_perceptual_tasks_have_five_equally_likely_swaps(drawn):
-    """256 layouts, 512 draws each: nothing but the five specified outcomes."""
+    """Only the five specified outcomes, in 512 draws for each of 256 layouts."""
     layouts = 256
     draws = SAMPLES // 256
     starts = jax.tree.map(lambda leaf: leaf[:layouts], drawn)
@@ -241,7 +241,7 @@ def test_symbolic_keeps_the_observation(drawn):
 
 
 def test_symbolic_swaps_no_object_that_cannot_be_a_tool():
-    """On own boards: an object of no cell, of five, or whose bar would leave the board."""
+    """On custom boards: objects of no cell or of five, and one whose bar would leave the board."""
     start = tt.State.from_ascii(
         ["11111......A", "TT..........", *["." * 12] * 8, ".........F..", "..........xx"],
         palette=DISTINCT_PALETTE,

@@ -27,7 +27,7 @@ def make(name: str, **settings: Any) -> Any:
 
 def reward_of(name: str, features: Any, column: Any) -> np.ndarray:
     """Computes rewards [B, T] from features [B, T + 1, F] and the columns of the agent."""
-    nothing: Any = None  # in place of arrays that these rewards do not use
+    nothing: Any = None  # for arrays that these rewards do not read
     column = jnp.array(column, jnp.uint8)
     cells = jnp.zeros((*column.shape, 3, 2), jnp.uint8).at[:, :, 0, 1].set(column)
     layout = jax.tree.map(lambda x: jnp.stack([x] * len(column)), tt.base_state())

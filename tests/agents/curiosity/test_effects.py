@@ -17,7 +17,7 @@ BATCH = 48
 
 
 def random_episodes(env: tt.Environment) -> Episodes:
-    """Plays with actions that often repeat, so that things move."""
+    """Plays with actions that often repeat, so that objects move."""
 
     def play(key):
         reset_key, action_key, keep_key = jax.random.split(key, 3)

@@ -58,7 +58,7 @@ def problem() -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
 
 
 def total(fn: Any, chunk: int, problem: Any, params: Any, count: Any) -> jax.Array:
-    """Weighs the features of the first `count` rows; those of `plain` if there is no `fn`."""
+    """Sums the weighted features of the first `count` rows, by `plain` if there is no `fn`."""
     _, rows, cotangent = problem
     if fn is None:
         features = plain(params, rows)

@@ -21,7 +21,7 @@ BATCH = 12
 
 
 def paths(**settings: Any) -> tuple[Learner, Learner]:
-    """Returns the learner of a plain path and that of a fast one."""
+    """Returns a learner with the plain path, and one with the fast path."""
     learner = make_learner(small_config(**settings))
     parts = learner.agent, learner.curiosity.encode
     return tuple(
@@ -111,7 +111,7 @@ def test_every_distinct_observation_is_encoded_once(bits, monkeypatch):
         )
     )
     for env_id in ("base", "psy"):
-        # Several episodes of each layout, which meet again what the others have met before.
+        # Several episodes of every layout, so that they share observations.
         keys = jnp.repeat(jax.random.split(jax.random.key(1), 3), BATCH // 3)
         layouts, _ = jax.jit(jax.vmap(tt.make(env_id).reset))(keys)
         jax.effects_barrier()

@@ -25,7 +25,7 @@ def test_kernels_have_the_variance_of_their_layer_and_biases_are_zero():
 
 
 def scales(module: nn.Module, *inputs: Any) -> dict[str, float]:
-    """Returns by path each parameter's standard deviation times the root of its fan-in."""
+    """Returns a parameter's standard deviation times the root of its fan-in, by its path."""
     found = {}
     params = nn.meta.unbox(jax.jit(module.init)(jax.random.key(0), *inputs))["params"]
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):

@@ -43,7 +43,7 @@ def test_the_rules_of_bootstrap_differ_at_the_end(bootstrap, end, advantage, tar
 
 
 def test_normalized_steps_have_mean_0_and_deviation_1():
-    """Episodes are masked after an end of their own, of 3 to STEPS steps."""
+    """Episodes have different lengths, from 3 to STEPS steps, and are masked after their end."""
     rng = np.random.default_rng(0)
     length = rng.integers(3, STEPS + 1, CASES)
     mask = (np.arange(STEPS)[None] < length[:, None]).astype(np.float32)

@@ -20,7 +20,7 @@ AWAY = [(DOWN, DOWN)]
         ({}, AWAY, "none"),
         ({}, PLAN[:1], "none"),
         ({}, PLAN[:2], "tool moved"),
-        ({}, [*PLAN[:2], (UP, LEFT)], "tool moved"),  # and is back in its place
+        ({}, [*PLAN[:2], (UP, LEFT)], "tool moved"),  # and is back in its first cell
         ({}, PLAN[:5], "food moved"),
         ({}, PLAN[:6], "food out"),
         ({}, PLAN, "food out"),

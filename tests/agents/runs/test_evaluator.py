@@ -120,7 +120,7 @@ def test_unknown_sets_are_refused():
 
 
 def test_keys_of_tasks_are_never_drawn_in_training(monkeypatch):
-    """Records the keys that transfers get, which depend on those of `reset` alone."""
+    """Records the keys that transfers get, which depend only on the keys of `reset`."""
     seen = []
     no_update = lambda learner, state, *_: (state.params, state.opt_state, {})  # noqa: E731
     monkeypatch.setattr(Learner, "update", no_update)

@@ -1,4 +1,4 @@
-"""Metrics in TensorBoard and Weights & Biases, by their own readers."""
+"""Reads logged metrics with the readers of TensorBoard and Weights & Biases."""
 
 import sys
 from types import SimpleNamespace

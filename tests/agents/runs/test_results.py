@@ -20,7 +20,7 @@ EVALUATION = {
 
 @pytest.fixture
 def runs(tmp_path) -> Path:
-    """A folder of the runs a and deep/b, with one evaluation each."""
+    """A folder of the runs a and deep/b, which have one evaluation."""
     for name in ("a", "deep/b"):
         folder = RunFolder(tmp_path / "runs" / name)
         folder.path.mkdir(parents=True)

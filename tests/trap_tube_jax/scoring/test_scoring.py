@@ -138,7 +138,7 @@ def test_a_policy_is_scored_on_the_fixed_tasks(scores):
     [
         ("own", [3, 1, 1, 3], [1, 0, 0, 1]),
         ("own", [7], [0]),
-        ("own", [1, 2, 3], None),  # no sign that they are few
+        ("own", [1, 2, 3], None),  # not counted as layouts
         ("own", [0, 1, 2, 3, 4, 4], [0, 1, 2, 3, 4, 4]),
         ("own", [0, 1, 2, 3, 4, 5, 5], None),
         ("p", [1, 1], None),
@@ -198,7 +198,7 @@ def test_the_step_limit_of_the_task_set_holds(near, max_steps, counts):
 
 
 class Ends(NamedTuple):
-    """Outcomes as an agent of one's own may record them."""
+    """Outcomes as the program of another agent may record them."""
 
     solved: jax.Array
     length: jax.Array
