@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 ADAPTERS = "trap_tube_jax/adapters/README.md"
+PDOC = ["-m", "pdoc", "--docformat", "google", "-o", "reference"]
 SOLVE = ["-m", "trap_tube_jax.solver"]
 TRAIN = ["-m", "agents.train", "--iterations", "1", "--episodes-per-iteration", "64"]
 SWEEP_ON_A_CLUSTER = """
@@ -50,7 +51,7 @@ USES = {
     "agents": [["-c", block("README.md", "from agents")]],
     "agents,logging": [[*TRAIN, "--tensorboard", "--wandb"]],
     "agents,cluster": [["-c", SWEEP_ON_A_CLUSTER]],
-    "docs": [["-m", "pdoc", "--docformat", "google", "-o", "reference", "trap_tube_jax", "agents"]],
+    "docs": [[*PDOC, "trap_tube_jax", "agents", "agents.curiosity", "agents.networks"]],
     "bench": [["-c", COMPARE_PEERS]],
     "interop": [["-m", "agents.examples.rejax_agent"], ["-m", "agents.examples.sb3_agent"]],
 }
