@@ -248,7 +248,9 @@ def test_symbolic_swaps_no_object_that_cannot_be_a_tool():
     )
     bent_trap = np.asarray(start.board).copy()
     bent_trap[10, 11] = spec.TRAP  # three cells now; their bar would end in row 12
-    for board, fits in ((np.asarray(start.board), True), (bent_trap, False)):
+    last_cell = np.asarray(start.board).copy()
+    last_cell[11, 10] = spec.GROUND  # the trap has only the board's last cell
+    for board, fits in ((np.asarray(start.board), True), (bent_trap, False), (last_cell, True)):
         state = start.replace(board=jnp.asarray(board))
         outcomes = [_looks(state)]
         if fits:
