@@ -13,7 +13,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from agents.files import check_file, damage_named, parse_json, write_bytes
+from agents.files import check_file, naming_file, parse_json, write_bytes
 
 Tree = TypeVar("Tree")
 Arrays = dict[str, np.ndarray]
@@ -67,7 +67,7 @@ def read_arrays(path: Path, kind: Any = dict[str, Any]) -> tuple[Arrays, Any]:
     check_file(path)
     with path.open("rb"):  # safetensors calls an unreadable file missing
         pass
-    with damage_named(path), safetensors.safe_open(path, framework="numpy") as file:
+    with naming_file(path), safetensors.safe_open(path, framework="numpy") as file:
         about = parse_json((file.metadata() or {}).get("json", "null"), kind)
         for name in (names := list(file.keys())):
             if not name.isprintable():

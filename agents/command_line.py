@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import inspect
+import itertools
 import re
 import types
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ def option(default: Any, group: str | None = None, **metadata: Any) -> Any:
       default: its default.
       group: title under which help lists it.
       metadata: `append=True` collects the values of a repeated option in a tuple; `flags`
-        lists alternative spellings.
+        lists alternative spellings; `may_be_empty=True` allows a tuple of no values.
     """
     return dataclasses.field(default=default, metadata={"group": group, **metadata})
 
@@ -86,6 +87,9 @@ def parse_all(
         near = did_you_mean(unknown[0], options) if unknown[0].startswith("-") else ""
         parser.error(f"unknown arguments: {' '.join(unknown)}{near}")
     found = vars(known)
+    for field in itertools.chain(*map(dataclasses.fields, declared)):
+        if found.get(field.name) == [] and not field.metadata.get("may_be_empty"):
+            parser.error(f"argument {_flag(field.name)}: expected at least one argument")
     values = {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
     if not partly:
         import_modules(values.get("imports", ()))  # they register names that the classes check
@@ -122,13 +126,17 @@ def _add(group: Any, field: dataclasses.Field, default: Any, text: str, kind: An
     if isinstance(default, list | tuple):
         shown = " ".join(map(str, default))
     group.add_argument(
-        f"--{field.name.replace('_', '-')}",
+        _flag(field.name),
         *field.metadata.get("flags", ()),
         dest=field.name,
         default=argparse.SUPPRESS,  # the class has them
         help=text if shown is None or shown is False or shown == "" else f"{text} [{shown}]",
         **options,
     )
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _values(kind: Any) -> dict[str, Any]:
@@ -153,5 +161,6 @@ def _documents(cls: type) -> dict[str, str]:
     entries = re.findall(r"^ {2}(\w+): (.+(?:\n {4}.+)*)", text, re.M)
     sentences = {name: re.sub(r"\s+", " ", entry) for name, entry in entries}
     return {
-        name: re.split(r"(?<=\w)[.:;] ", entry)[0].rstrip(".") for name, entry in sentences.items()
+        name: re.split(r"(?<=[\w`)\]])[.:;] ", entry)[0].rstrip(".")
+        for name, entry in sentences.items()
     }

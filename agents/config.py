@@ -21,7 +21,6 @@ KEEP_COLORS = {
     tt.structural,
     tt.symbolic,
 }  # transfers after which agent and food look the same
-GROUPS = ("task", "length of training", "PPO", "curiosity", "replay of failed tasks", "network")
 
 
 def _setting(
@@ -33,7 +32,12 @@ def _setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-_task, _length, _ppo, _curiosity, _replay, _network = (partial(_setting, name) for name in GROUPS)
+_task = partial(_setting, "task")
+_length = partial(_setting, "length of training")
+_ppo = partial(_setting, "PPO")
+_curiosity = partial(_setting, "curiosity")
+_replay = partial(_setting, "replay of failed tasks")
+_network = partial(_setting, "network")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +63,8 @@ class Config:
       bootstrap: value after an episode's last step. `value`: 0 after termination, the
         last observation's value after truncation; the value target is advantage + value.
         `baseline`, as in the paper's published baseline: the value of the final board after
-        termination, the last step's own value after truncation; the value target is the
-        discounted sum of rewards.
+        termination; step T bootstraps from its own value, even if it terminates; the value target
+        is the discounted sum of rewards.
       clip_eps: half-width of PPO's clipping interval.
       value_coef: weight of the squared value error.
       entropy_coef: weight of the entropy bonus. Entropy is summed over grasp and move.
@@ -78,9 +82,10 @@ class Config:
         `intrinsic_coef`.
       intrinsic_anneal_fraction: fraction of iterations that decay the weight.
       curiosity_coef: weight of the curiosity's losses.
-      value_heads: one for all rewards, or one each. `shared`: rewards are divided by their standard
-        deviation and added, and one head values the sum. `separate`: each reward has its own head,
-        and the normalised advantages are added (`agents.ppo.advantages`).
+      value_heads: number of value heads, one for the sum of rewards or one per reward. `shared`:
+        rewards are divided by their standard deviation and added, and one head values the sum.
+        `separate`: each reward has its own head, and the normalised advantages are added
+        (`agents.ppo.advantages`).
       reward_ema_decay: decay of the rewards' moving variances. These variances normalise both
         rewards; the rates of `effects` use the same decay.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
@@ -141,7 +146,7 @@ class Config:
     value_heads: Literal["shared", "separate"] = _curiosity("shared")
     reward_ema_decay: float = _curiosity(0.9, 0, 1)
 
-    replay_fractions: tuple[float, ...] = _replay((), 0, 1)
+    replay_fractions: tuple[float, ...] = _replay((), 0, 1, may_be_empty=True)
     replay_capacity: int = _replay(1024, 1, 1_000_000)
 
     align_to_food: bool = _network(False)
@@ -185,7 +190,7 @@ class Config:
             )
 
     @classmethod
-    def preset(cls, name: str = "paper", **overrides: Any) -> Self:
+    def preset(cls, name: str = "paper", /, **overrides: Any) -> Self:
         """Returns the named preset with single settings replaced.
 
         Raises:

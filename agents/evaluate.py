@@ -28,9 +28,11 @@ class Options:
       sets: ids or short names of task sets, by default the paper's eight and the training set.
       imports: modules to import first, which register curiosities, encoders or task sets.
       tasks: tasks per set, by default the run's `eval_episodes`. Base has one.
-      purpose: tasks to play: `test`, or those for selection or for a final confirmation.
-      iteration: checkpoint of a run, by default its best policy, or the newest without one.
-      optimality: compares with shortest plans, which are searched for first.
+      purpose: which fixed tasks to play: `test`, or those for selection or for a final
+        confirmation.
+      iteration: checkpoint to load, by default the best policy, or the newest checkpoint if none
+        was selected.
+      optimality: finds shortest plans first, and compares with them.
       output: CSV file for the results.
       gif: GIF file for the first solved episode.
     """
@@ -67,14 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     announce(f"Playing {tasks:,} tasks of every set, up to a minute per 1,000")
     played = evaluator(policy.params)
     scores = evaluator.scores(played, shortest)
+    title = f"{policy.name}, iteration {policy.iteration}, {options.purpose} tasks"
+    print(title, scores, sep="\n\n", flush=True)
     if options.output is not None:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         table = pd.DataFrame(evaluation_rows(scores, policy, options.purpose))
         write_rows(options.output, table)
-    print(
-        f"{policy.name}, iteration {policy.iteration}, {options.purpose} tasks", scores, sep="\n\n"
-    )
-    if options.output is not None:
         print(f"\nresults: {options.output}")
     if options.gif is not None:
         options.gif.parent.mkdir(parents=True, exist_ok=True)

@@ -12,11 +12,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+import filelock
+
 from trap_tube_jax.command_line import one_line
 
 Plain = bool | int | float | str | None
 
-LARGEST = 2**26  # bytes of a text file
+MAX_TEXT_BYTES = 2**26  # bytes of a text file
 
 
 def is_file(path: Path) -> bool:
@@ -39,7 +41,7 @@ def check_file(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def damage_named(path: Path) -> Iterator[None]:
+def naming_file(path: Path) -> Iterator[None]:
     """Turns what a parser raises about a file's content into a ValueError with the file's path."""
     try:
         yield
@@ -53,14 +55,14 @@ def read_text(path: Path) -> str:
     """Reads a file of UTF-8.
 
     Raises:
-      ValueError: the file is not regular, not UTF-8 or larger than `LARGEST`.
+      ValueError: the file is not regular, not UTF-8 or larger than `MAX_TEXT_BYTES`.
       OSError: the file is missing or cannot be opened.
     """
     check_file(path)
-    with damage_named(path), path.open("rb") as file:
-        content = file.read(LARGEST + 1)
-        if len(content) > LARGEST:
-            raise ValueError(f"more than {LARGEST:,} bytes")
+    with naming_file(path), path.open("rb") as file:
+        content = file.read(MAX_TEXT_BYTES + 1)
+        if len(content) > MAX_TEXT_BYTES:
+            raise ValueError(f"more than {MAX_TEXT_BYTES:,} bytes")
         return content.decode()
 
 
@@ -72,7 +74,7 @@ def read_json(path: Path, kind: Any = Any) -> Any:
       OSError: the file is missing or cannot be opened.
     """
     text = read_text(path)
-    with damage_named(path):
+    with naming_file(path):
         return parse_json(text, kind)
 
 
@@ -144,6 +146,35 @@ def _check_keys(value: dict[str, Any], form: Any, name: str) -> None:
         raise ValueError(f"{name} has an unknown {reprlib.repr(key)}")
 
 
+class BusyError(ValueError):
+    """Another process writes to a folder."""
+
+
+@contextlib.contextmanager
+def lock_folder(path: Path, wait: float = 1) -> Iterator[None]:
+    """Makes this process the only writer of a folder; makes the folder if missing.
+
+    Waits for some seconds, because a launcher takes the lock for a moment to see whether a run has
+    begun.
+
+    Raises:
+      BusyError: another process writes to the folder.
+      ValueError: the folder holds a link.
+      OSError: the folder cannot be created or locked.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    for entry in path.iterdir():
+        if entry.is_symlink():  # writing would change a file elsewhere
+            raise ValueError(f"{entry} is a link; replace it by a copy of what it names")
+    try:
+        with filelock.FileLock(path / ".lock", timeout=wait):
+            yield
+    except filelock.Timeout:
+        raise BusyError(f"{path} is being written by another process; wait for its end") from None
+    except NotImplementedError as error:
+        raise OSError(f"{path} cannot be locked: {error}") from error
+
+
 @contextlib.contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
     """Yields a path to write to; its file replaces `path` at the end of the block.
@@ -181,7 +212,10 @@ def append_text(path: Path, text: str, head: str) -> None:
     is_file(path)
     with path.open("a+", encoding="utf-8", newline="") as file:
         file.seek(0)
-        first = file.readline(LARGEST)
+        first = file.readline(MAX_TEXT_BYTES)
         if first and first != head:
-            raise ValueError(f"{path} does not begin with {head.strip()!r}; move it away")
+            raise ValueError(
+                f"{path} has other columns than this version writes, {head.strip()}; continue "
+                "with the version that began the file"
+            )
         file.write(text if first else head + text)

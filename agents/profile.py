@@ -31,7 +31,7 @@ FIGURES = ("success.png", "controls.png")
 class Options:
     """Profiles trained agents: success by kind of task, and knowledge of the trap.
 
-    Agents play greedily, one episode a task, on tasks drawn with keys that training never uses.
+    Agents play greedily, one episode per task, on tasks drawn with keys that training never uses.
     Writes profile.csv, provenance.json and, if their parts are measured, success.png and
     controls.png. Takes a few minutes.
 
@@ -44,7 +44,7 @@ class Options:
         first-push-pst (towards the exit or away from it, in {P} and {P, St}) and control (from
         every cell where the agent may start).
       strengths: strengths of the graded transfers, from 0 (base) to 1 (the paper's transfer).
-      tasks: tasks of each strength, each symbolic swap, {P}, and {P, St}.
+      tasks: number of tasks for each strength and symbolic swap, and for {P} and {P, St}.
       imports: modules to import first, which register names in an agent's settings.
     """
 
@@ -69,14 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = "+".join(Path(source).resolve().stem for source in policies)  # a source may be "."
     output = options.output or Path("runs", f"profile-{names}")
     _check_free(output, iterations)
-    output.mkdir(parents=True, exist_ok=True)
     found = profile(policies, options.parts, options.strengths, options.tasks, announce)
+    _print_tables(found)
+    output.mkdir(parents=True, exist_ok=True)
     for figure in FIGURES:  # of an earlier profile
         (output / figure).unlink(missing_ok=True)
     table = found.to_csv(index=False, float_format="%.6g")
     write_bytes(output / "profile.csv", table.encode())
     write_json(output / "provenance.json", origin)
-    _print_tables(found)
     if set(options.parts) & set(plots.PANELS):
         plots.save_success(found, output / "success.png")
     if "control" in options.parts:

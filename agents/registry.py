@@ -2,6 +2,7 @@
 
 import contextlib
 import inspect
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -65,5 +66,5 @@ def contract(kind: str, name: str) -> Iterator[None]:
     try:
         yield
     except (AssertionError, FlaxError) as error:
-        reason = " ".join(str(error).split())
+        reason = re.sub(r"\[Chex\] Assertion \w+ failed: ", "", " ".join(str(error).split()))
         raise ValueError(f"{kind} {name!r} breaks its contract: {reason}") from error

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import jax
 
 from agents.command_line import parse_all
+from agents.files import lock_folder
 from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder
 from agents.sweeps import records
@@ -14,7 +15,7 @@ from agents.sweeps.grids import Grid
 from agents.sweeps.launcher import launch
 from agents.sweeps.workers import capacity, make_executor
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.interruptions import run_command, stopping
+from trap_tube_jax.interruptions import exit_when_stopped, run_command
 
 
 def main(
@@ -36,9 +37,9 @@ def main(
         options, run_options = parse_all([grid.options, grid.run_options], arguments, program)
         runs = grid.make_runs(name, options)
         root = next(iter(runs)).parent
-        with stopping(lambda: "The same command continues."):
+        with exit_when_stopped(lambda: "The same command continues."):
             workers = make_executor(options.processes, options.cluster)
-            with workers as executor, RunFolder(root).lock():
+            with workers as executor, lock_folder(root):
                 records.check(root)
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 failed = launch(runs, run_options, executor, console, options.seeds_per_program)

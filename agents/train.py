@@ -19,7 +19,7 @@ from agents.runs.metrics import read_rows
 from agents.runs.run import DeviceOptions, Run, RunOptions
 from agents.runs.session import train_run
 from trap_tube_jax.command_line import plain_errors
-from trap_tube_jax.interruptions import run_command, stopping
+from trap_tube_jax.interruptions import exit_when_stopped, run_command
 
 PROGRAM = "python -m agents.train"
 
@@ -38,8 +38,8 @@ class Options:
       resume: folder of a run to continue with its options. Of its settings only --iterations,
         --max-transitions and --stop-when-solved may change.
       imports: module to import first. It may register curiosities, encoders and task sets.
-      distributed: trains with the other processes of a Slurm, Open MPI, Kubernetes or Cloud TPU
-        job, or else of a job at HOST:PORT PROCESSES NUMBER.
+      distributed: joins the processes of a Slurm, Open MPI, Kubernetes or Cloud TPU job, or of the
+        job at HOST:PORT PROCESSES NUMBER.
     """
 
     preset: str = option("fast", "run")
@@ -48,7 +48,7 @@ class Options:
     out: Path = option(Path("runs"), "run")
     resume: Path | None = option(None, "run")
     imports: tuple[str, ...] = option((), "run", append=True, flags=("--import",))
-    distributed: tuple[str, ...] | None = option(None, "devices and hosts")
+    distributed: tuple[str, ...] | None = option(None, "devices and hosts", may_be_empty=True)
 
 
 @plain_errors()
@@ -104,12 +104,13 @@ def train(options: Options, run: Run, run_options: RunOptions) -> None:
     console = CommandConsole(quiet=not is_first, highlight=False)
     compilation.enable_cache()
     try:
-        with stopping(lambda: resume_hint(folder, run) if is_first else ""):
+        with exit_when_stopped(lambda: resume_hint(folder, run) if is_first else ""):
             train_run(folder.path, run, run_options, console=console)
             for line in summary(folder, run):
                 console.out(line)
     except OSError as error:
-        raise OSError(f"{error}. {resume_hint(folder, run)}") from error
+        hint = f". {resume_hint(folder, run)}" if folder.config.is_file() else ""
+        raise OSError(f"{error}{hint}") from error
 
 
 def run_path(options: Options, run: Run) -> Path:
@@ -117,7 +118,7 @@ def run_path(options: Options, run: Run) -> Path:
     if options.resume is not None:
         return options.resume
     short = tt.task_set(run.config.env_id).short
-    name = options.name or f"{options.preset}-{short}-{run.seed}"
+    name = f"{options.preset}-{short}-{run.seed}" if options.name is None else options.name
     check_name(name)
     return options.out / name
 

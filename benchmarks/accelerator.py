@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from benchmarks import harness
-from trap_tube_jax.interruptions import Stopped, deferring, stopping
+from trap_tube_jax.interruptions import Stopped, deferring, exit_when_stopped
 
 # The module and its options, by the name of the record. `gpu_best_second_start` finds the programs
 # that `gpu_best_first_start` has compiled.
@@ -75,18 +75,29 @@ def run(name: str, words: list[str], options: Options) -> bool:
         command += ["--output", str(options.output / f"{name}.json")]
     print(f"== {name}: {' '.join(command[1:])}", flush=True)
     start = time.perf_counter()
-    outcome = "stopped"
+    code = call(command, options.limit)
+    outcome = "stopped" if code is None else f"exit code {code}"
+    print(f"== {name}: {outcome} after {time.perf_counter() - start:.0f} s", flush=True)
+    return code == 0
+
+
+def call(command: list[str], limit: float) -> int | None:
+    """Runs a command; returns its exit code, None if it takes more than `limit` seconds.
+
+    Raises:
+      Stopped: on a signal, after the command has ended.
+    """
+    code = None
     with subprocess.Popen(command) as process, deferring(process.terminate) as request:
         try:
-            outcome = f"exit code {process.wait(options.limit)}"
+            code = process.wait(limit)
         except subprocess.TimeoutExpired:
             process.kill()
     if number := request():
         raise Stopped(number)
-    print(f"== {name}: {outcome} after {time.perf_counter() - start:.0f} s", flush=True)
-    return process.returncode == 0
+    return code
 
 
 if __name__ == "__main__":
-    with stopping(lambda: "The same command starts again."):
+    with exit_when_stopped(lambda: "The same command starts again."):
         harness.run(lambda options: sys.exit(bool(main(options))), Options, "accelerator")

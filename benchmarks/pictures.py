@@ -12,6 +12,7 @@ import pandas as pd
 
 import agents
 import trap_tube_jax as tt
+from agents.runs.drawing import COLORS
 from agents.sweeps import figures, tables
 from trap_tube_jax.checks import expand
 from trap_tube_jax.command_line import plain_errors
@@ -153,11 +154,11 @@ def _percent_by_set(record: str) -> Any:
 def _draw_seeds(axis: Any, row: int, percent: np.ndarray) -> None:
     """Draws a bar for the mean of several seeds with a point per seed, or an open bar for one."""
     if len(percent) > 1:
-        axis.barh(row, percent.mean(), color=figures.COLORS[5], height=0.7)
-        points = {"color": figures.COLORS[0], "alpha": 0.7, "markersize": 3}
+        axis.barh(row, percent.mean(), color=COLORS[5], height=0.7)
+        points = {"color": COLORS[0], "alpha": 0.7, "markersize": 3}
         axis.plot(percent, [row] * len(percent), "o", **points)
     else:
-        axis.barh(row, percent[0], fill=False, edgecolor=figures.COLORS[0], height=0.7)
+        axis.barh(row, percent[0], fill=False, edgecolor=COLORS[0], height=0.7)
     _name_value(axis, row, percent.mean(), percent.max())
 
 

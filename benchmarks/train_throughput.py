@@ -128,17 +128,17 @@ def _core_loss(learner: Learner, params: Params, features: jax.Array, part: Batc
     agent = learner.agent
     curiosity = learner.curiosity
     episodes = part.episodes
-    embedding, following = agent.unroll(
+    hidden, next_hidden = agent.unroll(
         params,
         features,
         episodes.action,
         episodes.reward,
-        with_next=curiosity.needs_next_embedding,
+        with_next=curiosity.needs_next_hidden,
     )
     actions = agent.embed_action(params, episodes.action)
-    experience = Experience(episodes, features[..., :0], embedding, following, actions)
+    experience = Experience(episodes, features[..., :0], hidden, next_hidden, actions)
     curiosity_losses = curiosity.losses(params["curiosity"], experience)
-    everything = jax.tree.leaves((agent.policy_and_value(params, embedding), curiosity_losses))
+    everything = jax.tree.leaves((agent.policy_and_value(params, hidden), curiosity_losses))
     return sum((jnp.sum(jnp.square(x)) for x in everything), jnp.zeros(()))
 
 

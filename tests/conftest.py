@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
     os.environ["MPLCONFIGDIR"] = os.environ["XDG_CACHE_HOME"]  # no warning of a read-only home
 
+EXAMPLE = "agents.examples.near_food"
 SETTINGS = {
     # Where the command lines keep theirs.
     "jax_compilation_cache_dir": str(Path(os.environ["XDG_CACHE_HOME"], "trap_tube_jax", "jax")),
@@ -68,10 +70,12 @@ def _compilation(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture
 def fresh_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Task sets that a test registers are gone after it."""
+    """Task sets that a test registers are gone after it, and so is the module of an example's."""
     from trap_tube_jax import registry  # noqa: PLC0415  after the settings above
 
     monkeypatch.setattr(registry, "_task_sets", dict(registry._task_sets))
+    monkeypatch.setitem(sys.modules, EXAMPLE, None)  # or, once imported, it would never register
+    monkeypatch.delitem(sys.modules, EXAMPLE)
 
 
 @pytest.fixture

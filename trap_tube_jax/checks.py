@@ -63,21 +63,21 @@ def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:
     except ValueError as error:
         raise ValueError(f"{name} must be a rectangular array of integers: {error}") from None
     if not jnp.issubdtype(array.dtype, np.integer):
-        found = f"{described(array)}: {reprlib.repr(value)}"
+        found = f"{describe_array(array)}: {reprlib.repr(value)}"
         raise ValueError(f"{name} must hold integers, got {found}")
     return array
 
 
-def described(array: Any) -> str:
+def describe_array(array: Any) -> str:
     """Returns dtype and shape for a message, such as "uint8[12, 12]"."""
     return f"{array.dtype}{list(array.shape)}"
 
 
 def check_registered_name(kind: str, name: Any) -> None:
-    """Checks a name for command lines and files; `kind` is the kind of thing it names.
+    """Checks a name for command lines and files; `kind` says in messages what the name is for.
 
     Raises:
-      ValueError: `name` has other characters than letters, digits, "_", "." and "-".
+      ValueError: `name` has characters other than letters, digits, "_", "." and "-".
     """
     if not isinstance(name, str) or not re.fullmatch(r"[\w.-]+", name, re.ASCII):
         raise ValueError(f"{kind} names consist of letters, digits, '_', '.' and '-', got {name!r}")

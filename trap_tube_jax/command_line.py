@@ -3,9 +3,10 @@
 import argparse
 import contextlib
 import io
-import os
 import sys
 from collections.abc import Iterator
+
+from trap_tube_jax.interruptions import close_stdout
 
 CLOSED_PIPE = 128 + 13  # as by SIGPIPE, which Windows lacks
 
@@ -40,7 +41,7 @@ def plain_errors() -> Iterator[None]:
         yield
         print(end="", flush=True)  # does nothing where stdout is closed, unlike sys.stdout.flush
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python warns at exit
+        close_stdout()
         raise SystemExit(CLOSED_PIPE) from None
     except (ValueError, ImportError, OSError) as error:
         print(f"error: {one_line(error)}", file=sys.stderr)

@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, described, integer_array, names_adapters
+from trap_tube_jax.checks import check_integer, describe_array, integer_array, names_adapters
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     DIRECTION_NAMES,
@@ -226,7 +226,9 @@ def action_to_index(action: jax.typing.ArrayLike) -> jax.Array:
     """
     action = integer_array("action", action)
     if action.ndim == 0 or action.shape[-1] != 2:
-        raise ValueError(f"action must be integer[..., 2] = (grasp, move), got {described(action)}")
+        raise ValueError(
+            f"action must be integer[..., 2] = (grasp, move), got {describe_array(action)}"
+        )
     is_known = ((action >= 0) & (action < NUM_DIRECTIONS)).all(-1)
     grasp = action[..., 0].astype(np.int32)
     move = action[..., 1].astype(np.int32)
@@ -243,7 +245,7 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> jax.Array:
     if actions.shape != shape:
         raise ValueError(
             f"action must be integer{list(shape)}, (grasp, move) in the last axis, got "
-            f"{described(actions)}; action_from_index converts 4 * grasp + move, and jax.vmap "
+            f"{describe_array(actions)}; action_from_index converts 4 * grasp + move, and jax.vmap "
             "steps several environments"
         )
     if not isinstance(actions, Tracer):
@@ -294,7 +296,7 @@ def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
         raise ValueError(f"transfer {name} returned an invalid state: {error}") from error
     if int(drawn.time) or drawn.palette.shape != state.palette.shape:
         raise ValueError(
-            f"transfer {name} must keep time 0 and a palette of {described(state.palette)}, got "
-            f"time {int(drawn.time)} and {described(drawn.palette)}"
+            f"transfer {name} must keep time 0 and a palette of {describe_array(state.palette)}, "
+            f"got time {int(drawn.time)} and {describe_array(drawn.palette)}"
         )
     return drawn

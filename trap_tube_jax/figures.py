@@ -10,7 +10,7 @@ from trap_tube_jax.imports import needs_extra
 def default_style() -> Iterator[None]:
     """Draws under Matplotlib's defaults in the `with` block.
 
-    Settings of the reader's machine, such as a matplotlibrc, do not count, and `$` is plain text.
+    Ignores the user's settings, such as a matplotlibrc, and treats `$` as plain text.
 
     Raises:
       ImportError: matplotlib is not installed.

@@ -1,5 +1,7 @@
 """Cells, directions and bars on the board, as array functions."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +26,15 @@ def unit_vector(direction: jax.Array | int) -> jax.Array:
 def cell_of(index: jax.Array) -> jax.Array:
     """Returns the cell i32[2] = (row, column) of a flat index in reading order."""
     return jnp.stack([index // BOARD_SIZE, index % BOARD_SIZE]).astype(jnp.int32)
+
+
+def cell_index(cell: Any) -> Any:
+    """Returns the flat indices i32[...] in reading order of cells integer[..., 2].
+
+    NumPy arrays give NumPy arrays.
+    """
+    cell = cell.astype(np.int32)
+    return cell[..., 0] * BOARD_SIZE + cell[..., 1]
 
 
 def is_on_board(cell: jax.Array) -> jax.Array:

@@ -20,7 +20,7 @@ from trap_tube_jax.layouts import (
     NUM_OUTLINES,
     LayoutTables,
     layout_tables,
-    padded,
+    pad_rows,
     padded_by_outline,
 )
 from trap_tube_jax.objects import BOARD_SIZE
@@ -34,7 +34,7 @@ from trap_tube_jax.transfers import (
     structural,
 )
 
-CENTER = 1e-4  # a radius below is 0 up to rounding; other features have a radius of 1 / 255 or more
+MIN_RADIUS = 1e-4  # a smaller one is 0 up to rounding; other features have at least 1 / 255
 TOLERANCE = 1e-9  # of a distance, against the rounding of strength * distance
 
 
@@ -121,28 +121,28 @@ class GradedStructural:
         """Draws a palette."""
         check_state(state)
         # The middle of the interval that floor maps to the feature, so that 0 changes nothing.
-        present = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
+        start = (state.palette.astype(jnp.float32) + 0.5) / 255 * 2 - 1
         drawn = sphere_points(key, state.palette.shape[-1])
-        return recolor(state, points_between(present, drawn, self.strength))
+        return recolor(state, points_between(start, drawn, self.strength))
 
     @property
     def __name__(self) -> str:
         return f"structural {self.strength:g}"
 
 
-def points_between(present: jax.Array, drawn: jax.Array, strength: float) -> jax.Array:
-    """Returns the points f32[K, N] of `graded_structural` from `present`, r b, to `drawn`, u."""
-    if present.shape[-1] == 1:
-        return (1 - strength) * present + strength * drawn
-    radius = jnp.linalg.norm(present, axis=-1, keepdims=True)
-    is_center = radius < CENTER
-    start = jnp.where(is_center, drawn, present / jnp.where(is_center, 1, radius))
-    cosine = jnp.sum(start * drawn, axis=-1, keepdims=True)
-    across = drawn - cosine * start
+def points_between(start: jax.Array, end: jax.Array, strength: float) -> jax.Array:
+    """Returns the points f32[K, N] of `graded_structural` from `start`, r b, to `end`, u."""
+    if start.shape[-1] == 1:
+        return (1 - strength) * start + strength * end
+    radius = jnp.linalg.norm(start, axis=-1, keepdims=True)
+    has_no_direction = radius < MIN_RADIUS
+    unit = jnp.where(has_no_direction, end, start / jnp.where(has_no_direction, 1, radius))
+    cosine = jnp.sum(unit * end, axis=-1, keepdims=True)
+    across = end - cosine * unit
     sine = jnp.linalg.norm(across, axis=-1, keepdims=True)
     angle = strength * jnp.atan2(sine, cosine)
     # Where u is b or -b there is no plane, and `across` is zero.
-    direction = jnp.cos(angle) * start + jnp.sin(angle) * across / jnp.maximum(sine, 1e-12)
+    direction = jnp.cos(angle) * unit + jnp.sin(angle) * across / jnp.maximum(sine, 1e-12)
     return ((1 - strength) * radius + strength) * direction
 
 
@@ -168,8 +168,8 @@ def near_layouts(strength: float) -> LayoutTables:
                 if corner in near_corners
             ]
         )
-    food, num_food = padded(foods)
-    tool, num_tools = padded(tools)
+    food, num_food = pad_rows(foods)
+    tool, num_tools = pad_rows(tools)
     agent, num_agents = padded_by_outline(agents, len(tool[0]))
     near = _is_near(_layout_distances(), strength)
     return full._replace(

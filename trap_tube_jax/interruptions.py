@@ -33,31 +33,31 @@ class Stopped(Exception):  # noqa: N818  not an error
 
 
 @dataclasses.dataclass
-class _Block:
-    """A block of `deferring`, and the number of the first signal in it."""
+class _DeferredSignal:
+    """An open `deferring` block, and the number of the first signal in it."""
 
     on_first: Callable[[], object]
     received: int | None = None
 
 
 class _Process:
-    """The process's answer to the next signal."""
+    """How this process answers the next signal."""
 
     def __init__(self) -> None:
-        self.is_command = False  # else the process is somebody's, as a notebook's
+        self.is_command = False  # False in a caller's process, such as a notebook
         self.terminal_modes: Any = None  # before the command changes them
         self.hint: Callable[[], str] = lambda: "The same command starts again."
-        self.blocks: list[_Block] = []  # the present `deferring`, within others
+        self.blocks: list[_DeferredSignal] = []  # open `deferring` blocks, innermost last
 
 
 _process = _Process()
 
 
-def receive(number: int) -> None:
-    """Does what a signal is to do now; also for an end that is no signal, as of a closed pipe.
+def handle_signal(number: int) -> None:
+    """Handles a signal, or an event that ends a command like one, such as a closed pipe.
 
     Raises:
-      KeyboardInterrupt: at once is now, and the process is not a command's.
+      KeyboardInterrupt: outside a command, if no `deferring` block takes the signal.
     """
     if os.isatty(2):
         _write("")  # a line of progress, or "^C", may stand there
@@ -71,7 +71,7 @@ def receive(number: int) -> None:
             _restore_terminal()
             _write_stopped()
         finally:
-            os._exit(128 + number)  # else the compiler's threads crash a process that takes leave
+            os._exit(128 + number)  # a normal exit can crash in the compiler's threads
     else:
         raise KeyboardInterrupt
 
@@ -82,12 +82,14 @@ def deferring(
 ) -> Iterator[Callable[[], int | None]]:
     """Defers the first signal, and calls `on_first` when it comes; a second one ends at once.
 
-    Yields a function that returns the number of the first signal, or None. In a thread other than
-    the main one of a process that is no command's, no signals arrive.
+    Yields a function that returns the number of the first signal, or None. Outside a command, only
+    the main thread receives signals.
     """
-    block = _Block(on_first)
+    block = _DeferredSignal(on_first)
     _process.blocks.append(block)
-    before = {} if _process.is_command else _handle(lambda number, _: receive(number))
+    before = {}
+    if not _process.is_command:
+        before = _install_handlers(lambda number, _: handle_signal(number))
     try:
         yield lambda: block.received
     finally:
@@ -97,7 +99,7 @@ def deferring(
 
 
 @contextlib.contextmanager
-def stopping(hint: Callable[[], str]) -> Iterator[None]:
+def exit_when_stopped(hint: Callable[[], str]) -> Iterator[None]:
     """Ends with a line in which `hint` says how to go on, and the exit code 128 + number.
 
     An empty hint prints no line.
@@ -128,7 +130,7 @@ def run_command(main: Callable[[], Any]) -> None:
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(reader,), daemon=True).start()
-    _handle(lambda *_: None)  # to the end of the process, which no signal makes a traceback
+    _install_handlers(lambda *_: None)  # for good, so that no signal causes a traceback
     main()
 
 
@@ -146,10 +148,10 @@ def _watch(reader: int) -> None:
     while True:
         for number in os.read(reader, 64):
             if number in SIGNALS:
-                receive(number)
+                handle_signal(number)
 
 
-def _handle(handler: Any) -> dict[int, Any]:
+def _install_handlers(handler: Any) -> dict[int, Any]:
     """Handles the signals that the process does not ignore, as `nohup` asks for SIGHUP.
 
     Returns the handlers before.

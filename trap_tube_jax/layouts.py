@@ -71,9 +71,9 @@ def layout_tables() -> LayoutTables:
         ]
         for outline, corners in zip(outlines, tools, strict=True)
     ]
-    tool, num_tools = padded([np.flatnonzero(corners) for corners in tools])
+    tool, num_tools = pad_rows([np.flatnonzero(corners) for corners in tools])
     agent, num_agents = padded_by_outline(agents, len(tool[0]))
-    food, num_food = padded([_food_cells(*outline[:4]) for outline in outlines])
+    food, num_food = pad_rows([_food_cells(*outline[:4]) for outline in outlines])
     index = np.arange(NUM_OUTLINES * NUM_ASSIGNMENTS, dtype=np.int32)
     return LayoutTables(
         layout=np.stack([index % NUM_OUTLINES, index // NUM_OUTLINES], axis=1),
@@ -137,7 +137,7 @@ def _agent_cells(tool_corners: np.ndarray, extent: tuple[int, int], corner: int)
     return np.flatnonzero(~center & ~tool_corners & ~tool)
 
 
-def padded(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def pad_rows(rows: list[np.ndarray], num_rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Pads rows of cells to a table u8; also returns their lengths u32, 1 for a missing row."""
     num_rows = num_rows or len(rows)
     table = np.zeros((num_rows, max(map(len, rows))), np.uint8)
@@ -152,7 +152,7 @@ def padded_by_outline(
     outlines: list[list[np.ndarray]], num_rows: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pads the rows of every outline to u8[F, num_rows, A], with lengths u32[F, num_rows]."""
-    tables, lengths = zip(*(padded(rows, num_rows) for rows in outlines), strict=True)
+    tables, lengths = zip(*(pad_rows(rows, num_rows) for rows in outlines), strict=True)
     longest = max(table.shape[1] for table in tables)
     wide = [np.pad(table, ((0, 0), (0, longest - table.shape[1]))) for table in tables]
     return np.stack(wide), np.stack(lengths)

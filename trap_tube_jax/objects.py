@@ -56,7 +56,7 @@ def base_palette(num_features: int = 3) -> np.ndarray:
 
     Three features are the RGB colours of environment.md, "Board and objects". Two are the
     red and green channels. More than three repeat red, green and blue. One feature is the
-    colour's luma (ITU-R BT.601), rounded. For every N all objects differ in pairs,
+    colour's luma (ITU-R BT.601), rounded. For every N all objects differ pairwise,
     except the two tubes, which always look alike.
 
     Args:

@@ -68,7 +68,7 @@ class Game:
       env: the environment.
       name: the task set's id.
       seed: the seed of the task.
-      state: the present state.
+      state: the current state.
       grasp: the direction of the hand, held until changed.
       message: the line below the board.
     """

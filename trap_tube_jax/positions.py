@@ -7,6 +7,7 @@ agent, tool and food determine the state, apart from time and flags.
 import jax
 import jax.numpy as jnp
 
+from trap_tube_jax.geometry import cell_index
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.state import State
 
@@ -41,5 +42,5 @@ def position_id(state: State) -> jax.Array:
     A state of NumPy arrays gives a NumPy number.
     """
     cells = (state.agent, state.tool, state.food)
-    agent, tool, food = (cell[0] * BOARD_SIZE + cell[1] for cell in cells)
+    agent, tool, food = map(cell_index, cells)
     return (agent * NUM_CELLS + tool) * NUM_CELLS + food

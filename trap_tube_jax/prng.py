@@ -1,4 +1,4 @@
-"""PRNG keys: typed and raw ones, and those whose draws do not depend on the batch."""
+"""PRNG keys: conversion to typed keys, and to keys whose draws do not depend on the batch."""
 
 from typing import Any
 

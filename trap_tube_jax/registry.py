@@ -107,7 +107,10 @@ def task_set(name: str) -> TaskSet:
     if isinstance(name, str) and name in by_name:
         return by_name[name]
     if isinstance(name, str) and "+" in name:
-        return _mixture([task_set(part.strip()) for part in name.split("+")])
+        parts = [part.strip() for part in name.split("+")]
+        if not all(parts):
+            raise ValueError(f"a mixture names task sets joined by '+', got {name!r}")
+        return _mixture(list(map(task_set, parts)))
     allowed = ", ".join(entry.short for entry in _task_sets.values())
     raise ValueError(
         f"unknown task set {name!r}{did_you_mean(name, by_name)}; allowed: {allowed}, or their ids "

@@ -10,6 +10,7 @@ white, the one with more contrast to the object's colour:
 """
 
 import functools
+import numbers
 import os
 from typing import Any
 
@@ -40,15 +41,15 @@ from trap_tube_jax.objects import (
 from trap_tube_jax.observation import observe, visible_objects
 from trap_tube_jax.state import State, check_state
 
-SMALLEST_SIGN = 7  # the smallest cell, in pixels, with a sign
-SMALLEST_GRID = 4  # the smallest cell, in pixels, with lines around it
+MIN_SIGN_SIZE = 7  # the smallest cell, in pixels, with a sign
+MIN_GRID_SIZE = 4  # the smallest cell, in pixels, with lines around it
 SIGN_OPACITY = 0.8
 GRID_OPACITY = 0.22
 TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
 TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
 FPS_RANGE = (1, 50)  # browsers slow down GIFs with shorter frames
-LONGEST_HOLD = 100  # seconds
+MAX_HOLD = 100  # seconds
 MAX_DURATION = 2**16 - 1  # hundredths of a second for which a GIF can show a picture
 
 
@@ -154,8 +155,8 @@ def save_gif(
       path: the file to write.
       fps: frames per second, 1 to 50. GIF counts hundredths of a second; durations alternate where
         a frame takes a fraction, so that an episode keeps its length.
-      hold: seconds by which the last frame stays longer, 0 to 100. A picture that does not change
-        for 655 seconds or more stays that long.
+      hold: seconds by which the last frame stays longer, 0 to 100. A picture held for longer
+        than 655 seconds is shown for 655 seconds.
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
@@ -172,10 +173,10 @@ def save_gif(
         raise ValueError(
             f"frames must be uint8[T, height, width, 3], T >= 1, got {pictures.dtype}{list(shape)}"
         )
-    if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
-        raise ValueError(f"fps must be from {FPS_RANGE[0]} to {FPS_RANGE[1]}, got {fps}")
-    if not 0 <= hold <= LONGEST_HOLD:
-        raise ValueError(f"hold must be from 0 to {LONGEST_HOLD} seconds, got {hold}")
+    if not isinstance(fps, numbers.Real) or not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
+        raise ValueError(f"fps must be from {FPS_RANGE[0]} to {FPS_RANGE[1]}, got {fps!r}")
+    if not isinstance(hold, numbers.Real) or not 0 <= hold <= MAX_HOLD:
+        raise ValueError(f"hold must be from 0 to {MAX_HOLD} seconds, got {hold!r}")
     with needs_extra("pictures"):
         from PIL import Image  # noqa: PLC0415  importing the environment must stay light
 
@@ -218,13 +219,13 @@ def _render(
     objects = visible_objects(state)
     image = _enlarge(rgb(observe(state)), cell_size).astype(jnp.float32)
     ink = _ink(image)
-    if cell_size >= SMALLEST_SIGN:
+    if cell_size >= MIN_SIGN_SIZE:
         is_tool = _enlarge(objects, cell_size) == TOOL
         sign = jnp.where(is_tool, _tool_bar(state, cell_size), _arrange(_signs(cell_size), objects))
         image = _blend(image, ink, sign * SIGN_OPACITY)
-    if grid and cell_size >= SMALLEST_GRID:
+    if grid and cell_size >= MIN_GRID_SIZE:
         image = _blend(image, ink, _grid_lines(cell_size) * GRID_OPACITY)
-    if grasp is not None and cell_size >= SMALLEST_SIGN:
+    if grasp is not None and cell_size >= MIN_SIGN_SIZE:
         image = _draw_hand(image, state, jnp.asarray(grasp), cell_size)
     return jnp.round(image).astype(jnp.uint8)
 

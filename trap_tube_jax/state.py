@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import described, integer_array
+from trap_tube_jax.checks import describe_array, integer_array
 from trap_tube_jax.objects import (
     AGENT,
     BOARD_SIZE,
@@ -119,7 +119,7 @@ class State(ByValue, struct.PyTreeNode, eq=False):
             "tool_extent": tool_extent,
             "food": food,
         }
-        fields = {name: _converted(name, value) for name, value in given.items()}
+        fields = {name: _convert(name, value) for name, value in given.items()}
         start: Any = {"time": np.int32(0), "terminated": np.False_, "truncated": np.False_}
         # Keep the layout concrete, even inside a traced function.
         with jax.ensure_compile_time_eval():
@@ -236,7 +236,7 @@ def take(batch: Record, index: Any) -> Record:
     return jax.tree.map(lambda field: field[index], batch)
 
 
-def concatenated(batches: Iterable[Record]) -> Record:
+def concatenate_trees(batches: Iterable[Record]) -> Record:
     """Joins trees of arrays along the first axis; returns NumPy arrays."""
     return jax.tree.map(lambda *parts: np.concatenate(parts), *batches)
 
@@ -289,6 +289,13 @@ def validate(state: State) -> State:
     return state
 
 
+def check_is_state(state: Any) -> None:
+    """Raises ValueError unless `state` is a `State`."""
+    if not isinstance(state, State):
+        hint = "; reset and step return (state, timestep)" if isinstance(state, tuple) else ""
+        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}{hint}")
+
+
 def check_state(state: Any) -> None:
     """Checks that `state` is one unbatched `State` with fields of the right shape and dtype.
 
@@ -298,9 +305,7 @@ def check_state(state: Any) -> None:
     Raises:
       ValueError: naming the field, what it is and what it must be.
     """
-    if not isinstance(state, State):
-        hint = "; reset and step return (state, timestep)" if isinstance(state, tuple) else ""
-        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}{hint}")
+    check_is_state(state)
     for name, (shape, dtype) in _FIELDS.items():
         field = getattr(state, name)
         if not hasattr(field, "shape") or not hasattr(field, "dtype"):
@@ -310,7 +315,7 @@ def check_state(state: Any) -> None:
             is_batch = extra > 0 and _fits(field.shape[extra:], shape)
             raise ValueError(
                 f"state.{name} must be {np.dtype(dtype).name}{_written(shape)}, got "
-                + described(field)
+                + describe_array(field)
                 + ("; this is a batch of states: use jax.vmap, or take one" if is_batch else "")
             )
 
@@ -333,12 +338,12 @@ def _written(shape: tuple[int | None, ...]) -> str:
     return f"[{', '.join(str(size or 'N') for size in shape)}]"
 
 
-def _converted(name: str, value: Any) -> np.ndarray:
+def _convert(name: str, value: Any) -> np.ndarray:
     """Converts `value` to the shape and dtype of a field."""
     array = np.asarray(integer_array(name, value))
     shape, dtype = _FIELDS[name]
     if not _fits(array.shape, shape):
-        raise ValueError(f"{name} must be integer{_written(shape)}, got {described(array)}")
+        raise ValueError(f"{name} must be integer{_written(shape)}, got {describe_array(array)}")
     limits = np.iinfo(dtype)
     outside = array[(array < limits.min) | (array > limits.max)]
     if outside.size:

@@ -1,4 +1,4 @@
-"""Tables as Markdown text, aligned for a terminal too."""
+"""Markdown tables whose columns also align in a terminal."""
 
 from collections.abc import Sequence
 

@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, check_own_state, described, names_adapters
+from trap_tube_jax.checks import check_integer, check_own_state, describe_array, names_adapters
 from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.state import State, TimeStep
@@ -180,7 +180,7 @@ def _check_keys(keys: Any) -> None:
         is_typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
         if keys.ndim == (1 if is_typed else 2) and len(keys):
             return
-        found = described(keys)
+        found = describe_array(keys)
     raise ValueError(
         f"expected an array of PRNG keys [B] with B >= 1, got {found}; make them with "
         "jax.random.split(jax.random.key(seed), B)"

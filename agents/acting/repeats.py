@@ -1,4 +1,4 @@
-"""Repeats: how often an episode has taken each action at the present observation.
+"""Repeats: how often an episode has taken each action at the current observation.
 
 The environment is deterministic, so repeating an action at the same observation has the same
 effect. A policy that always takes the most probable action may therefore walk in circles. With

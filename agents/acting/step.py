@@ -13,13 +13,13 @@ class Memory(NamedTuple):
     """Memory of the agent between the steps of B episodes.
 
     Attributes:
-      embedding: f32[B, hidden], the state of the GRU.
+      hidden: f32[B, H], the state of the GRU.
       action_tm1: i32[B, 2], the previous (grasp, move); zeros before the first step.
       reward_tm1: f32[B], the previous reward; 0 before the first step.
       repeats: the actions that greedy play has tried; None without `repeat_penalty`.
     """
 
-    embedding: jax.Array
+    hidden: jax.Array
     action_tm1: jax.Array
     reward_tm1: jax.Array
     repeats: Repeats | None
@@ -28,7 +28,7 @@ class Memory(NamedTuple):
     def empty(agent: Agent, params: Params, batch: int, *, greedy: bool) -> "Memory":
         """Returns the memory before the first step of `batch` episodes."""
         return Memory(
-            embedding=agent.initial_state(params, batch),
+            hidden=agent.initial_state(params, batch),
             action_tm1=jnp.zeros((batch, 2), jnp.int32),
             reward_tm1=jnp.zeros(batch, jnp.float32),
             repeats=Repeats.empty(batch) if greedy and agent.config.repeat_penalty else None,
@@ -41,7 +41,7 @@ class Choice(NamedTuple):
     Attributes:
       action: i32[B, 2], (grasp, move).
       log_prob: f32[B], of the action.
-      value: f32[B, V], one value per head for the present observation.
+      value: f32[B, V], one value per head for the current observation.
     """
 
     action: jax.Array
@@ -67,8 +67,8 @@ def choose(
       observation: u8[B, 12, 12, N]; only greedy play with `repeat_penalty` reads it.
       key: PRNG key of the draws; None takes the most probable actions after `repeat_penalty`.
     """
-    embedding = agent.step(params, memory.embedding, features, memory.action_tm1, memory.reward_tm1)
-    actions, value = agent.policy_and_value(params, embedding)
+    hidden = agent.step(params, memory.hidden, features, memory.action_tm1, memory.reward_tm1)
+    actions, value = agent.policy_and_value(params, hidden)
     repeats = memory.repeats
     if key is not None:
         action = actions.sample(key)
@@ -77,4 +77,4 @@ def choose(
     else:
         action, repeats = repeats.choose(actions, agent.config.repeat_penalty, observation)
     choice = Choice(action, actions.log_prob(action), value)
-    return choice, Memory(embedding, action, memory.reward_tm1, repeats)
+    return choice, Memory(hidden, action, memory.reward_tm1, repeats)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
+from trap_tube_jax.geometry import cell_of
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, DOWN, FOOD, LEFT, NUM_DIRECTIONS, RIGHT, UP
 
 
@@ -88,5 +89,4 @@ def _first_cell(observation: jax.Array, color: jax.Array) -> jax.Array:
     """Returns the first cell i32[2] of this colour u8[N]; (-1, -1) if there is none."""
     has_color = jnp.all(observation == color[None, None], axis=-1).reshape(-1)
     index = jnp.argmax(has_color).astype(jnp.int32)
-    cell = jnp.stack([index // BOARD_SIZE, index % BOARD_SIZE])
-    return jnp.where(jnp.any(has_color), cell, -1)
+    return jnp.where(jnp.any(has_color), cell_of(index), -1)

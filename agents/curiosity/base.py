@@ -21,16 +21,16 @@ class Experience(NamedTuple):
     Attributes:
       episodes: B episodes of T steps.
       features: f32[B, T + 1, F], the observations encoded by `Curiosity.encode`.
-      embedding: f32[B, T, H], the GRU's output h at the step.
-      next_embedding: f32[B, T, H], h', its output after the step, in a second pass; None unless
-        the curiosity `needs_next_embedding`.
+      hidden: f32[B, T, H], the GRU's output h at the step.
+      next_hidden: f32[B, T, H], h', its output after the step, in a second pass; None unless
+        the curiosity `needs_next_hidden`.
       action_embedding: f32[B, T, E], the policy's embedding of the action.
     """
 
     episodes: Episodes
     features: jax.Array
-    embedding: Any = None
-    next_embedding: Any = None
+    hidden: Any = None
+    next_hidden: Any = None
     action_embedding: Any = None
 
 
@@ -40,10 +40,10 @@ class Curiosity:
     All methods are pure functions of arrays. Attributes are settings and modules, never arrays.
 
     Attributes:
-      needs_next_embedding: whether rewards or losses read `Experience.next_embedding`.
+      needs_next_hidden: whether rewards or losses read `Experience.next_hidden`.
     """
 
-    needs_next_embedding = False
+    needs_next_hidden = False
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws parameters, trained together with the policy's; {} if there are none.

@@ -49,7 +49,7 @@ class CheckedCuriosity(Curiosity):
             assert isinstance(features, jax.ShapeDtypeStruct), "encode must return an array"
             chex.assert_shape(features, (len(boards), None))
             chex.assert_type(features, jnp.float32)
-        self.needs_next_embedding = curiosity.needs_next_embedding
+        self.needs_next_hidden = curiosity.needs_next_hidden
         self.init = curiosity.init
         self.memory = curiosity.memory
         self.encode = curiosity.encode

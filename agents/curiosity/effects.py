@@ -14,11 +14,12 @@ from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.curiosity.first_visits import first_visits
 from agents.networks.hashing import hash_rows
+from trap_tube_jax.geometry import cell_index
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 
 NUM_KINDS = 3
 OFF_BOARD = np.uint32(2**32 - 1)  # in place of a colour's hash; 0 is the hash of black
-LOWEST_RATE = 1e-4  # effects per step; effects of a lower rate do not pay more
+MIN_RATE = 1e-4  # effects per step; effects of a lower rate do not pay more
 
 
 class Effects(Curiosity):
@@ -46,7 +47,7 @@ class Effects(Curiosity):
         new = new_effects(experience.episodes) * mask[None]
         rate = jnp.sum(new, axis=(1, 2)) / jnp.sum(mask)
         rate = jnp.where(memory > 0, self._decay * memory + (1 - self._decay) * rate, rate)
-        return jnp.tensordot(1 / jnp.maximum(rate, LOWEST_RATE), new, axes=1), rate
+        return jnp.tensordot(1 / jnp.maximum(rate, MIN_RATE), new, axes=1), rate
 
 
 def new_effects(episodes: Episodes) -> jax.Array:
@@ -58,9 +59,7 @@ def new_effects(episodes: Episodes) -> jax.Array:
 
     Grasp: the grasped cell has a colour that the episode has not grasped before.
     """
-    new_cells = [
-        first_visits(_cell_index(cells))[:, 1:] for cells in (episodes.food, episodes.tool)
-    ]
+    new_cells = [first_visits(cell_index(cells))[:, 1:] for cells in (episodes.food, episodes.tool)]
     hand = episodes.agent[:, :-1].astype(jnp.int32)
     hand = hand + jnp.asarray(DIRECTIONS)[episodes.action[..., 0]]
     on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
@@ -69,9 +68,3 @@ def new_effects(episodes: Episodes) -> jax.Array:
     color = hash_rows(episodes.observations()[episode, time, hand[..., 0], hand[..., 1]])
     new_colors = first_visits(jnp.where(on_board, color, OFF_BOARD))
     return jnp.stack([*new_cells, jnp.where(on_board, new_colors, 0.0)])
-
-
-def _cell_index(cells: jax.Array) -> jax.Array:
-    """Returns the indices i32[...] of cells u8[..., 2], row by row."""
-    cells = cells.astype(jnp.int32)
-    return cells[..., 0] * BOARD_SIZE + cells[..., 1]

@@ -26,8 +26,8 @@ class Models(nn.Module):
         """Returns the squared errors f32[..., H] of predicted h', and the inferred action.
 
         Args:
-          h: f32[..., H], an embedding before a step.
-          after: f32[..., H], h', the one after it.
+          h: f32[..., H], the GRU's output at a step.
+          after: f32[..., H], h', its output after the step.
           action: f32[..., E], the embedded action.
         """
         x = nn.swish(dense(self.hidden, name="inverse")(jnp.concatenate([h, after], axis=-1)))
@@ -43,7 +43,7 @@ class ICM(Curiosity):
     No gradient is stopped, so both losses train the policy's encoder.
     """
 
-    needs_next_embedding = True
+    needs_next_hidden = True
 
     def __init__(self, config: Config):
         self._models: Any = Models(config.hidden)
@@ -69,5 +69,5 @@ class ICM(Curiosity):
 
     def predict(self, params: Params, experience: Experience) -> Any:
         """Returns the squared errors f32[B, T, H] of predicted h', and the inferred action."""
-        embeddings = experience.embedding, experience.next_embedding
-        return self._models.apply(params, *embeddings, experience.action_embedding)
+        hidden = experience.hidden, experience.next_hidden
+        return self._models.apply(params, *hidden, experience.action_embedding)

@@ -13,6 +13,7 @@ from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
 from agents.networks import make_encoder
 from agents.networks.layers import dense, init_module, output_dense
+from agents.registry import contract
 
 
 class Models(nn.Module):
@@ -37,11 +38,16 @@ class RND(Curiosity):
     """reward: the squared error at the next observation, summed over units; loss: its mean."""
 
     def __init__(self, config: Config):
+        self._encoder = config.encoder
         self._models = Models(config.hidden, make_encoder(config), make_encoder(config))
 
     def init(self, key: jax.Array, board: jax.Array) -> Params:
         """Draws the parameters of target and predictor; the target's get no gradient."""
-        return init_module(self._models, key, board)
+        params = init_module(self._models, key, board)
+        found = [jax.tree.structure(params["params"].get(name)) for name in ("target", "predictor")]
+        with contract("encoder", self._encoder):
+            assert found[0] == found[1], "two encoders share a module; build all modules anew"
+        return params
 
     def encode(self, params: Params, observation: jax.Array) -> jax.Array:
         """Returns the difference of prediction and target, f32[M, F]."""

@@ -127,8 +127,9 @@ def advantages_and_targets(
     """Estimates advantages and value targets, f32[B, T] each, by the rule of `config.bootstrap`.
 
     `value`: gamma is 0 where a step terminates, a truncated episode bootstraps from the value of
-    its last observation, and the target is A_t + v_t. `baseline`: gamma is constant, the last
-    step bootstraps from its own value, and the target is the discounted sum of rewards.
+    its last observation, and the target is A_t + v_t. `baseline`: gamma is constant, step T
+    bootstraps from its own value, even if it terminates, an earlier termination bootstraps from the
+    final board, and the target is the discounted sum of rewards.
 
     Args:
       config: settings.

@@ -130,9 +130,9 @@ class Learner:
         curiosity = self.curiosity.init(curiosity_key, board)
         params = {**self.agent.init(agent_key), "curiosity": curiosity}
         if config.motion_coef:
-            embedding = jnp.zeros((1, config.hidden), jnp.float32)
+            hidden = jnp.zeros((1, config.hidden), jnp.float32)
             action = self.agent.embed_action(params, jnp.zeros((1, 2), jnp.int32))
-            params["motion"] = init_module(MotionHead(), motion_key, embedding, action)
+            params["motion"] = init_module(MotionHead(), motion_key, hidden, action)
         zero = jnp.zeros((), jnp.int32)
         return TrainState(
             params=params,
@@ -265,7 +265,7 @@ class Learner:
         config = self.config
         mask = batch.episodes.mask
         experience = self.experience(params, batch.episodes)
-        actions, value = self.agent.policy_and_value(params, experience.embedding)
+        actions, value = self.agent.policy_and_value(params, experience.hidden)
         log_prob = actions.log_prob(batch.episodes.action)
         surrogate = losses.clipped_surrogate(
             log_prob, batch.log_prob, batch.advantage, config.clip_eps
@@ -279,7 +279,7 @@ class Learner:
         }
         if config.motion_coef:
             logits: Any = MotionHead().apply(
-                params["motion"], experience.embedding, experience.action_embedding
+                params["motion"], experience.hidden, experience.action_embedding
             )
             motion = motion_loss(logits, batch.episodes.cells)
             terms["motion_loss"] = config.motion_coef * losses.padded_mean(motion, mask)
@@ -292,15 +292,15 @@ class Learner:
     def experience(self, params: Params, episodes: Episodes) -> Experience:
         """Returns the curiosity's view of episodes under `params`, differentiable by them."""
         features, curiosity_features = self.encoding.encode_episodes(params, episodes)
-        embedding, next_embedding = self.agent.unroll(
+        hidden, next_hidden = self.agent.unroll(
             params,
             features,
             episodes.action,
             episodes.reward,
-            with_next=self.curiosity.needs_next_embedding,
+            with_next=self.curiosity.needs_next_hidden,
         )
         action_embedding = self.agent.embed_action(params, episodes.action)
-        return Experience(episodes, curiosity_features, embedding, next_embedding, action_embedding)
+        return Experience(episodes, curiosity_features, hidden, next_hidden, action_embedding)
 
     def play_metrics(
         self, episodes: Episodes, intrinsic_reward: jax.Array, solved: jax.Array

@@ -27,7 +27,7 @@ def clipped_surrogate(
       loss = -min(ratio * A, clip(ratio, 1 - clip_eps, 1 + clip_eps) * A)
 
     Args:
-      log_prob: f32[...], log-probabilities of the actions under the present parameters.
+      log_prob: f32[...], log-probabilities of the actions under the current parameters.
       old_log_prob: f32[...], the same under the parameters that acted.
       advantage: f32[...].
       clip_eps: half-width of the interval of ratios.

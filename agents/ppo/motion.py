@@ -23,16 +23,16 @@ class MotionHead(nn.Module):
     """Predicts from the GRU's output and the action whether each thing changes row and column."""
 
     @nn.compact
-    def __call__(self, embedding: jax.Array, action: jax.Array) -> jax.Array:
+    def __call__(self, hidden: jax.Array, action: jax.Array) -> jax.Array:
         """Maps f32[..., H] and an embedded action f32[..., E] to logits f32[..., 3, 2]."""
-        x = nn.swish(dense(UNITS)(jnp.concatenate([embedding, action], axis=-1)))
+        x = nn.swish(dense(UNITS)(jnp.concatenate([hidden, action], axis=-1)))
         return output_dense(THINGS * AXES)(x).reshape(*x.shape[:-1], THINGS, AXES)
 
 
 def motion_loss(logits: jax.Array, cells: jax.Array) -> jax.Array:
     """Returns the cross-entropy f32[B, T] of the motion of a step, summed over things and axes.
 
-      loss_t = -sum log p(cells_{t+1} != cells_t)
+      loss_t = -sum log p(moved_t), moved_t = [cells_{t+1} != cells_t]
 
     Args:
       logits: f32[B, T, 3, 2].

@@ -11,8 +11,3 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 FILES = {path.stem: path for path in sorted(FOLDER.glob("*.safetensors"))}
-
-
-def names() -> tuple[str, ...]:
-    """Returns the names of the shipped agents."""
-    return tuple(FILES)

@@ -13,14 +13,14 @@ from agents.acting.policy import Policy
 from agents.profiles.subgoals import SUBGOALS, Cells, last_subgoals, replay, tool_moves
 from agents.profiles.tasks import FIRST_PUSH_PARTS, FIRST_PUSHES, PARTS, STRENGTHS, Part, Sampling
 from agents.runs.evaluator import Evaluator
+from agents.runs.metrics import Table
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
 from trap_tube_jax.scoring.knowledge import choice_of_exit, first_push
 from trap_tube_jax.scoring.scores import wilson_interval
-from trap_tube_jax.state import take
+from trap_tube_jax.state import concatenate_trees, take
 
 LONG = 100  # steps, twice the paper's limit
-Table = Any  # pandas.DataFrame; what a type checker infers of pandas is too wide to use
 FAILED = [f"failed: {name}" for name in SUBGOALS]
 COUNTS = ["tasks", "solved", "solved_100", "direct", *FAILED]
 MEANS = ["steps", "plan", "optimality"]
@@ -43,7 +43,7 @@ def profile(
       parts: names of `tasks.PARTS`.
       strengths: of the graded transfers, from 0 (the base task) to 1 (the paper's transfer).
       num_tasks: tasks of each strength and symbolic swap, and of the other draws from {P}.
-      report: is told what is about to be done.
+      report: called with one line before each stage.
 
     Returns:
       One row per policy, part and level. Columns: the number of tasks, of tasks solved within 50
@@ -166,7 +166,7 @@ def percent(successes: float, trials: float) -> str:
 
 
 def is_direct(cells: Cells, planned: np.ndarray) -> np.ndarray:
-    """Tests whether B episodes push the food in the direction `planned` i32[B, 2] alone, bool[B].
+    """Tests whether B episodes push the food only in the direction `planned` i32[B, 2], bool[B].
 
     Where it is zero, the tool must not move either.
     """
@@ -178,7 +178,7 @@ def is_direct(cells: Cells, planned: np.ndarray) -> np.ndarray:
 
 def _solve(tasks: Mapping[str, tt.State]) -> dict[str, tt.Plan]:
     """Solves the tasks of all parts in one call, since parts share tasks."""
-    plans = tt.solve_batch(jax.tree.map(lambda *x: np.concatenate(x), *tasks.values()))
+    plans = tt.solve_batch(concatenate_trees(tasks.values()))
     ends = np.cumsum([len(states.time) for states in tasks.values()])
     return {
         name: take(plans, slice(end - len(states.time), end))

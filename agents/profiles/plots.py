@@ -10,8 +10,8 @@ import trap_tube_jax as tt
 from agents.files import write_bytes
 from agents.profiles.measure import Table
 from agents.profiles.tasks import control_layouts
-from agents.runs.drawing import drawing, to_png
-from agents.sweeps.figures import COLORS, WIDTH, make_panels
+from agents.runs.drawing import COLORS, drawing, to_png
+from agents.sweeps.figures import WIDTH, make_panels
 from trap_tube_jax.rendering import used_window
 from trap_tube_jax.scoring.scores import wilson_interval
 

@@ -13,6 +13,7 @@ import trap_tube_jax as tt
 from trap_tube_jax.controls import CONTROLS, with_every_start
 from trap_tube_jax.objects import EXIT, OBJECT_NAMES, TRAP
 from trap_tube_jax.scoring.tasks import fixed_tasks
+from trap_tube_jax.state import concatenate_trees
 from trap_tube_jax.transfers import SYMBOLIC_OBJECTS, Transfer, swap_with_tool
 
 # All parts draw with the keys of this name. Hence "perceptual" and "both" have the same layouts,
@@ -140,5 +141,7 @@ def _draw(transfers: Sequence[Transfer], sampling: Sampling) -> tt.State:
 
 
 def _join(groups: dict[str, tt.State]) -> Part:
-    tasks = jax.tree.map(lambda *parts: np.concatenate(parts), *groups.values())
-    return Part(tasks, [name for name, states in groups.items() for _ in states.time])
+    return Part(
+        concatenate_trees(groups.values()),
+        [name for name, states in groups.items() for _ in states.time],
+    )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.arrays import SUFFIX, Arrays, read_arrays, to_arrays, write_arrays
-from agents.files import Plain, damage_named
+from agents.files import Plain, naming_file
 
 KEPT = 3  # the newest checkpoints
 CANONICAL = re.compile("0|[1-9][0-9]*")  # names of files; others are somebody else's
@@ -64,7 +64,7 @@ def _read(folder: Path, iteration: int) -> tuple[Arrays, dict[str, Any]]:
     path = _file(folder, iteration)
     try:
         arrays, record = read_arrays(path, dict[str, Plain])
-        with damage_named(path):
+        with naming_file(path):
             if record.get("iteration") != iteration:
                 raise ValueError(f"its iteration is {record.get('iteration')!r}")
     except ValueError as error:

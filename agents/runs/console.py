@@ -24,4 +24,4 @@ class CommandConsole(Console):
         """Is called instead of an error."""
         self.quiet = True
         interruptions.close_stdout()
-        interruptions.receive(signal.SIGPIPE)
+        interruptions.handle_signal(signal.SIGPIPE)

@@ -23,7 +23,7 @@ class ProgressLine(Progress):
     """
 
     def __init__(self, console: Console, total: float, *columns: ProgressColumn, **options: Any):
-        rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # alone is cut off
+        rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # alone is truncated
         super().__init__(
             BarColumn(bar_width=12),
             *columns,

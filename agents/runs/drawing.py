@@ -10,6 +10,9 @@ from typing import Any
 from trap_tube_jax.command_line import one_line
 from trap_tube_jax.figures import default_style
 
+# Okabe and Ito's palette, which is colour-blind safe.
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
+
 
 @contextlib.contextmanager
 def drawing(path: Path) -> Iterator[None]:

@@ -35,7 +35,7 @@ class Evaluator:
     def of_sets(
         cls, config: Config, sets: Sequence[str], num_tasks: int, purpose: Purpose = "test"
     ) -> Self:
-        """Makes an evaluator of registered task sets, whose step limits hold, as in the protocol.
+        """Builds an evaluator for registered task sets, each under its own step limit.
 
         Raises:
           ValueError: unknown set, or no task.

@@ -1,15 +1,11 @@
 """The folder of one run: its files and its lock."""
 
-import contextlib
 import dataclasses
 import difflib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-import filelock
-
-from agents.files import Plain, damage_named, is_file, read_json, write_json
+from agents.files import Plain, is_file, naming_file, read_json, write_json
 from agents.runs.run import DeviceOptions, Run, RunOptions, check_algorithm
 from trap_tube_jax._version import __version__
 from trap_tube_jax.checks import check_seed, check_stored_name, expand
@@ -17,7 +13,7 @@ from trap_tube_jax.imports import import_modules
 
 CONFIG_FILE = "config.json"
 RUNS = Path("runs")  # where agents.train puts them
-MOST_LISTED = 10
+MAX_LISTED = 10
 
 Settings = dict[str, Plain | list[int | float]]
 
@@ -54,28 +50,6 @@ class RunFolder:
         """The folder's name, also if its path is "." or ends in ".."."""
         return self.path.resolve().name
 
-    @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
-        """Makes this process the folder's only writer; makes the folder if missing.
-
-        Raises:
-          ValueError: another process writes to the folder, or the folder holds a link.
-          OSError: the folder cannot be created or locked.
-        """
-        self.path.mkdir(parents=True, exist_ok=True)
-        for path in self.path.iterdir():
-            if path.is_symlink():  # writing would change a file elsewhere
-                raise ValueError(f"{path} is a link; replace it by a copy of what it names")
-        try:
-            with filelock.FileLock(self.path / ".lock", timeout=0):
-                yield
-        except filelock.Timeout:
-            raise ValueError(
-                f"{self.path} is being written by another process; wait for its end"
-            ) from None
-        except NotImplementedError as error:
-            raise OSError(f"{self.path} cannot be locked: {error}") from error
-
     def check_free(self) -> None:
         """Raises ValueError unless a new run can be created here."""
         names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
@@ -85,7 +59,7 @@ class RunFolder:
         if names - {".lock"}:
             raise ValueError(f"{self.path} exists, but holds no run; give another --name")
 
-    def note(self, run: Run, options: RunOptions | None = None) -> None:
+    def write_config(self, run: Run, options: RunOptions | None = None) -> None:
         """Writes a run, its options and the version of this package."""
         values = {**run.to_dict(), "options": dataclasses.asdict(options or RunOptions())}
         write_json(self.config, {"version": __version__, **values})
@@ -99,7 +73,7 @@ class RunFolder:
         if not is_file(self.config):
             raise ValueError(f"{self.path} holds no run; {runs_near(self.path)}")
         values = read_json(self.config, StoredRun)
-        with damage_named(self.config):
+        with naming_file(self.config):
             check_seed(values["seed"])
             check_algorithm(values["algorithm"])
             DeviceOptions(values["options"].get("devices"))
@@ -135,10 +109,19 @@ class RunFolder:
 
 
 def check_output(path: Path) -> None:
-    """Raises ValueError if a file to be written is one of a run's files."""
-    run = RunFolder(path.parent)
-    if run.config.is_file() and path in vars(run).values():
+    """Raises ValueError if a file to be written is one of a run's files, or no regular file."""
+    is_file(path)
+    if run := run_of(path):
         raise ValueError(f"{path} is a file of the run {run.path}; give another path")
+
+
+def run_of(path: Path) -> RunFolder | None:
+    """Returns the run of which a path is a file; None if there is none."""
+    for folder in map(RunFolder, (path.parent, path.parent.parent)):
+        files = set(vars(folder).values()) - {folder.path}
+        if folder.config.is_file() and (path in files or path.parent == folder.checkpoints):
+            return folder
+    return None
 
 
 def runs_near(path: Path) -> str:
@@ -158,8 +141,8 @@ def _runs_in(path: Path) -> list[Path]:
 
 
 def _listed(runs: list[Path]) -> str:
-    more = ", ..." if len(runs) > MOST_LISTED else ""
-    return ", ".join(run.name for run in runs[:MOST_LISTED]) + more
+    more = ", ..." if len(runs) > MAX_LISTED else ""
+    return ", ".join(run.name for run in runs[:MAX_LISTED]) + more
 
 
 def check_name(name: str) -> None:

@@ -13,7 +13,7 @@ from agents.config import Config
 from agents.files import is_file
 from agents.networks.agent import PARTS, Agent, Params
 from agents.runs import checkpoint
-from agents.runs.folder import CONFIG_FILE, RunFolder, Settings, runs_near
+from agents.runs.folder import RunFolder, Settings, run_of, runs_near
 from trap_tube_jax.checks import check_integer, expand
 from trap_tube_jax.imports import import_modules
 
@@ -57,20 +57,20 @@ def load(
     if is_file(folder.config):
         return _load_run(folder, iteration, imports).replace(greedy=greedy)
     path = folder.path
+    if (run := run_of(path)) and path != run.best:
+        number = f", and iteration {path.stem}" if path.parent == run.checkpoints else ""
+        raise ValueError(f"{source} is in the run {run.path}; give the run{number}")
     if not path.is_file():
         path = pretrained.FILES.get(str(source), path)
     if path.is_dir() or not is_file(path):
         raise ValueError(
             f"{source} is neither a run, a file nor a shipped agent; {runs_near(path)}; "
-            f"shipped agents: {', '.join(pretrained.names())}"
-        )
-    if is_file(path.parent.parent / CONFIG_FILE) and path.parent.name == folder.checkpoints.name:
-        raise ValueError(
-            f"{source} is a checkpoint; give its run, {path.parent.parent}, and iteration "
-            f"{path.stem}"
+            f"shipped agents: {', '.join(pretrained.FILES)}"
         )
     if iteration is not None:
-        raise ValueError(f"iteration is for runs, which {source} is not; leave it out")
+        raise ValueError(
+            f"iteration selects a checkpoint of a run, and {source} is a file; leave it out"
+        )
     import_modules(imports)
     return read_policy(path).replace(greedy=greedy)
 

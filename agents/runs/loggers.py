@@ -42,7 +42,7 @@ def check_loggers(options: RunOptions) -> None:
 def open_loggers(path: Path, run: Run, *, tensorboard: bool, wandb: bool) -> Iterator[Log]:
     """Opens loggers in the folder of a run; yields a function that logs a row of metrics.
 
-    A resumed run goes on where metrics.csv ends, and every iteration is shown once.
+    A resumed run continues after the last row of metrics.csv, without duplicate iterations.
     """
     folder = RunFolder(path)
     with contextlib.ExitStack() as stack:
@@ -77,14 +77,20 @@ def _open_wandb(folder: RunFolder, run: Run) -> Iterator[Log]:
     """Continues the run of the newest W&B folder, or begins one."""
     import wandb  # noqa: PLC0415  # pyright: ignore
 
-    with wandb.init(
-        project="trap-tube-jax",
-        group=folder.title,
-        config=run.to_dict(),
-        dir=folder.path,
-        id=_wandb_id(folder),
-        resume="allow",
-    ) as logged:
+    try:
+        logged = wandb.init(
+            project="trap-tube-jax",
+            group=folder.title,
+            config=run.to_dict(),
+            dir=folder.path,
+            id=_wandb_id(folder),
+            resume="allow",
+        )
+    except wandb.Error as error:
+        raise ValueError(
+            f"--wandb cannot log: {one_line(error)} WANDB_MODE=offline needs no network."
+        ) from error
+    with logged:
         yield lambda row: logged.log(row, row["iteration"])
 
 

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import io
 import math
+import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ import pandas as pd
 import trap_tube_jax as tt
 from agents.acting.policy import Policy
 from agents.config import Config
-from agents.files import append_text, damage_named, is_file, read_text, write_bytes
+from agents.files import append_text, is_file, naming_file, read_text, write_bytes
 from agents.runs.run import check_algorithm
 from trap_tube_jax.checks import check_stored_name
 from trap_tube_jax.scoring.tasks import Purpose
@@ -120,7 +121,7 @@ def write_rows(path: Path, table: Table) -> None:
 def read_rows(path: Path) -> Table:
     """Reads a CSV file by the schema of its name; an empty table if the file is missing.
 
-    A last line that a killed process left incomplete is passed over.
+    Ignores an incomplete last line, which a killed process leaves.
 
     Raises:
       ValueError: the file is damaged; the message names it.
@@ -133,7 +134,7 @@ def _table(path: Path, records: list[list[str]]) -> Table:
     header, *rows = records
     schema = SCHEMAS[path.name]
     parsers = [schema.columns.get(name, schema.other) for name in header]
-    with damage_named(path):
+    with naming_file(path):
         for name in schema.columns:
             if name not in header:
                 raise ValueError(f"it has no column {name!r}")
@@ -142,6 +143,8 @@ def _table(path: Path, records: list[list[str]]) -> Table:
             name: [_parsed(parse, value, name) for value in values]
             for name, parse, values in zip(header, parsers, columns, strict=True)
         }
+        if "solved" in table and any(map(operator.gt, table["solved"], table["tasks"])):
+            raise ValueError("more tasks are solved than there are")
         return pd.DataFrame(table, columns=header)
 
 
@@ -150,7 +153,7 @@ def _records(path: Path) -> list[list[str]]:
     text = read_text(path) if is_file(path) else ""
     if "\n" not in text:  # not even the header is complete
         return [list(SCHEMAS[path.name].columns)]
-    with damage_named(path):
+    with naming_file(path):
         header, *rows = filter(None, csv.reader(io.StringIO(text, newline=""), strict=True))
         if rows and not text.endswith("\n") and len(rows[-1]) < len(header):
             rows.pop()

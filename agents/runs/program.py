@@ -1,4 +1,4 @@
-"""The program that runs share which differ only in their seed: learner, devices, evaluators."""
+"""The program shared by runs that differ only in their seed: learner, devices, evaluators."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ Tree = TypeVar("Tree")
 
 
 class Program:
-    """Holds what runs share that differ only in their seed.
+    """Holds what is shared by runs that differ only in their seed.
 
     Attributes:
       options: options of the runs.
@@ -76,7 +76,7 @@ class Cohort:
     """
 
     def __init__(self, program: Program, states: Sequence[TrainState]):
-        """Compiles the program; `states` are given up to it."""
+        """Compiles the program; the first `advance` donates `states`."""
         self.size = len(states)
         self.placement = program.placement
         advance = make_advance(program.learner)
@@ -98,7 +98,7 @@ class Cohort:
         return tree if self.size == 1 else jax.tree.map(lambda x: x[index], tree)
 
     def state(self, index: int) -> TrainState:
-        """Returns the present state of a member."""
+        """Returns the current state of a member."""
         return self.member(self.states, index)
 
 

@@ -34,7 +34,7 @@ class Progress:
     """One run as far as it has come, and the writer of its files.
 
     Attributes:
-      state: returns the present training state. Training replaces the function.
+      state: returns the current training state. Training replaces the function.
       last: the newest row of metrics; None before the first iteration.
     """
 
@@ -47,7 +47,7 @@ class Progress:
           run: the run.
           program: what the run shares with others.
           stored: the run's folder.
-          folder: the folder to write to; see `session.writing`.
+          folder: the folder to write to; see `session.output_folder`.
           console: where progress is shown.
 
         Raises:
@@ -59,6 +59,7 @@ class Progress:
         self.console = console
         self.stored = stored
         self.folder = folder
+        self.has_trained = False
         if stored.config.is_file():
             run.check_continues(stored.read()[0])
         restored, self.last = restore(stored, program.state_shapes)
@@ -83,8 +84,13 @@ class Progress:
         return self.last is not None and is_last(self.last, self.run.config)
 
     def begin(self) -> None:
-        """Notes what goes on, and removes the rows that training makes again."""
-        self.folder.note(self.run, self.program.options)  # they may differ from those before
+        """Writes config.json and, for a new run, the first checkpoint.
+
+        Removes rows after the newest checkpoint.
+        """
+        self.folder.write_config(
+            self.run, self.program.options
+        )  # they may differ from those before
         if self.last is None:
             self.save()  # from now on, rows without a checkpoint mean that files were removed
         for rows in (self.folder.metrics, self.folder.evaluations):
@@ -97,6 +103,7 @@ class Progress:
 
         `seeds` are trained together.
         """
+        self.has_trained = True
         config = self.run.config
         options = self.program.options
         note_provenance(self.folder.provenance, str(self.program.placement))
@@ -145,7 +152,7 @@ class Progress:
     def finish(self) -> tt.Scores | None:
         """Plays the test tasks with the final policy, or the best one; writes the results.
 
-        Returns the scores; None if all are in the files.
+        Returns the scores; None if they are in the files, and so is the report of all training.
         """
         options = self.program.options
         policy = self._policy()
@@ -154,7 +161,7 @@ class Progress:
         tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
         tested = set(tested[tested["iteration"] == policy.iteration]["task_set"])
         has_page = self.folder.page.exists() or not options.report
-        if tested.issuperset(self.program.sets) and has_page:
+        if tested.issuperset(self.program.sets) and has_page and not self.has_trained:
             self.console.out("Already tested; to play other tasks, run python -m agents.evaluate.")
             return None
         self.console.out("Playing test tasks, which takes up to a minute ...")
@@ -184,7 +191,7 @@ class Progress:
                 raise ValueError(
                     f"{self.stored.evaluations} has the evaluation of iteration {done} on "
                     f"{row['task_set']}, which is after the newest checkpoint and would not be "
-                    "made again; continue with the --sets and --evaluate-every of before"
+                    "made again; continue with the same --sets and --evaluate-every as before"
                 )
 
     def _row(self, metrics: Metrics, seconds: float) -> Row:
@@ -224,7 +231,7 @@ class Progress:
         self._keep_best()
 
     def _keep_best(self) -> None:
-        """Saves the present policy if its evaluation is better than the best policy's."""
+        """Saves the current policy if its evaluation is better than the best policy's."""
         rows = validation_rows(self.folder)
         train_set = tt.task_set(self.run.config.env_id).short
         if is_better(rows, self.iteration, best_iteration(self.folder), train_set):

@@ -10,7 +10,7 @@ from typing import Any, NotRequired, TypedDict
 
 import jax
 
-from agents.files import damage_named, is_file, read_json, write_json
+from agents.files import is_file, naming_file, read_json, write_json
 
 ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -67,7 +67,7 @@ def read_provenance(path: pathlib.Path) -> list[Machine]:
       ValueError: the file is damaged; the message names it.
     """
     machines: list[Machine] = read_json(path, list[Machine]) if is_file(path) else []
-    with damage_named(path):
+    with naming_file(path):
         for machine in machines:
             commit = machine["commit"]
             if commit is not None and not re.fullmatch("[0-9a-f]+(-dirty)?", commit):

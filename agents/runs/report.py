@@ -20,7 +20,7 @@ import numpy as np
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.files import draft_of, write_bytes
-from agents.runs.drawing import drawing, to_png
+from agents.runs.drawing import COLORS, drawing, to_png
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import Table, read_rows
@@ -35,7 +35,6 @@ from trap_tube_jax.state import take
 CELL_SIZE = 16  # pixels of the page's boards
 GIF_CELL_SIZE = 24
 PAGE = Path(__file__).with_name("report.html")  # its $names are filled in
-COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00")  # colour-blind safe
 
 PANELS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("tasks solved", "fraction", ("success", "validation_success")),

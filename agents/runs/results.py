@@ -59,7 +59,7 @@ def metrics(paths: Paths) -> pd.DataFrame:
 
 
 def find_runs(paths: Paths) -> list[RunFolder]:
-    """Returns the runs in folders, sorted by path, a folder once whatever links lead to it.
+    """Returns the runs in folders, sorted by path, once even if several links lead to one.
 
     Raises:
       ValueError: a folder holds no run, or there is no folder.

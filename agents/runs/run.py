@@ -77,7 +77,7 @@ def check_algorithm(name: str) -> None:
     if not re.fullmatch(r"\w[\w .,:;=+/()\[\]{}-]*", name):
         raise ValueError(
             "algorithm must begin with a letter or digit, and hold letters, digits, spaces and "
-            f"any of .,:;=+/()[]{{}}- alone, got {name!r}"
+            f"any of .,:;=+/()[]{{}}- only, got {name!r}"
         )
 
 
@@ -133,5 +133,7 @@ class RunOptions(DeviceOptions):
         check_integer("evaluate_every", self.evaluate_every, minimum=0)
         if self.test_tasks is not None:
             check_integer("test_tasks", self.test_tasks, maximum=MAX_TASKS)
+        if self.sets is not None and not self.sets:
+            raise ValueError("sets must name one or more task sets, or be None for the default")
         for name in self.sets or ():
             tt.task_set(name)

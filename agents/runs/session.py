@@ -17,6 +17,7 @@ import jax
 from rich.console import Console
 
 import trap_tube_jax as tt
+from agents.files import lock_folder
 from agents.parallel import processes
 from agents.runs.folder import RunFolder
 from agents.runs.loggers import check_loggers
@@ -25,7 +26,7 @@ from agents.runs.progress import Progress
 from agents.runs.run import Run, RunOptions
 from trap_tube_jax.interruptions import Stopped, deferring
 
-# Scores on test tasks, None if the run was finished before, or the reason why it did not end.
+# Scores on test tasks, None if they were known before, or the reason why the run did not end.
 Outcome = tt.Scores | None | Stopped | ValueError | OSError
 
 
@@ -50,7 +51,7 @@ def train_run(
         and other hosts.
 
     Returns:
-      The scores on test tasks; None if the run was finished before.
+      The scores on test tasks; None if the policy to report was tested before.
 
     Raises:
       ValueError: the run cannot be trained or continued, or it diverged.
@@ -109,9 +110,9 @@ def train_runs(
     with contextlib.ExitStack() as stack:
         for path, run in runs.items():
             console = (consoles or {}).get(path) or Console(quiet=True)
-            with recording(outcomes, path):
+            with capturing_outcome(outcomes, path):
                 stored = RunFolder(path)
-                folder = stack.enter_context(writing(stored))
+                folder = stack.enter_context(output_folder(stored))
                 opened[path] = Progress(run, program, stored, folder, console)
                 opened[path].begin()
         training = {
@@ -123,7 +124,7 @@ def train_runs(
             train(program, training, outcomes, stop)
         for path, progress in opened.items():
             if path not in outcomes:
-                with recording(outcomes, path):
+                with capturing_outcome(outcomes, path):
                     outcomes[path] = progress.finish()
     return outcomes
 
@@ -152,7 +153,7 @@ def train(
             for index, (path, progress) in enumerate(training.items()):
                 if path in outcomes:
                     continue
-                with recording(outcomes, path):
+                with capturing_outcome(outcomes, path):
                     if not progress.is_trained:
                         progress.record(cohort.member(metrics, index), seconds)
                     if number:
@@ -161,15 +162,15 @@ def train(
 
 
 @contextlib.contextmanager
-def writing(stored: RunFolder) -> Iterator[RunFolder]:
+def output_folder(stored: RunFolder) -> Iterator[RunFolder]:
     """Makes this process the writer of a run.
 
-    Yields the run's folder, or on all but the first process of a job one that is then deleted.
+    Yields the run's folder; processes other than the first get a temporary folder.
 
     Raises ValueError if another process writes to the folder, OSError if it cannot be created.
     """
     if jax.process_index() == 0:
-        with stored.lock():
+        with lock_folder(stored.path):
             yield stored
     else:
         with tempfile.TemporaryDirectory() as copy:
@@ -177,7 +178,7 @@ def writing(stored: RunFolder) -> Iterator[RunFolder]:
 
 
 @contextlib.contextmanager
-def recording(outcomes: dict[Path, Outcome], path: Path) -> Iterator[None]:
+def capturing_outcome(outcomes: dict[Path, Outcome], path: Path) -> Iterator[None]:
     """Records a failure or stop as the outcome of one run, so that the others go on."""
     try:
         yield

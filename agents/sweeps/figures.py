@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.files import write_bytes
-from agents.runs.drawing import drawing, to_png
+from agents.runs.drawing import COLORS, drawing, to_png
 from agents.runs.metrics import Table
 from agents.sweeps import tables
 from trap_tube_jax.scoring.tasks import label
@@ -14,9 +14,7 @@ from trap_tube_jax.scoring.tasks import label
 WIDTH = 8.3  # inches, as in a page 830 pixels wide
 DPI = 150
 UNITS = {"transitions": "environment steps", "episodes": "episodes"}
-# Okabe and Ito's palette, which is colour-blind safe.
-MOST_RANGES = 3  # of seeds that a panel can show
-COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
+MAX_RANGES = 3  # of seeds that a panel can show
 
 
 def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) -> list[Path]:
@@ -61,7 +59,7 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
             panels[f"greedy, {label(str(name))}"] = rows
     figure, axes = make_panels(list(panels), min(3, len(panels)), 2.1, about["title"])
     names = sorted(curves["algorithm"].unique())  # so that a colour means the same on all pages
-    has_ranges = len(names) <= MOST_RANGES
+    has_ranges = len(names) <= MAX_RANGES
     shown = set()
     for axis, rows in zip(axes, panels.values(), strict=True):
         for color, name in zip(COLORS, names, strict=False):

@@ -80,14 +80,16 @@ class Grid:
     def make_runs(self, name: str, options: Options) -> dict[Path, Run]:
         """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
         check_integer("seeds", options.seeds, maximum=MAX_RUNS)
-        if options.seeds_per_program is not None:
-            check_integer("seeds_per_program", options.seeds_per_program)
+        for limit in ("processes", "seeds_per_program"):
+            if getattr(options, limit) is not None:
+                check_integer(limit, getattr(options, limit))
         configs = self.configs(options)
         short = tt.task_set(next(iter(configs.values())).env_id).short
         if (options.preset, short) != (self.options.preset, self.options.env):
             name = f"{name}-{options.preset}-{short}"
-        check_name(options.name or name)
-        root = options.out / (options.name or name)
+        name = name if options.name is None else options.name
+        check_name(name)
+        root = options.out / name
         runs = {}
         for seed in range(options.seed, options.seed + options.seeds):
             for point, config in configs.items():

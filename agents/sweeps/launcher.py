@@ -69,13 +69,13 @@ def launch(
       KeyboardInterrupt: on a second signal; processes of this machine are killed.
     """
     # First, because the workers of a lost launcher are busy until they learn of this one.
-    present = Launch.begin(next(iter(runs)).parent)
+    current = Launch.begin(next(iter(runs)).parent)
     failed: list[Path] = []
     count = 0
     try:
         groups = group_runs(runs, options, executor, size)
-        with deferring(present.end) as request, Overview(console, runs) as overview:
-            calls = {executor.submit(*_call(group, options, present)): group for group in groups}
+        with deferring(current.end) as request, Overview(console, runs) as overview:
+            calls = {executor.submit(*_call(group, options, current)): group for group in groups}
             pending = set(calls)
             while pending:
                 overview.show()
@@ -98,19 +98,19 @@ def launch(
             process.kill()
         raise
     finally:
-        present.end()
+        current.end()
     return failed
 
 
-def _call(group: Group, options: RunOptions, present: Launch) -> tuple:
+def _call(group: Group, options: RunOptions, current: Launch) -> tuple:
     absolute = {path.absolute(): run for path, run in group.items()}  # a worker may run elsewhere
-    return train_logged, absolute, options, present
+    return train_logged, absolute, options, current
 
 
 def _outcomes(call: Future, group: Group, stopped: bool) -> dict[Path, str]:
     """Returns the outcomes of the runs of a call: `done`, `stopped` or an error.
 
-    Of a call that was lost, and of one that says `done`, the runs' files have the last word.
+    If a call was lost or reports `done`, the runs' files decide the outcome.
     """
     error = None if call.cancelled() else call.exception()  # its process was killed, for example
     if call.cancelled() or error:

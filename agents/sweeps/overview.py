@@ -13,8 +13,8 @@ from agents.runs.display import ProgressLine
 from agents.runs.folder import RunFolder
 from agents.runs.run import Run
 
-REFRESH = 5  # seconds between two readings of the runs' files
-LINE = 60  # seconds between two lines where there is no terminal
+REFRESH_SECONDS = 5  # between two readings of the runs' files
+LOG_SECONDS = 60  # between two lines where there is no terminal
 
 
 class Overview(ProgressLine):
@@ -37,7 +37,8 @@ class Overview(ProgressLine):
 
     def show(self) -> None:
         """Shows the progress if that is due; to be called every second."""
-        if time.monotonic() - self.shown >= (REFRESH if self.console.is_terminal else LINE):
+        wait = REFRESH_SECONDS if self.console.is_terminal else LOG_SECONDS
+        if time.monotonic() - self.shown >= wait:
             self._show()
 
     def _show(self) -> None:

@@ -72,7 +72,7 @@ def check(root: Path) -> None:
 def collect(root: Path, command: str) -> None:
     """Writes results.csv, curves.csv and grid.json from the runs in a folder.
 
-    Commands and the note that grid.json holds already stay in it.
+    Keeps the commands and the note already in grid.json.
 
     Raises:
       ValueError: a file is damaged, or a folder has a name that no table can hold.

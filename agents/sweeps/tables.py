@@ -80,7 +80,9 @@ def by_set(tested: Table) -> Table:
     table = tested.pivot(index=["algorithm", "seed"], columns="task_set", values="percent")
     order = [name for name in ALL_SETS if name in table]
     table = table[[*order, *(name for name in table if name not in order)]]
-    table[MEAN] = table.drop(columns="base", errors="ignore").mean(axis=1)
+    others = table.drop(columns="base", errors="ignore")
+    if len(others.columns):
+        table[MEAN] = others.mean(axis=1)
     return table.reindex(tested["algorithm"].unique(), level="algorithm")
 
 
@@ -142,13 +144,15 @@ def differences(tested: Table) -> Table:
     several = list(seeds[seeds > 1].index)
     if len(several) < 2 or several[0] != seeds.index[0]:
         return pd.DataFrame()
-    reference, *others = several
+    reference = several[0]
     few_layouts = tested.loc[tested["layouts_total"].notna(), "task_set"].unique()
     rows = []
     for task_set, percents in by_set(tested).drop(columns=few_layouts).items():
-        tests = [
-            welch(percents[name].to_numpy(), percents[reference].to_numpy()) for name in others
-        ]
+        known = {name: percents[name].dropna().to_numpy() for name in several}
+        if len(known[reference]) < 2:
+            continue
+        others = [name for name in several[1:] if len(known[name]) > 1]
+        tests = [welch(known[name], known[reference]) for name in others]
         factors = holm_factors(np.array([p for *_, p in tests]))
         for name, test, factor in zip(others, tests, factors, strict=True):
             difference, error, freedom, p = test

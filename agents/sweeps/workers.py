@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import multiprocessing
 import os
 import threading
@@ -16,10 +17,9 @@ from uuid import uuid4
 import jax
 from rich.console import Console
 
-from agents.files import write_bytes
+from agents.files import BusyError, lock_folder, write_bytes
 from agents.parallel.devices import split_cpu
 from agents.runs.compilation import enable_cache
-from agents.runs.folder import RunFolder
 from agents.runs.provenance import cores
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_runs
@@ -29,14 +29,14 @@ from trap_tube_jax.interruptions import Stopped, block_signals
 SPAWN = multiprocessing.get_context("spawn")
 DONE = "done"
 STOPPED = "stopped"
-PATIENCE = 600  # seconds; the longest iterations, with their evaluation, take a few minutes
+MAX_WAIT = 600  # seconds; the longest iterations, with their evaluation, take a few minutes
 
 
 class ProcessPerCall(ThreadPoolExecutor):
     """Makes each call in a fresh process; threads only wait.
 
-    A crash costs one call, unlike in `ProcessPoolExecutor(max_tasks_per_child=1)`, of which it
-    breaks all calls. Signals do not reach the processes: `Launch` ends them.
+    A crash fails one call; in `ProcessPoolExecutor(max_tasks_per_child=1)` it would fail all of
+    them. Signals do not reach the processes: `Launch` ends them.
     """
 
     def __init__(self, processes: int):
@@ -65,6 +65,8 @@ def make_executor(processes: int | None, cluster: str | None) -> Iterator[Execut
     if cluster is not None:
         with needs_extra("cluster"):
             from distributed import Client  # noqa: PLC0415  # pyright: ignore
+        # Calls of a lost scheduler are reported as failures, without tracebacks.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         with Client(cluster) as client:
             yield client.get_executor(pure=False)
         return
@@ -79,7 +81,7 @@ def capacity(executor: Executor) -> str:
     """Says how many calls an executor makes at a time."""
     if isinstance(executor, ProcessPerCall):
         return f"up to {executor.processes} at a time"
-    return "at a time as many as the cluster has workers"
+    return "as many at a time as the cluster has workers"
 
 
 def backend_of(executor: Executor) -> str:
@@ -94,7 +96,7 @@ class Launch:
     Unlike a signal, a file reaches other hosts, and workers whose launcher has died.
 
     Attributes:
-      file: holds the name of the grid's present launch; missing between two launches.
+      file: holds the name of the grid's current launch; missing between two launches.
       name: this launch.
     """
 
@@ -109,7 +111,7 @@ class Launch:
         return launch
 
     def end(self) -> None:
-        """Asks the workers to stop after their present iteration."""
+        """Asks the workers to stop after their current iteration."""
         self.file.unlink(missing_ok=True)
 
     def has_ended(self) -> bool:
@@ -147,19 +149,20 @@ def train_logged(runs: Mapping[Path, Run], options: RunOptions, launch: Launch) 
 
 
 def wait_for_earlier_launch(path: Path, launch: Launch, console: Console) -> None:
-    """Waits until a worker whose launcher has died has saved a run, at most for `PATIENCE`."""
-    end = time.monotonic() + PATIENCE
-    while is_being_written(path) and time.monotonic() < end and not launch.has_ended():
+    """Waits until a worker whose launcher has died has saved a run, at most for `MAX_WAIT`."""
+    end = time.monotonic() + MAX_WAIT
+    if is_being_written(path):
         console.out("Waiting for the process that writes to this run ...")
+    while is_being_written(path) and time.monotonic() < end and not launch.has_ended():
         time.sleep(1)
 
 
 def is_being_written(path: Path) -> bool:
     """Returns whether a process writes to a run's folder."""
     try:
-        with RunFolder(path).lock():
+        with lock_folder(path, wait=0):
             return False
-    except ValueError:
+    except BusyError:
         return True
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.command_line import parse
+from agents.command_line import option, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,14 +13,18 @@ class Options:
     """Does something.
 
     Attributes:
-      files: some files.
+      files: some files, by default those of `here`. They may be missing.
       out: a folder.
       extra: another folder.
+      more: names.
+      none: no names, or some.
     """
 
     files: tuple[Path, ...]
     out: Path = Path("runs")
     extra: Path | None = None
+    more: tuple[str, ...] = ("b",)
+    none: tuple[str, ...] | None = option(None, may_be_empty=True)
 
 
 @pytest.mark.parametrize(
@@ -30,6 +34,23 @@ def test_an_unknown_option_is_refused_and_the_nearest_offered(word, meant, capsy
     with pytest.raises(SystemExit):
         parse(Options, ["a", word], "x")
     assert capsys.readouterr().err.endswith(f"error: unknown arguments: {word}{meant}\n")
+
+
+def test_an_option_needs_a_value_unless_it_may_be_empty(capsys):
+    """A shell's variable may be empty."""
+    for arguments in (["a", "--more"], []):
+        with pytest.raises(SystemExit):
+            parse(Options, arguments, "x")
+    assert "the following arguments are required: FILES" in capsys.readouterr().err
+    assert parse(Options, ["a", "--none"], "x").none == ()
+
+
+def test_help_shows_the_first_sentence_about_an_option(capsys):
+    with pytest.raises(SystemExit):
+        parse(Options, ["--help"], "x")
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "some files, by default those of `here`" in shown
+    assert "missing" not in shown
 
 
 def test_a_leading_tilde_in_a_path_is_the_home_folder(monkeypatch):

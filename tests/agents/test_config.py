@@ -61,6 +61,7 @@ def test_a_preset_trains_in_a_custom_environment_without_curiosity_and_previous_
         ({"intrinsic_coef_init": 1.0, "intrinsic_coef": 0.0}, ["> 0", "intrinsic_coef=0.0"]),
         ({"max_steps": 5.0}, ["max_steps", "integer", "5.0"]),
         ({"epsiodes_per_iteration": 3}, ["did you mean 'episodes_per_iteration'", "epochs"]),
+        ({"name": "x"}, ["unknown setting 'name'"]),
     ],
 )
 def test_refusals_name_the_value_and_what_is_allowed(settings, words):

@@ -77,6 +77,7 @@ def test_whatever_a_curiosity_returns_is_refused_in_one_line(curiosity, message,
     with pytest.raises(ValueError, match=message) as error:
         train()
     assert "\n" not in str(error.value)
+    assert "Chex" not in str(error.value)
 
 
 class Maps(nn.Module):
@@ -116,6 +117,16 @@ class Integer(nn.Module):
     def __call__(self, observation):
         count = self.param("count", lambda key: 3)
         return observation.reshape(len(observation), -1) * jnp.float32(count)
+
+
+class Around(nn.Module):
+    """Has a part that others may have, too."""
+
+    part: nn.Module
+
+    @nn.compact
+    def __call__(self, observation):
+        return self.part(observation)
 
 
 class Noisy(nn.Module):
@@ -161,6 +172,15 @@ def test_two_encoders_of_one_module_share_no_parameters(monkeypatch):
     assert set(params) == {"target", "predictor", "hidden", "output"}
     target, predictor = (params[name]["conv1"]["kernel"] for name in ("target", "predictor"))
     assert not np.any(np.isclose(target, predictor))
+
+
+def test_two_encoders_that_share_a_part_are_refused(monkeypatch):
+    part = Encoder((2, 2))
+    monkeypatch.setitem(encoders, "mine", lambda config: Around(part))
+    learner = make_learner(Config(**{**SETTINGS, "encoder": "mine", "curiosity": "none"}))
+    jax.eval_shape(learner.init, jax.random.key(0))  # one alone is allowed
+    with pytest.raises(ValueError, match=r"encoder 'mine' .*share a module; build all"):
+        make_learner(Config(**{**SETTINGS, "encoder": "mine", "curiosity": "rnd"}))
 
 
 def test_devices_average_floats_only(with_curiosity):

@@ -106,7 +106,7 @@ def test_devices_and_processes_are_ready_before_a_module_starts_jax(here, capsys
     arguments = "--import my_module --env nowhere --devices 2 --distributed a:1 2 0"
     refused(capsys, main, *arguments.split())
     sys.modules.pop("my_module")
-    RunFolder(here / "x").note(Run(small_config()), RunOptions(devices=2))
+    RunFolder(here / "x").write_config(Run(small_config()), RunOptions(devices=2))
     refused(capsys, main, "--import", "my_module", "--resume", here / "x", "--hidden", "8")
     assert ready == [(2, False), ("a:1", "2", "0"), (2, False), None]
 

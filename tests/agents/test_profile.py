@@ -72,12 +72,12 @@ def test_neither_a_run_nor_a_profile_of_other_policies_is_replaced(origin, tmp_p
         (["fast-base", "--import", "no.such"], "no.such"),
         (["fast-base", "--tasks", "0"], "evaluation tasks must be"),
         (["fast-base", "--parts", "swaps"], "allowed: one or more of structural, perceptual"),
-        (["fast-base", "--parts"], "allowed: one or more of structural, perceptual"),
+        (["fast-base", "--parts"], "expected at least one argument"),
         (["fast-base", "--strengths", "1.5"], "strength must be a number from 0 to 1"),
-        (["fast-base", "--strengths"], "allowed: one or more from 0 to 1"),
     ],
 )
 def test_the_command_line_refuses(arguments, message, capsys, tmp_path):
     with pytest.raises(SystemExit):
-        profile.main([*arguments, "--output", str(tmp_path)])
+        profile.main([*arguments, "--output", str(tmp_path / "x")])
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from agents import experiments, sweep
 from agents.config import Config
+from agents.files import lock_folder
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
 from agents.runs.run import Run, RunOptions
@@ -141,12 +142,13 @@ def test_workers_obey_the_present_launch(tmp_path):
 
 
 def test_a_worker_waits_for_that_of_an_earlier_launch(tmp_path, monkeypatch):
-    asked = iter([True, True, False])
+    asked = iter([True, True, True, False])
     monkeypatch.setattr(workers, "is_being_written", lambda path: next(asked))
     monkeypatch.setattr(workers.time, "sleep", lambda _: None)
     console = Console(record=True)
     workers.wait_for_earlier_launch(tmp_path / "a", workers.Launch.begin(tmp_path), console)
-    assert console.export_text().count("Waiting") == 2
+    assert console.export_text().count("Waiting") == 1
+    assert not list(asked)
 
 
 @pytest.mark.parametrize(
@@ -202,16 +204,15 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
         (["--seeds", "2000000000"], "seeds must be an integer >= 1 and <= 10000"),
         (["--seeds", "9", "--settings", MANY], "a grid has at most 10,000 runs, got 18,000"),
         (["--seed", "-1"], "seed must be an integer >= 0"),
-        (["--processes", "0"], "must be greater than 0"),
+        (["--processes", "0"], "processes must be an integer >= 1, got 0"),
         (["--seeds-per-program", "0"], "seeds_per_program must be an integer"),
         (["--name", "a/b"], "folder's name"),
         (["--env", "nowhere"], "nowhere"),
     ],
 )
 def test_impossible_sweeps_are_refused_and_leave_nothing(
-    capsys, monkeypatch, fresh_task_sets, tmp_path, arguments, words
+    capsys, fresh_task_sets, tmp_path, arguments, words
 ):
-    monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
     out = tmp_path / "out"
     assert words in refused(capsys, sweep.main, *arguments, "--out", out)
     assert not out.exists()
@@ -232,7 +233,7 @@ def test_modules_are_imported_after_other_devices_are_left_to_the_runs(monkeypat
 
 
 def test_a_grid_that_is_being_written_is_refused(capsys, tmp_path):
-    with RunFolder(tmp_path / "sweep-fast-base").lock():
+    with lock_folder(tmp_path / "sweep-fast-base"):
         message = refused(capsys, sweep.main, "--out", tmp_path, "--processes", "1")
     assert "is being written by another process" in message
 

@@ -206,7 +206,7 @@ def test_a_run_is_continued_from_within_its_folder(whole, tmp_path, monkeypatch,
 
 def test_a_checkpoint_of_another_run_is_refused(capsys, whole, tmp_path):
     folder = RunFolder(tmp_path / "foreign")
-    folder.note(Run(Config()))
+    folder.write_config(Run(Config()))
     shutil.copytree(whole[0] / "checkpoints", folder.checkpoints)
     settings = folder.config.read_bytes()
     assert "cannot be continued" in refused(capsys, main, "--resume", folder.path)
@@ -227,11 +227,22 @@ def test_a_stop_before_the_first_file_promises_nothing(capfd, monkeypatch, tmp_p
 
 @pytest.mark.parametrize(
     ("option", "name"),
-    [("--output", "evaluations.csv"), ("--output", "metrics.csv"), ("--gif", "best.safetensors")],
+    [
+        ("--output", "evaluations.csv"),
+        ("--output", "metrics.csv"),
+        ("--output", "checkpoints/1.csv"),
+        ("--gif", "best.safetensors"),
+    ],
 )
 def test_an_evaluation_replaces_no_file_of_a_run(option, name, capsys, whole):
     message = refused(capsys, evaluate.main, whole[0], option, whole[0] / name)
     assert f"{name} is a file of the run {whole[0]}; give another path" in message
+
+
+@pytest.mark.parametrize("option", ["--output", "--gif"])
+def test_an_evaluation_refuses_to_write_to_a_folder_before_it_plays(option, capsys, tmp_path):
+    message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path)
+    assert f"{tmp_path} is not a regular file" in message
 
 
 def test_an_unknown_training_set_is_refused_before_anything_is_played(capsys, tmp_path):
@@ -260,7 +271,7 @@ def test_options_take_precedence_over_every_preset(preset):
 def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     stored = Run(Config.preset("paper", hidden=32), 5, "mine", ("json",))
     how = RunOptions(test_tasks=7, sets=("p", "st"))
-    RunFolder(tmp_path / "x").note(stored, how)
+    RunFolder(tmp_path / "x").write_config(stored, how)
     arguments = f"--resume {tmp_path / 'x'}"
     found, *wanted = read(arguments)
     assert wanted == [stored, how]

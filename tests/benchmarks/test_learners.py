@@ -2,13 +2,14 @@
 
 import dataclasses
 import importlib
-from types import SimpleNamespace
+import sys
 
 import pytest
 
 from agents import Config
 from agents.command_line import parse
 from benchmarks import accelerator, learner_peers, seeds, train_throughput
+from trap_tube_jax.interruptions import Stopped
 
 TINY = {"filters": (2, 3), "hidden": 4, "embedding": 2}
 CONFIG = Config(max_steps=4, episodes_per_iteration=4, minibatch_size=2, epochs=2, **TINY)
@@ -57,11 +58,11 @@ def test_an_accelerators_measurements_are_commands_that_exist(scale, monkeypatch
     commands = []
     codes = iter([1, *[0] * 9])
 
-    def run(command: list[str], **_: object) -> SimpleNamespace:
+    def call(command: list[str], limit: float) -> int:
         commands.append(command)
-        return SimpleNamespace(returncode=next(codes))
+        return next(codes)
 
-    monkeypatch.setattr(accelerator.subprocess, "run", run)
+    monkeypatch.setattr(accelerator, "call", call)
     small = scale == "SMALL"
     failed = accelerator.main(accelerator.Options(small=small))
     names = list(getattr(accelerator, scale))
@@ -70,6 +71,15 @@ def test_an_accelerators_measurements_are_commands_that_exist(scale, monkeypatch
     for _, _, module, *words in commands:
         options = importlib.import_module(module).Options
         parse(options, words, module)
+
+
+def test_a_measurement_ends_with_its_exit_code_its_limit_or_the_signal():
+    python = [sys.executable, "-c"]
+    assert accelerator.call([*python, "raise SystemExit(3)"], limit=60) == 3
+    assert accelerator.call([*python, "input()"], limit=0) is None
+    parent = "import os, signal; os.kill(os.getppid(), signal.SIGTERM); signal.pause()"
+    with pytest.raises(Stopped):
+        accelerator.call([*python, parent], limit=60)
 
 
 def test_an_unknown_measurement_is_refused():

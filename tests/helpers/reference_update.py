@@ -102,8 +102,8 @@ def make_trajectory(agent: Agent, params: Params, recording: Recording) -> Traje
     action = jnp.asarray(recording["batch/action"], jnp.int32)
     reward = jnp.asarray(recording["batch/reward"])
     features = jax.vmap(lambda image: agent.encode(params, image))(jnp.asarray(images))
-    embedding, _ = agent.unroll(params, features, action, reward)
-    actions, value = agent.policy_and_value(params, embedding)
+    hidden, _ = agent.unroll(params, features, action, reward)
+    actions, value = agent.policy_and_value(params, hidden)
     return Trajectory(
         symmetry=Symmetry.from_index(jnp.zeros(len(action), jnp.int32)),
         episodes=Episodes(

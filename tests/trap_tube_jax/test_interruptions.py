@@ -11,14 +11,14 @@ from trap_tube_jax.interruptions import FINISHING, SIGNALS
 
 PROGRAM = """
 import hashlib, signal
-from trap_tube_jax.interruptions import Stopped, deferring, run_command, stopping
+from trap_tube_jax.interruptions import Stopped, deferring, run_command, exit_when_stopped
 
 def compute():  # in C, as XLA does: Python's signal handlers wait until it returns
     print("ready", flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
 
 def main():
-    with stopping(lambda: "Go on like this."):
+    with exit_when_stopped(lambda: "Go on like this."):
         {body}
 
 run_command(main)

@@ -185,3 +185,4 @@ def test_a_mixture_refuses_sets_that_do_not_mix(fresh_task_sets):
     assert_refused(["one step limit; p has 50 steps, Short-v0 20"], tt.make, "p+Short-v0")
     assert_refused(["Own-v0 50 and a base state of its own"], tt.make, "p+Own-v0")
     assert_refused(["unknown task set 'pts' (did you mean"], tt.make, "p+pts")
+    assert_refused(["joined by '+', got 'p+'"], tt.make, "p+")

@@ -212,6 +212,7 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
         ("a.gif", {}, "frames must be uint8[T, height, width, 3]"),
         (FRAMES, {"fps": 0}, "from 1 to 50, got 0"),
         (FRAMES, {"fps": 51}, "from 1 to 50, got 51"),
+        (FRAMES, {"fps": "4"}, "from 1 to 50, got '4'"),
         (FRAMES, {"hold": -1}, "from 0 to 100 seconds, got -1"),
         (FRAMES, {"hold": np.inf}, "got inf"),
     ],

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import check_integer, check_seed, described, integer_array
+from trap_tube_jax.checks import check_integer, check_seed, describe_array, integer_array
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
@@ -202,7 +202,7 @@ def _scores(
     check_integer("optimality", optimality, minimum=0)
     made = []
     entries = [task_set(name) for name in sets]
-    # All before the first is played, so that a wrong one costs nothing.
+    # Make all environments first, so that a bad argument fails before any play.
     envs = [make(entry.short, num_features=num_features) for entry in entries]
     for entry, env in zip(entries, envs, strict=True):
         states = fixed_tasks(env, entry.id, tasks)
@@ -272,7 +272,7 @@ def _pair(returned: Any, batch: int) -> tuple[jax.Array, Any]:
     if action.shape != (batch, 2):
         raise ValueError(
             f"the policy's act must return actions integer{[batch, 2]}, (grasp, move) each, got "
-            f"{described(action)}; action_from_index converts 4 * grasp + move"
+            f"{describe_array(action)}; action_from_index converts 4 * grasp + move"
         )
     return jnp.asarray(action), carry
 

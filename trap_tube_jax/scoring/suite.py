@@ -19,7 +19,7 @@ from trap_tube_jax.scoring.tasks import (
     label,
     layout_numbers,
 )
-from trap_tube_jax.state import State, concatenated, take
+from trap_tube_jax.state import State, concatenate_trees, take
 
 BLOCK = 1024  # tasks played at once, which bounds the memory
 
@@ -99,7 +99,7 @@ class Suite:
           program: maps b states at time 0 to an `Outcome` of b episodes of at most `longest` steps.
             b is the same in all calls, so that a jitted program compiles once.
         """
-        together = concatenated(self.tasks.values())
+        together = concatenate_trees(self.tasks.values())
         whole = play_blocks(lambda states, _: program(states), together)
         outcomes = {}
         start = 0
@@ -141,7 +141,7 @@ def play_blocks(program: Callable[[State, int], Record], tasks: State) -> Record
     """
     total = len(tasks.time)
     played = [program(take(tasks, block), int(block[0])) for block in blocks(total)]
-    return take(concatenated(played), slice(total))
+    return take(concatenate_trees(played), slice(total))
 
 
 def blocks(total: int) -> list[np.ndarray]:

@@ -23,7 +23,7 @@ from trap_tube_jax.state import State
 from trap_tube_jax.tables import markdown_table
 
 DESCRIPTION = """Finds exact shortest plans of the trap-tube tasks. Without --show and --distances,
-prints statistics of whole task sets and draws a histogram. Sets that differ in colours alone have
+prints statistics of whole task sets and draws a histogram. Sets that differ only in colours have
 the same statistics. Only the pictures need the extra [pictures]."""
 SURVEYED = ("base", "sy", "p", "psy")
 QUANTILES = (5, 25, 50, 75, 95)

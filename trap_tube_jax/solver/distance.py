@@ -9,7 +9,7 @@ from flax import struct
 from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.positions import NUM_POSITIONS
-from trap_tube_jax.solver.search import checked, levels
+from trap_tube_jax.solver.search import levels, validate_on_host
 from trap_tube_jax.state import State
 
 UNKNOWN = -1
@@ -68,7 +68,7 @@ def distances(state: State) -> Distances:
       >>> found.num_reachable, int(found.lookup(state))
       (5, 4)
     """
-    from_start, nodes, successors = _explore(checked(state))
+    from_start, nodes, successors = _explore(validate_on_host(state))
     to_goal = _distances_to_goal(from_start, nodes, successors)
     return Distances(_by_cells(from_start), _by_cells(to_goal))
 

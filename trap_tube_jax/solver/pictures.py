@@ -29,7 +29,7 @@ def save_distances(
     """Writes a PNG of the distance to the goal over the board, at moments of a plan.
 
     Tool and food do not move within a picture. A number is the distance to the goal with the agent
-    in that cell. The agent's present cell has no number, nor have cells that are unreachable or
+    in that cell. The agent's current cell has no number, nor have cells that are unreachable or
     have no way to the goal.
 
     Args:

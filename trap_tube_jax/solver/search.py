@@ -20,7 +20,7 @@ from trap_tube_jax.environment import action_from_index
 from trap_tube_jax.geometry import cell_of
 from trap_tube_jax.objects import NO_DIRECTION, NUM_ACTIONS
 from trap_tube_jax.positions import NUM_CELLS, NUM_POSITIONS, colorless_rows, position_id
-from trap_tube_jax.state import State, take, validate
+from trap_tube_jax.state import State, check_is_state, take, validate
 
 # Frontiers are padded to one of few sizes, because every size compiles.
 CHUNK_SIZES = (256, 1024, 4096)
@@ -89,7 +89,7 @@ def solve(state: State) -> Plan:
       >>> int(plan.length), plan.actions[:2].tolist()
       (11, [[0, 0], [0, 3]])
     """
-    return _to_plan(_shortest_actions(checked(state)))
+    return _to_plan(_shortest_actions(validate_on_host(state)))
 
 
 def solve_batch(states: State) -> Plan:
@@ -137,7 +137,7 @@ def replay(state: State, plan: Plan) -> list[State]:
 _step = jax.jit(dynamics.step)
 
 
-def checked(state: State) -> State:
+def validate_on_host(state: State) -> State:
     """Returns a valid state as NumPy arrays; raises the errors of `solve`."""
     return validate(_to_host(state))
 
@@ -145,11 +145,11 @@ def checked(state: State) -> State:
 def levels(state: State) -> Iterator[Level]:
     """Yields the task's nodes by distance from the start, every node once.
 
-    Solved nodes end an episode, so they appear as successors alone. The search ends where no
+    Solved nodes end an episode, so they appear only as successors. The search ends where no
     node is new; stop iterating to end it earlier.
 
     Args:
-      state: a checked state.
+      state: a valid state of NumPy arrays.
     """
     # Colours play no part; without them there is one compilation for every N.
     layout = jax.device_put(state.replace(palette=np.zeros((0, 0), np.uint8)))
@@ -238,15 +238,13 @@ def _unbatched(states: State) -> Iterator[State]:
         )
     for index in range(len(states.time)):
         try:
-            yield checked(take(states, index))
+            yield validate_on_host(take(states, index))
         except (ValueError, IndexError) as error:
             raise ValueError(f"state {index} of the batch: {error}") from error
 
 
 def _to_host(state: State) -> State:
-    if not isinstance(state, State):
-        hint = "; reset and step return (state, timestep)" if isinstance(state, tuple) else ""
-        raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}{hint}")
+    check_is_state(state)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
         raise ValueError(
             "the solver runs on the host and got a traced state; call it outside jit, vmap and "

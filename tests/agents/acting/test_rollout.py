@@ -57,8 +57,8 @@ def test_values_and_log_probabilities_belong_to_the_observations_in_order(played
         features = jax.vmap(functools.partial(agent.encode, params))(episodes.observations())
         action = again(episodes.action)
         reward = again(episodes.reward)
-        embedding, _ = agent.unroll(params, again(features), action, reward)
-        actions, value = agent.policy_and_value(params, embedding)
+        hidden, _ = agent.unroll(params, again(features), action, reward)
+        actions, value = agent.policy_and_value(params, hidden)
         return value, actions.log_prob(action)[:, :-1]
 
     value, log_prob = expected()

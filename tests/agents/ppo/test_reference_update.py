@@ -87,13 +87,13 @@ def test_replayed_boards_are_the_recorded_ones(recording, ours):
 def test_network_outputs_equal_the_recorded_ones(recording, ours):
     trajectory = ours["trajectory"]
     (error, inferred) = ours["prediction"]
-    embedding = ours["experience"].embedding
-    actions, _ = ours["learner"].agent.policy_and_value(ours["params"], embedding)
-    assert_close(embedding, recording["out/embedding"])
+    hidden = ours["experience"].hidden
+    actions, _ = ours["learner"].agent.policy_and_value(ours["params"], hidden)
+    assert_close(hidden, recording["out/embedding"])
     assert_close(trajectory.log_prob, recording["out/log_probs"])
     assert_close(actions.entropy(), recording["out/entropy"])
     assert_close(trajectory.value[:, :-1, 0], recording["out/values"])
-    assert_close(ours["experience"].next_embedding, recording["out/embedding_next"])
+    assert_close(ours["experience"].next_hidden, recording["out/embedding_next"])
     expected = recording["out/embedding_next_pred"] - recording["out/embedding_next"]
     assert_close(error, np.square(expected))
     predicted = [recording[f"out/{name}_pred"] for name in ("move", "grasp")]

@@ -14,7 +14,7 @@ import pytest
 import safetensors.numpy
 
 from agents.arrays import to_arrays
-from agents.files import LARGEST
+from agents.files import MAX_TEXT_BYTES
 from agents.runs import checkpoint
 from agents.runs.folder import RunFolder
 from agents.runs.loading import load, save
@@ -85,7 +85,7 @@ def whole(tmp_path_factory) -> Path:
     """A folder with every file of a run and of a grid."""
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "whole")
     folder.path.mkdir()
-    folder.note(Run(CONFIG), RunOptions(evaluate_every=2))
+    folder.write_config(Run(CONFIG), RunOptions(evaluate_every=2))
     note_provenance(folder.provenance, "cpu")
     append_rows(folder.metrics, [METRICS])
     append_rows(folder.evaluations, [EVALUATION])
@@ -114,7 +114,7 @@ def eights(name: str = "x", dtype: str = "F8_E4M3", **about: Any) -> bytes:
 
 def sparse(path: Path) -> None:
     with path.open("wb") as file:
-        file.truncate(LARGEST + 1)
+        file.truncate(MAX_TEXT_BYTES + 1)
 
 
 def csv_file(row: dict[str, Any], **changes: Any) -> bytes:
@@ -158,7 +158,13 @@ WRONG_ROWS = [
     {"more\x1b": "x"},
 ]
 WRONG_METRICS = [{"seconds": "inf"}, {"loss": "high"}, {"validation_success": "1,2"}]
-WRONG_EVALUATIONS = [{"tasks": 0}, {"task_set": "=1+1"}, {"purpose": "=1+1"}, {"length": "x"}]
+WRONG_EVALUATIONS = [
+    {"solved": 99},
+    {"tasks": 0},
+    {"task_set": "=1+1"},
+    {"purpose": "=1+1"},
+    {"length": "x"},
+]
 WRONG_ALGORITHMS = [{"algorithm": name} for name in WRONG["algorithm"][2:7]]
 # What follows a good row.
 CSV = {
@@ -233,7 +239,7 @@ def csv_damages() -> Damages:
         ("metrics.csv", METRICS, WRONG_METRICS),
         ("evaluations.csv", EVALUATION, WRONG_EVALUATIONS),
         ("curves.csv", CURVE, WRONG_ALGORITHMS),
-        ("results.csv", RESULT, [*WRONG_EVALUATIONS[:3], *WRONG_ALGORITHMS]),
+        ("results.csv", RESULT, [*WRONG_EVALUATIONS[:4], *WRONG_ALGORITHMS]),
     ):
         for change in WRONG_ROWS + wrong:
             found[name, str(change)] = csv_file(row, **change)

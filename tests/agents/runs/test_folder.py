@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from agents.config import Config
-from agents.files import read_json, write_bytes, write_json
+from agents.files import lock_folder, read_json, write_bytes, write_json
 from agents.runs.folder import RunFolder, check_name
 from agents.runs.loading import load
 from agents.runs.results import results
@@ -31,6 +31,7 @@ def test_a_run_is_the_same_after_json():
         (RunOptions, {"evaluate_every": -1}, ["evaluate_every must be an integer >= 0, got -1"]),
         (RunOptions, {"test_tasks": 10**9}, ["test_tasks must be", "<= 1000000, got 1000000000"]),
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
+        (RunOptions, {"sets": ()}, ["sets must name one or more task sets"]),
         (RunOptions, {"devices": 100_000}, ["devices must be an integer >= 1 and <= 1024"]),
         (partial(Run, Config()), {"algorithm": "=1+1"}, ["algorithm must begin with a letter"]),
         (RunFolder, {"path": "a/\x1b[2J/b"}, [r"paths must be printable, got 'a/\x1b[2J/b'"]),
@@ -71,7 +72,7 @@ def test_a_folder_holds_a_run_and_its_options(tmp_path):
     run = Run(Config(hidden=8))
     options = RunOptions(test_tasks=5, sets=("base",))
     RunFolder(tmp_path / "x").path.mkdir()
-    RunFolder(tmp_path / "x").note(run, options)
+    RunFolder(tmp_path / "x").write_config(run, options)
     assert RunFolder(tmp_path / "x").read() == (run, options)
     assert_refused(["none holds no run; runs in", "x"], RunFolder(tmp_path / "none").read)
 
@@ -84,10 +85,10 @@ def test_a_folder_has_its_title_however_its_path_is_given(tmp_path, monkeypatch)
 
 
 def test_a_second_writer_is_refused(tmp_path):
-    with RunFolder(tmp_path / "x").lock():
+    with lock_folder(tmp_path / "x"):
         words = [f"{tmp_path}/x is being written by another process"]
-        assert_refused(words, RunFolder(tmp_path / "x").lock().__enter__)
-    with RunFolder(tmp_path / "x").lock():
+        assert_refused(words, lock_folder(tmp_path / "x", wait=0).__enter__)
+    with lock_folder(tmp_path / "x"):
         pass
 
 
@@ -97,7 +98,7 @@ def test_a_link_among_the_files_is_refused_before_it_is_written_through(tmp_path
     victim.write_text("mine")
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / name).symlink_to(victim)
-    assert_refused([f"{name} is a link"], RunFolder(tmp_path / "x").lock().__enter__)
+    assert_refused([f"{name} is a link"], lock_folder(tmp_path / "x").__enter__)
     write_bytes(tmp_path / "x" / name, b"new")
     assert victim.read_text() == "mine"
 
@@ -105,7 +106,7 @@ def test_a_link_among_the_files_is_refused_before_it_is_written_through(tmp_path
 def test_a_run_that_is_not_found_is_answered_with_those_near(tmp_path, monkeypatch):
     for name in ("mine", "yours"):
         RunFolder(tmp_path / "runs" / name).path.mkdir(parents=True)
-        RunFolder(tmp_path / "runs" / name).note(Run(Config()))
+        RunFolder(tmp_path / "runs" / name).write_config(Run(Config()))
     monkeypatch.chdir(tmp_path)
     for path, words in (
         ("mine", "did you mean runs/mine?"),
@@ -120,7 +121,7 @@ def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
     (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
     monkeypatch.chdir(tmp_path)
     RunFolder(tmp_path / "x").path.mkdir()
-    RunFolder(tmp_path / "x").note(Run(Config(), imports=("evil",)))
+    RunFolder(tmp_path / "x").write_config(Run(Config(), imports=("evil",)))
     values = read_json(tmp_path / "x" / "config.json")
     values["config"]["curiosity"] = "evil-curiosity"
     write_json(tmp_path / "x" / "config.json", values)

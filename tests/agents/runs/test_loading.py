@@ -30,7 +30,7 @@ ARRAYS = to_arrays(POLICY.params)
 def run_path(tmp_path_factory) -> Path:
     """A run of seed 3 with one checkpoint."""
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "mine")
-    folder.note(Run(CONFIG, seed=3))
+    folder.write_config(Run(CONFIG, seed=3))
     state = {"params": {**random_params(), "curiosity": np.ones(2)}, "iteration": np.int32(6)}
     checkpoint.save(folder.checkpoints, 6, state, {})
     return folder.path
@@ -52,7 +52,7 @@ def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path
     folder = RunFolder(path)
     save(folder.best, POLICY.replace(iteration=4))
     assert agents.load(path).iteration == 6, "resumed without --evaluate-every"
-    folder.note(folder.read()[0], RunOptions(evaluate_every=2))
+    folder.write_config(folder.read()[0], RunOptions(evaluate_every=2))
     policy = agents.load(path)
     assert (policy.name, policy.iteration) == ("seed 3", 4)
     assert agents.load(path, iteration=6).iteration == 6
@@ -63,7 +63,7 @@ def test_a_run_that_selects_a_policy_is_loaded_as_this_policy(run_path, tmp_path
     [
         (None, "no checkpoint 5; allowed: 6"),
         ("none", "none is neither a run, a file nor a shipped agent; .* shipped agents: best"),
-        ("fast-base", "iteration is for runs, which fast-base is not"),
+        ("fast-base", "iteration selects a checkpoint of a run, and fast-base is a file"),
     ],
 )
 def test_unknown_sources_and_iterations_are_refused(run_path, source, message):
@@ -73,7 +73,9 @@ def test_unknown_sources_and_iterations_are_refused(run_path, source, message):
 
 def test_sources_that_are_nearly_right_are_answered_with_what_to_give(run_path):
     for source, words in (
-        (run_path / "checkpoints" / "6.safetensors", f"give its run, {run_path}, and iteration 6"),
+        (run_path / "checkpoints" / "6.safetensors", "give the run, and iteration 6"),
+        (run_path / "checkpoints", f"is in the run {run_path}; give the run"),
+        (run_path / "config.json", f"is in the run {run_path}; give the run"),
         (run_path.parent, "give one of its runs: mine"),
         (run_path.parent / "mien", f"did you mean {run_path}?"),
     ):
@@ -145,7 +147,7 @@ PRESETS_OF = {
 }
 
 
-@pytest.mark.parametrize("name", pretrained.names())
+@pytest.mark.parametrize("name", list(pretrained.FILES))
 def test_shipped_agents_have_the_presets_of_today_and_solve_their_tasks(name):
     policy = agents.load(name)
     (preset, changes) = PRESETS_OF[name]

@@ -49,6 +49,18 @@ def test_a_missing_key_is_named(monkeypatch):
     check_loggers(RunOptions())
 
 
+def test_a_run_that_wandb_cannot_begin_is_an_error_of_one_line(monkeypatch, tmp_path):
+    class Error(Exception):
+        pass
+
+    def init(**_):
+        raise Error("Network\nunreachable.")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init, Error=Error))
+    with pytest.raises(ValueError, match=r"--wandb cannot log: Network unreachable\. WANDB_MODE"):
+        log(RunFolder(tmp_path), [1], loss=0.25, wandb=True)
+
+
 @pytest.mark.interop
 def test_tensorboard_shows_metrics_of_a_killed_and_resumed_run_once(tmp_path):
     reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")

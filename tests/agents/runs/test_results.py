@@ -24,7 +24,7 @@ def runs(tmp_path) -> Path:
     for name in ("a", "deep/b"):
         folder = RunFolder(tmp_path / "runs" / name)
         folder.path.mkdir(parents=True)
-        folder.note(Run(CONFIG))
+        folder.write_config(Run(CONFIG))
         append_rows(folder.evaluations, [EVALUATION])
     return tmp_path / "runs"
 

@@ -123,6 +123,14 @@ def _raise(error):
     raise error
 
 
+def test_a_run_has_ended_with_its_last_iteration_and_its_test(copy):
+    assert history.has_ended(RunFolder(copy), small_run())
+    assert not history.has_ended(RunFolder(copy), small_run(iterations=ITERATIONS + 1))
+    rows = (copy / "evaluations.csv").read_text()
+    (copy / "evaluations.csv").write_text(rows.replace("test", "validation"))
+    assert not history.has_ended(RunFolder(copy), small_run())
+
+
 def test_a_finished_run_returns_at_once(copy, monkeypatch):
     monkeypatch.setattr(program, "make_advance", None)
     before = (copy / "evaluations.csv").read_bytes()
@@ -183,6 +191,17 @@ def test_a_finished_run_is_extended(copy, monkeypatch):
     assert after == pytest.approx(before + 1)
     with pytest.raises(ValueError, match="iterations must be at least 7, which are done, got 6"):
         train_run(copy, small_run(), TRACKED)
+
+
+def test_a_run_that_trains_on_scores_its_old_best_policy_again(copy, monkeypatch):
+    """For the report, whose curves have grown; the rows stay as they are."""
+    monkeypatch.setattr(progress, "is_better", lambda *_: False)
+    tested = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
+    scores = train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
+    assert scores is not None
+    assert [score.solved for score in scores.sets] == tested["solved"].tolist()
+    again = read_rows(copy / "evaluations.csv").query("purpose == 'test'")
+    assert again.reset_index(drop=True).equals(tested.reset_index(drop=True))
 
 
 def test_a_report_stays_until_there_are_other_scores(copy, monkeypatch):

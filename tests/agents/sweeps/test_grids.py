@@ -1,7 +1,6 @@
 """The points of a grid, their settings, and the paper's protocols."""
 
 import dataclasses
-import sys
 
 import pytest
 
@@ -46,8 +45,7 @@ def test_a_setting_may_have_no_effect_at_some_points():
     assert {config.intrinsic_coef for config in found.values()} == {0.5}
 
 
-def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, monkeypatch, fresh_task_sets):
-    monkeypatch.delitem(sys.modules, "agents.examples.near_food", raising=False)
+def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, fresh_task_sets):
     given = Options(("curiosity=none,icm",), ("agents.examples.near_food",), seeds=2, seed=3)
     given = dataclasses.replace(given, env="near-food", out=tmp_path)
     import_modules(given.imports)
@@ -91,9 +89,9 @@ def test_a_stored_run_with_other_settings_is_refused(tmp_path):
     ((path, run),) = Grid().make_runs("sweep", given).items()
     other = Run(dataclasses.replace(run.config, clip_eps=0.2), algorithm="fast")
     path.mkdir(parents=True)
-    RunFolder(path).note(other)
+    RunFolder(path).write_config(other)
     assert_refused(["clip_eps=0.2, not 0.3", "another --name"], Grid().make_runs, "sweep", given)
-    RunFolder(path).note(run)
+    RunFolder(path).write_config(run)
     longer = dataclasses.replace(given, settings=("clip_eps=0.3", "iterations=200"))
     assert Grid().make_runs("sweep", longer)[path].config.iterations == 200
 

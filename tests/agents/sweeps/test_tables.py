@@ -146,6 +146,24 @@ def test_seeds_that_all_solve_as_much_differ_for_certain_or_not_at_all():
     np.testing.assert_allclose(found.loc[("p", "c"), columns].tolist(), [10, 10, 10, 0])
 
 
+def test_a_grid_tested_on_base_alone_has_no_mean_without_base():
+    tested = tables.reported(
+        pd.DataFrame(rows("a", [5, 6], task_set="base") + rows("b", [5, 7], task_set="base"))
+    )
+    assert list(tables.by_set(tested)) == ["base"]
+    assert set(tables.differences(tested)["task_set"]) == {"base"}
+
+
+def test_seeds_that_lack_a_set_are_left_out_of_its_comparison():
+    base = [row for name in "abc" for row in rows(name, [5, 6, 7], task_set="st")]
+    given = rows("a", [5, 6, 7]) + rows("b", [1, 2]) + rows("c", [1])
+    found = tables.differences(tables.reported(pd.DataFrame(base + given)))
+    found = found.set_index(["task_set", "algorithm"])
+    assert found.loc[("p", "b"), "difference"] == pytest.approx(15 - 60)
+    assert ("p", "c") not in found.index
+    assert found.notna().all(axis=None)
+
+
 def test_algorithms_of_one_seed_are_not_compared():
     tested = pd.DataFrame(rows("ppo", [5]) + rows("ppo+icm", [6, 7]))
     assert len(tables.differences(tables.reported(tested))) == 0
@@ -224,7 +242,7 @@ def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path
 def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
     for seed, iterations in ((0, 2), (1, 3)):
         folder = RunFolder(tmp_path / f"seed{seed}")
-        folder.note(Run(small_config(iterations=iterations, stop_when_solved=0), seed))
+        folder.write_config(Run(small_config(iterations=iterations, stop_when_solved=0), seed))
         done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, done.to_dict("records"))
         tested = pd.DataFrame(rows("ppo", [1])).drop(columns=["algorithm", "seed"])
@@ -241,7 +259,7 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
 def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
     for name, threshold in (("base", 0.5), ("sy", 0.9)):
         folder = RunFolder(tmp_path / name)
-        folder.note(Run(small_config(env_id=name, stop_when_solved=threshold)))
+        folder.write_config(Run(small_config(env_id=name, stop_when_solved=threshold)))
         metrics = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, metrics.to_dict("records"))
     records.collect(tmp_path, "sweep")
@@ -254,7 +272,7 @@ def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
 def test_what_others_have_written_is_plain_text(tmp_path):
     """In Markdown as in a spreadsheet."""
     folder = RunFolder(tmp_path / "seed0")
-    folder.note(Run(small_config()))
+    folder.write_config(Run(small_config()))
     append_rows(folder.metrics, curves().drop(columns=["algorithm", "seed"]).to_dict("records"))
     note_provenance(folder.provenance, "cpu")
     (machine,) = read_json(folder.provenance)
@@ -272,7 +290,7 @@ def test_what_cannot_be_made_again_is_kept(tmp_path):
     """A note that is written by hand, and rows of runs whose folders are gone."""
     for seed in (0, 1):
         folder = RunFolder(tmp_path / f"seed{seed}")
-        folder.note(Run(small_config(), seed))
+        folder.write_config(Run(small_config(), seed))
         done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, done.to_dict("records"))
     records.check(tmp_path)

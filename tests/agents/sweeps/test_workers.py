@@ -7,6 +7,7 @@ import signal
 import pytest
 
 from agents.config import Config
+from agents.files import lock_folder
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import workers
 from trap_tube_jax.interruptions import Stopped
@@ -66,6 +67,16 @@ def test_devices_are_split_before_modules_are_imported(tmp_path, monkeypatch):
     with contextlib.suppress(TypeError):  # no outcomes
         workers.train_logged({tmp_path / "a": Run(Config())}, RunOptions(devices=2), launch)
     assert order == ["split_cpu", "import_modules", "train_runs"]
+
+
+def test_a_link_in_a_folder_is_an_error_and_no_writer_to_wait_for(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "metrics.csv").symlink_to(tmp_path)
+    with pytest.raises(ValueError, match="is a link"):
+        workers.is_being_written(tmp_path / "a")
+    with lock_folder(tmp_path / "b"):
+        assert workers.is_being_written(tmp_path / "b")
+    assert not workers.is_being_written(tmp_path / "b")
 
 
 def test_dask_is_an_extra(monkeypatch):

@@ -12,7 +12,7 @@ from helpers.refusal import assert_refused
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver import pictures
-from trap_tube_jax.solver.search import checked, levels, replay
+from trap_tube_jax.solver.search import levels, replay, validate_on_host
 from trap_tube_jax.state import take
 from trap_tube_jax.transfers import swap_with_tool
 
@@ -134,7 +134,7 @@ def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
 @pytest.mark.slow
 def test_random_actions_solve_the_base_task_as_rarely_as_environment_md_says():
     """The exact probability, over the graph of all states that can be reached."""
-    found = list(levels(checked(tt.base_state())))
+    found = list(levels(validate_on_host(tt.base_state())))
     nodes, successors, solved = (
         np.concatenate([getattr(level, name) for level in found])
         for name in ("nodes", "successors", "solved")
