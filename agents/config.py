@@ -82,10 +82,9 @@ class Config:
         `intrinsic_coef`.
       intrinsic_anneal_fraction: fraction of iterations that decay the weight.
       curiosity_coef: weight of the curiosity's losses.
-      value_heads: number of value heads, one for the sum of rewards or one per reward. `shared`:
-        rewards are divided by their standard deviation and added, and one head values the sum.
-        `separate`: each reward has its own head, and the normalised advantages are added
-        (`agents.ppo.advantages`).
+      value_heads: one value head, or one per reward. `shared`: rewards are divided by their
+        standard deviation and added, and one head values the sum. `separate`: each reward has its
+        own head, and the normalised advantages are added (`agents.ppo.advantages`).
       reward_ema_decay: decay of the rewards' moving variances. These variances normalise both
         rewards; the rates of `effects` use the same decay.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.

@@ -57,7 +57,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Some options decide how the others are read.
     first, devices = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
     start_devices(first, devices)
-    train(*parse(first, arguments))
+    options, run, run_options = parse(first, arguments)
+    folder = RunFolder(run_path(options, run))
+    if options.resume is None:
+        folder.check_free()
+        processes.max_over_processes(None)  # no process writes before all have checked
+    train(folder, run, run_options)
 
 
 def start_devices(first: Options, devices: DeviceOptions) -> None:
@@ -94,12 +99,8 @@ def parse(first: Options, arguments: Sequence[str] | None) -> tuple[Options, Run
     return options, run, run_options
 
 
-def train(options: Options, run: Run, run_options: RunOptions) -> None:
+def train(folder: RunFolder, run: Run, run_options: RunOptions) -> None:
     """Trains a run, or continues it, and prints its results, or how to continue if it stops."""
-    folder = RunFolder(run_path(options, run))
-    if options.resume is None:
-        folder.check_free()
-        processes.max_over_processes(None)  # no process writes before all have checked
     is_first = jax.process_index() == 0
     console = CommandConsole(quiet=not is_first, highlight=False)
     compilation.enable_cache()
