@@ -352,7 +352,9 @@ def test_an_agent_that_cannot_be_scored_is_refused(near):
     assert_refused(words, evaluation_keys, "TrapTube-v0", 1, purpose)
 
 
-@pytest.mark.parametrize("action", [16, -1, (0, 4), (0, 1, 2), (), 0.0, "up", None, ((0, 3), None)])
+@pytest.mark.parametrize(
+    "action", [16, -1, (0, 4), (0, 1, 2), (0, 0, 0), (), 0.0, "up", None, ((0, 3), None)]
+)
 def test_single_actions_are_checked(action):
     words = ["(grasp, move)", "0 to 3", "0 to 15", repr(action)]
     assert_refused(words, tt.score_gymnasium, Single(action), ["base"])
