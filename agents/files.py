@@ -154,8 +154,8 @@ class BusyError(ValueError):
 def lock_folder(path: Path, wait: float = 1) -> Iterator[None]:
     """Makes this process the only writer of a folder; makes the folder if missing.
 
-    Waits for some seconds, because a launcher takes the lock for a moment to see whether a run has
-    begun.
+    Waits for up to `wait` seconds, because a launcher takes the lock for a moment to see whether a
+    run has begun.
 
     Raises:
       BusyError: another process writes to the folder.

@@ -41,7 +41,7 @@ class _DeferredSignal:
 
 
 class _Process:
-    """How this process answers the next signal."""
+    """Holds how this process answers the next signal."""
 
     def __init__(self) -> None:
         self.is_command = False  # False in a caller's process, such as a notebook

@@ -88,9 +88,7 @@ class Progress:
 
         Removes rows after the newest checkpoint.
         """
-        self.folder.write_config(
-            self.run, self.program.options
-        )  # they may differ from those before
+        self.folder.write_config(self.run, self.program.options)
         if self.last is None:
             self.save()  # from now on, rows without a checkpoint mean that files were removed
         for rows in (self.folder.metrics, self.folder.evaluations):
