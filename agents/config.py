@@ -14,6 +14,7 @@ import trap_tube_jax as tt
 from agents import registry
 from trap_tube_jax.checks import did_you_mean
 from trap_tube_jax.objects import AGENT, FOOD
+from trap_tube_jax.transfers import parts_of
 
 MAX_INT32 = 2**31 - 1  # the largest i32, in which training counts
 KEEP_COLORS = {
@@ -320,7 +321,7 @@ def _check_known_colors(env: tt.Environment) -> None:
     """Raises ValueError if agent or food may have another colour than in the base task."""
     known = tt.base_palette(env.num_features)[[AGENT, FOOD]].tolist()
     palettes: Any = [env.base.palette]
-    if not set(env.transfers) <= KEEP_COLORS:
+    if not parts_of(env.transfers) <= KEEP_COLORS:
         states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 1024))
         palettes = states.palette
     for palette in np.asarray(palettes)[:, [AGENT, FOOD]].tolist():

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from benchmarks import harness
-from trap_tube_jax.interruptions import Stopped, deferring, exit_when_stopped
+from trap_tube_jax.interruptions import Stopped, deferring
 
 # The module and its options, by the name of the record. `gpu_best_second_start` finds the programs
 # that `gpu_best_first_start` has compiled.
@@ -99,5 +99,4 @@ def call(command: list[str], limit: float) -> int | None:
 
 
 if __name__ == "__main__":
-    with exit_when_stopped(lambda: "The same command starts again."):
-        harness.run(lambda options: sys.exit(bool(main(options))), Options, "accelerator")
+    harness.run(lambda options: sys.exit(bool(main(options))), Options, "accelerator")

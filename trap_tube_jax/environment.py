@@ -33,8 +33,10 @@ from trap_tube_jax.state import (
     with_narrow_integers,
 )
 from trap_tube_jax.transfers import (
+    Composition,
     Transfer,
     compose,
+    parts_of,
     perceptual,
     structural,
     symbolic,
@@ -43,7 +45,7 @@ from trap_tube_jax.transfers import (
 
 MAX_TIME = 2**31 - 1  # `State.time` is an i32
 
-_PAPER_TRANSFERS = (perceptual, structural, symbolic)  # known to be valid, so never tried
+_PAPER_TRANSFERS = {perceptual, structural, symbolic}  # known to be valid, so never tried
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,8 +111,8 @@ class Environment(ByValue):
                 f"got {transfers!r}"
             )
         self.max_steps = check_integer("max_steps", max_steps, maximum=MAX_TIME)
-        self.transfers = tuple(transfers)
-        custom = [x not in _PAPER_TRANSFERS for x in self.transfers]
+        self.transfers = Composition(tuple(transfers)).transfers  # which it checks
+        custom = [not parts_of([x]) <= _PAPER_TRANSFERS for x in self.transfers]
         num_tried = len(custom) - custom[::-1].index(True) if any(custom) else 0
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             self.base = base_state() if base is None else _check_base(base)

@@ -40,13 +40,18 @@ class _DeferredSignal:
     received: int | None = None
 
 
+def _start_again() -> str:
+    """Says how to go on after a command that saves nothing on the way."""
+    return "The same command starts again."
+
+
 class _Process:
     """Holds how this process answers the next signal."""
 
     def __init__(self) -> None:
         self.is_command = False  # False in a caller's process, such as a notebook
         self.terminal_modes: Any = None  # before the command changes them
-        self.hint: Callable[[], str] = lambda: "The same command starts again."
+        self.hint: Callable[[], str] = _start_again
         self.blocks: list[_DeferredSignal] = []  # open `deferring` blocks, innermost last
 
 
@@ -131,7 +136,8 @@ def run_command(main: Callable[[], Any]) -> None:
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(reader,), daemon=True).start()
     _install_handlers(lambda *_: None)  # for good, so that no signal causes a traceback
-    main()
+    with exit_when_stopped(_start_again):
+        main()
 
 
 def block_signals() -> None:

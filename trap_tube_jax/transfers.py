@@ -9,7 +9,7 @@ Source: paper, sections "Perceptual", "Structural" and "Symbolic"; environment.m
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
@@ -116,6 +116,17 @@ class Mixture:
     @property
     def __name__(self) -> str:
         return " + ".join(map(transfer_name, self.transfers))
+
+
+def parts_of(transfers: Iterable[Transfer]) -> set[Transfer]:
+    """Returns the transfers themselves, in place of compositions and mixtures of them."""
+    parts = set()
+    for transfer in transfers:
+        if isinstance(transfer, Composition | Mixture):
+            parts |= parts_of(transfer.transfers)
+        else:
+            parts.add(transfer)
+    return parts
 
 
 def transfer_name(transfer: Transfer) -> str:

@@ -10,7 +10,7 @@ import pytest
 from trap_tube_jax.interruptions import FINISHING, SIGNALS
 
 PROGRAM = """
-import hashlib, signal
+import contextlib, hashlib, signal
 from trap_tube_jax.interruptions import Stopped, deferring, run_command, exit_when_stopped
 
 def compute():  # in C, as XLA does: Python's signal handlers wait until it returns
@@ -18,11 +18,13 @@ def compute():  # in C, as XLA does: Python's signal handlers wait until it retu
     hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
 
 def main():
-    with exit_when_stopped(lambda: "Go on like this."):
+    with {hint}:
         {body}
 
 run_command(main)
 """
+HINT = 'exit_when_stopped(lambda: "Go on like this.")'
+NO_HINT = "contextlib.nullcontext()"
 AT_ONCE = "compute()"
 SAVES = """with deferring() as request:
             print("ready", flush=True)
@@ -33,21 +35,24 @@ NEVER_SAVES = """with deferring():
             compute()"""
 
 
-def start(body, **options):
+def start(body, hint=HINT, **options):
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
-    return subprocess.Popen([sys.executable, "-c", PROGRAM.format(body=body)], text=True, **options)
+    program = PROGRAM.format(body=body, hint=hint)
+    return subprocess.Popen([sys.executable, "-c", program], text=True, **options)
 
 
 @pytest.mark.parametrize(
-    ("body", "times", "lines"),
+    ("body", "hint", "times", "lines"),
     [
-        (AT_ONCE, 1, ["Stopped. Go on like this."]),
-        (SAVES, 1, [FINISHING, "Stopped. Go on like this."]),
-        (NEVER_SAVES, 2, [FINISHING, "Stopped. Go on like this."]),
+        (AT_ONCE, HINT, 1, ["Stopped. Go on like this."]),
+        (SAVES, HINT, 1, [FINISHING, "Stopped. Go on like this."]),
+        (NEVER_SAVES, HINT, 2, [FINISHING, "Stopped. Go on like this."]),
+        (AT_ONCE, NO_HINT, 1, ["Stopped. The same command starts again."]),
+        (SAVES, NO_HINT, 1, [FINISHING, "Stopped. The same command starts again."]),
     ],
 )
-def test_a_signal_ends_a_command_with_one_line_and_its_code(body, times, lines):
-    processes = {number: start(body) for number in SIGNALS}
+def test_a_signal_ends_a_command_with_one_line_and_its_code(body, hint, times, lines):
+    processes = {number: start(body, hint) for number in SIGNALS}
     ends = {}
     for number, process in processes.items():
         with process:

@@ -20,6 +20,7 @@ from agents.acting.episodes import Episodes
 from agents.acting.rollout import Trajectory
 from agents.acting.symmetry import Symmetry
 from agents.arrays import to_arrays
+from agents.config import PRESETS
 from agents.curiosity import Experience
 from agents.ppo import advantages, learner
 from agents.ppo.learner import Learner, TrainState
@@ -27,6 +28,7 @@ from helpers.curiosities import Returning
 from helpers.small_runs import SETTINGS
 from helpers.trees import assert_same, rows
 from trap_tube_jax.objects import AGENT
+from trap_tube_jax.transfers import Mixture
 
 BEST = Config.preset(
     "best",
@@ -60,6 +62,7 @@ def recolour_rarely(key: jax.Array, state: tt.State) -> tt.State:
 
 
 RARELY_RECOLOURED = tt.Environment((recolour_rarely,))
+MIXED_WITH_RECOLOURED = tt.Environment((Mixture((tt.perceptual, tt.compose(recolour)), (1, 1)),))
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
 
@@ -334,6 +337,16 @@ def test_an_accelerator_takes_the_plain_path(backend, monkeypatch):
     assert made.agent.core.scan_unroll > 1
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_an_iteration_can_be_compiled_for_a_gpu(preset, monkeypatch):
+    """Every operation has a rule of its own there, or a custom call would stand for it."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    learner = make_learner(Config.preset(preset))
+    state = jax.eval_shape(learner.init, jax.random.key(0))
+    lowered = jax.jit(learner.iterate).trace(state).lower(lowering_platforms=("cuda",))
+    assert "custom_call" not in lowered.as_text()
+
+
 @pytest.mark.parametrize(
     ("settings", "env", "message"),
     [
@@ -344,6 +357,7 @@ def test_an_accelerator_takes_the_plain_path(backend, monkeypatch):
         ({"align_to_food": True}, OWN_COLORS, "know agent and food by the colours"),
         ({"align_to_food": True}, RECOLOURED, "know agent and food by the colours"),
         ({"align_to_food": True}, RARELY_RECOLOURED, "know agent and food by the colours"),
+        ({"align_to_food": True}, MIXED_WITH_RECOLOURED, "know agent and food by the colours"),
         ({"iterations": 2**20, "epochs": 10_000, "max_steps": 1}, None, "gradient steps"),
     ],
 )
