@@ -51,7 +51,7 @@ def command(line, *arguments, folder):
 
 
 def test_a_run_records_the_module_and_needs_leave_to_import_it(here):
-    command(TRAIN, *SIZES, "--iterations", "1", folder=here)
+    command(TRAIN, *SIZES, "--iterations", "1", "--sets", "cold", "--no-report", folder=here)
     folder = here / "runs" / "fast-cold-0"
     stored = read_json(folder / "config.json")
     assert (stored["imports"], stored["config"]["max_steps"]) == (["my_module"], None)
