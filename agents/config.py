@@ -73,9 +73,9 @@ class Config:
         (`agents.ppo.motion`).
       learning_rate: Adam's step size.
       lr_decay_fraction: final fraction of training that decays the step size. It decays
-        geometrically to a fiftieth.
+        geometrically towards a fiftieth.
       adam_epsilon: Adam's epsilon.
-      max_gradient_norm: global norm of clipped gradients.
+      max_gradient_norm: largest global norm of a gradient; a larger gradient is scaled down to it.
       curiosity: intrinsic reward, by its registered name. README.md lists them.
       intrinsic_coef: weight of the intrinsic reward. The reward is normalised; with separate value
         heads its advantage is weighted instead.
@@ -86,8 +86,8 @@ class Config:
       value_heads: one value head, or one per reward. `shared`: rewards are divided by their
         standard deviation and added, and one head values the sum. `separate`: each reward has its
         own head, and the normalised advantages are added (`agents.ppo.advantages`).
-      reward_ema_decay: decay of the rewards' moving variances. These variances normalise both
-        rewards; the rates of `effects` use the same decay.
+      reward_ema_decay: decay of the moving averages: the variances that scale rewards, and the
+        rates of `effects`.
       replay_fractions: fractions of episodes that replay tasks failed once, twice, and so on.
       replay_capacity: failed tasks kept per replay fraction.
       align_to_food: turns the board once per episode, so that the food is below the agent. May also
@@ -98,8 +98,8 @@ class Config:
         their positions relative to agent and food.
       filters: channels of first and later convolutions; layer widths of `objects`.
       object_colors: `objects` also knows the colours of the base task.
-      hidden: units of the GRU. The layer before the GRU and the inverse model have the same number
-        of units.
+      hidden: units of the GRU, of the layer before it, and of the hidden layers of `icm`, `rnd` and
+        `noveld`.
       embedding: units of embeddings of action and reward.
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.
@@ -255,6 +255,13 @@ class Config:
     def num_value_heads(self) -> int:
         """V, the number of value heads."""
         return 2 if self.value_heads == "separate" and self.curiosity != "none" else 1
+
+    @property
+    def has_schedule(self) -> bool:
+        """Whether `iterations` decides more than the end of training."""
+        anneals = self.curiosity != "none" and bool(self.intrinsic_coef_init)
+        anneals = anneals and self.intrinsic_anneal_fraction > 0
+        return anneals or self.lr_decay_fraction > 0
 
     @property
     def num_replayed(self) -> tuple[int, ...]:

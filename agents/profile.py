@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from agents.arrays import SUFFIX
 from agents.command_line import option, parse
 from agents.files import is_file, read_json, write_bytes, write_json
 from agents.profiles import plots
@@ -66,7 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     iterations = {name: policy.iteration for name, policy in policies.items()}
     command = f"python -m agents.profile {shlex.join(arguments)}"
     origin = {"command": command, "iterations": iterations, **provenance()}
-    names = "+".join(Path(source).resolve().stem for source in policies)  # a source may be "."
+    paths = [Path(source).resolve() for source in policies]  # a source may be "."
+    names = "+".join(path.name.removesuffix(SUFFIX) for path in paths)
     output = options.output or Path("runs", f"profile-{names}")
     _check_free(output, iterations)
     found = profile(policies, options.parts, options.strengths, options.tasks, announce)

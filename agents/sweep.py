@@ -44,7 +44,7 @@ def main(
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 failed = launch(runs, run_options, executor, console, options.seeds_per_program)
                 if any(RunFolder(path).metrics.exists() for path in runs):
-                    records.collect(root, f"{program} {shlex.join(arguments)}".strip())
+                    records.collect(root, f"{program} {shlex.join(arguments)}".strip(), runs)
                     console.out(records.write_tables(root))
                     files = [root / "results.csv", root / "table.md", *records.draw(root)]
                     console.out("", *files, sep="\n")

@@ -137,11 +137,10 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
         lines.append(f"First solved {share}{train_set} after {solving.min():,} episodes{more}.")
     if folder.page.exists():
         lines.append(f"Report with curves and episodes to step through: {folder.page}")
-    has_schedule = config.lr_decay_fraction or config.intrinsic_coef_init
     if config.stop_when_solved and len(solving):
         more = "python -m agents.train --preset best"
         lines.append(f"Next, learn all transfers in 40 minutes: {more}")
-    elif not has_schedule and config.max_transitions is None:
+    elif not config.has_schedule and config.max_transitions is None:
         again = resume_command(folder, run)
         lines.append(f"Train longer: {again} --iterations {2 * config.iterations}")
     return lines

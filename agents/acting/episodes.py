@@ -20,7 +20,7 @@ class Episodes(NamedTuple):
       action: i32[B, T, 2], (grasp, move).
       reward: f32[B, T], extrinsic.
       discount: f32[B, T], 0 on the step that terminated the episode and after it, else 1.
-      mask: f32[B, T], 1 on steps taken before the episode's end, else 0.
+      mask: f32[B, T], 1 on the steps that the episode took, with the last one, and 0 on padding.
     """
 
     layout: tt.State

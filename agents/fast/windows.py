@@ -1,4 +1,4 @@
-"""Encodes as networks/encoder.py does, its first layers once per distinct window.
+"""Computes `networks.encoder.Encoder`, its first layers once per distinct window.
 
 Up to its first pooling, the encoder maps a 4x4 window of the observation to the features of one 2x2
 block of the board. An observation is 36 windows, most of which repeat: one step changes a handful.

@@ -61,6 +61,8 @@ def variance_scaling(scale: float) -> Callable[..., Undrawn]:
 def draw(key: jax.Array, params: Any) -> Any:
     """Samples every `Undrawn` from a normal distribution truncated at two standard deviations."""
     leaves, structure = jax.tree.flatten(params, is_leaf=_is_undrawn)
+    if not leaves:
+        return params
     ends = np.cumsum([jnp.size(nn.meta.unbox(leaf)) for leaf in leaves])
     noise = jax.random.truncated_normal(key, -2, 2, (ends[-1],), jnp.float32) / TRUNCATED_STD
     drawn = [

@@ -1,6 +1,6 @@
-"""Suits training to the machine: the one place that tells a CPU from an accelerator.
+"""Chooses the encoding, the unrolling of the GRU and the seeds per program for the machine.
 
-A CPU gains from encoding each distinct observation once, in small chunks. A GPU or TPU loses by it:
+A CPU gains from encoding each distinct observation once, in small chunks. That slows a GPU or TPU:
 such a chunk is dozens of small kernels, launched by a loop whose length depends on the data. An
 accelerator gains from unrolling the GRU instead, whose kernels are small, too.
 """

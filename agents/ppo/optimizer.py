@@ -8,7 +8,7 @@ import optax
 
 from agents.config import Config
 
-FINAL_LR_FRACTION = 1 / 50  # learning rate of the last gradient step of a decay, over the first
+FINAL_LR_FRACTION = 1 / 50  # what a whole decay multiplies the learning rate by
 BETA1 = 0.9  # decay of the first moment
 BETA2 = 0.999  # decay of the second moment
 

@@ -1,7 +1,7 @@
 """Returns and advantages of one episode: functions of arrays, to vmap over episodes.
 
-An episode has T steps; step t leads from observation t to observation t + 1. `mask` is 1 on steps
-before the episode's end, 0 after it.
+An episode has T steps; step t leads from observation t to observation t + 1. `mask` is 1 on the
+steps that the episode took, with the last one, and 0 on padding.
 
 Source: agents/agent.md, "PPO".
 """
@@ -48,7 +48,10 @@ def generalized_advantages(
 
 
 def normalize(x: jax.Array, mask: jax.Array, epsilon: float = 1e-8) -> jax.Array:
-    """Subtracts the masked mean of `x` f32[...] and divides by its masked standard deviation."""
+    """Subtracts the masked mean of `x` f32[...] and divides by its masked standard deviation.
+
+    Padding becomes 0. `epsilon` is added to the variance.
+    """
     chex.assert_equal_shape([x, mask])
     variance = jnp.var(x, where=mask > 0)
     return mask * (x - jnp.mean(x, where=mask > 0)) / jnp.sqrt(variance + epsilon)

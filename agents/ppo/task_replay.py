@@ -22,7 +22,7 @@ class TaskReplay(NamedTuple):
 
     Attributes:
       keys: PRNG keys [L, K] from which `env.reset` draws the tasks.
-      next: i32[L], the index of every list to fill next.
+      next: i32[L], for each list, the index that is overwritten next.
     """
 
     keys: jax.Array

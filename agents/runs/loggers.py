@@ -85,6 +85,7 @@ def _open_wandb(folder: RunFolder, run: Run) -> Iterator[Log]:
             dir=folder.path,
             id=_wandb_id(folder),
             resume="allow",
+            reinit="create_new",  # beside those of other seeds, and of the caller
         )
     except wandb.Error as error:
         raise ValueError(

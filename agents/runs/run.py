@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from collections.abc import Iterable
 from typing import Any, Self
 
 import trap_tube_jax as tt
@@ -38,7 +39,8 @@ class Run:
 
     def __post_init__(self) -> None:
         """Completes task set and algorithm; ValueError names a value that is not allowed."""
-        check_seed(self.seed)
+        object.__setattr__(self, "seed", check_seed(self.seed))
+        object.__setattr__(self, "imports", check_names("imports", self.imports))
         env_id = tt.task_set(self.config.env_id).id
         object.__setattr__(self, "config", dataclasses.replace(self.config, env_id=env_id))
         if not self.algorithm:
@@ -60,8 +62,8 @@ class Run:
     def check_continues(self, before: "Run") -> None:
         """Raises ValueError unless resuming `before` gives the result of an uninterrupted run."""
         old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
-        scheduled = old["lr_decay_fraction"] > 0 or old["intrinsic_coef_init"] > 0
-        free = {*EXTENDABLE, "config", "imports"} - ({"iterations"} if scheduled else set())
+        scheduled = {"iterations"} if before.config.has_schedule else set()
+        free = {*EXTENDABLE, "config", "imports"} - scheduled
         for name, value in old.items():
             if name not in free and new[name] != value:
                 reason = "schedules span this number; " if name == "iterations" else ""
@@ -70,6 +72,13 @@ class Run:
                     f"only {', '.join(sorted(free & set(EXTENDABLE)))} may change in a run; train "
                     "with other settings under another --name"
                 )
+
+
+def check_names(option: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Returns names as a tuple; ValueError for a single name, whose letters would be taken."""
+    if isinstance(names, str):
+        raise ValueError(f"{option} must be a tuple of names, got {names!r}")
+    return tuple(names)
 
 
 def check_algorithm(name: str) -> None:
@@ -94,7 +103,8 @@ class DeviceOptions:
     def __post_init__(self) -> None:
         """Raises ValueError for a number of devices that no job has."""
         if self.devices is not None:
-            check_integer("devices", self.devices, maximum=MAX_DEVICES)
+            devices = check_integer("devices", self.devices, maximum=MAX_DEVICES)
+            object.__setattr__(self, "devices", devices)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,11 +139,14 @@ class RunOptions(DeviceOptions):
     def __post_init__(self) -> None:
         """Raises ValueError for a number that is not allowed or an unknown set."""
         super().__post_init__()
-        check_integer("checkpoint_every", self.checkpoint_every)
-        check_integer("evaluate_every", self.evaluate_every, minimum=0)
-        if self.test_tasks is not None:
-            check_integer("test_tasks", self.test_tasks, maximum=MAX_TASKS)
-        if self.sets is not None and not self.sets:
+        bounds = {"checkpoint_every": (1, None), "evaluate_every": (0, None)}
+        bounds |= {} if self.test_tasks is None else {"test_tasks": (1, MAX_TASKS)}
+        for name, limits in bounds.items():
+            object.__setattr__(self, name, check_integer(name, getattr(self, name), *limits))
+        if self.sets is None:
+            return
+        object.__setattr__(self, "sets", check_names("sets", self.sets))
+        if not self.sets:
             raise ValueError("sets must name one or more task sets, or be None for the default")
-        for name in self.sets or ():
+        for name in self.sets:
             tt.task_set(name)

@@ -126,7 +126,7 @@ def train_runs(
             if path not in outcomes:
                 with capturing_outcome(outcomes, path):
                     outcomes[path] = progress.finish()
-    return outcomes
+    return {path: outcomes[path] for path in runs}
 
 
 def train(
@@ -137,8 +137,12 @@ def train(
 ) -> None:
     """Trains runs together until their limits; adds the outcomes of those that fail or stop."""
     with contextlib.ExitStack() as stack:
-        for progress in training.values():
-            progress.begin_training(stack, len(training))
+        for path, progress in training.items():
+            with capturing_outcome(outcomes, path):
+                progress.begin_training(stack, len(training))
+        training = {path: x for path, x in training.items() if path not in outcomes}
+        if not training:
+            return
         cohort = Cohort(program, [progress.state() for progress in training.values()])
         for index, progress in enumerate(training.values()):
             progress.state = functools.partial(cohort.state, index)

@@ -6,7 +6,7 @@ grid.json (see `About`). table.md and the figures are made from only these three
 
 import itertools
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
@@ -18,6 +18,7 @@ from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.provenance import Machine, read_provenance
 from agents.runs.results import find_runs, metrics
+from agents.runs.run import Run
 from agents.sweeps import figures, tables
 
 COUNTS = ["iteration", "episodes", "transitions", "seconds"]
@@ -69,10 +70,15 @@ def check(root: Path) -> None:
             )
 
 
-def collect(root: Path, command: str) -> None:
+def collect(root: Path, command: str, launched: Mapping[Path, Run]) -> None:
     """Writes results.csv, curves.csv and grid.json from the runs in a folder.
 
     Keeps the commands and the note already in grid.json.
+
+    Args:
+      root: folder of the grid.
+      command: command that has trained the runs.
+      launched: its runs by folder, also those that left no settings there.
 
     Raises:
       ValueError: a file is damaged, or a folder has a name that no table can hold.
@@ -83,6 +89,8 @@ def collect(root: Path, command: str) -> None:
     before = _read_about(root)
     commands = [*(before["commands"] if before else []), command]
     about = _about(root.name, folders, commands)
+    missing = [run for path, run in launched.items() if not RunFolder(path).config.is_file()]
+    about["unfinished"] += [[run.algorithm, run.seed] for run in missing]
     if before and "note" in before:
         about["note"] = before["note"]
     results = agents.results(root)

@@ -5,7 +5,7 @@ Source: the paper's Tables 1 and 2; Student's t for the interval of a mean of fe
 """
 
 import re
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
@@ -49,7 +49,9 @@ def tables(results: Table, curves: Table, about: Mapping[str, Any]) -> dict[str,
     """
     tested = reported(results)
     train_set = about["train_set"]
-    unfinished = Counter(algorithm for algorithm, _ in about["unfinished"])
+    unfinished = defaultdict(set)
+    for algorithm, seed in about["unfinished"]:
+        unfinished[algorithm].add(seed)
     with_paper = train_set == "base"
     found = {"Training": training_table(curves, about["threshold"], with_paper, unfinished)}
     if len(tested):
@@ -76,34 +78,42 @@ def reported(results: Table) -> Table:
 
 
 def by_set(tested: Table) -> Table:
-    """Returns percent solved by algorithm and seed, a column per set and one for their mean."""
+    """Returns percent solved by algorithm and seed, a column per set and one for their mean.
+
+    A seed that lacks a set of its algorithm has no mean.
+    """
     table = tested.pivot(index=["algorithm", "seed"], columns="task_set", values="percent")
     order = [name for name in ALL_SETS if name in table]
     table = table[[*order, *(name for name in table if name not in order)]]
     others = table.drop(columns="base", errors="ignore")
     if len(others.columns):
-        table[MEAN] = others.mean(axis=1)
+        known = others.notna()
+        is_complete = (known == known.groupby(level="algorithm").transform("any")).all(axis=1)
+        table[MEAN] = others.mean(axis=1).where(is_complete)
     return table.reindex(tested["algorithm"].unique(), level="algorithm")
 
 
 def training_table(
-    curves: Table, threshold: float, with_paper: bool, unfinished: Mapping[Any, int]
+    curves: Table, threshold: float, with_paper: bool, unfinished: Mapping[Any, set[int]]
 ) -> Table:
     """Returns seeds that solved their training set, episodes until they did, and means of costs.
 
-    `unfinished` counts the seeds that have not reached their end, by algorithm.
+    `unfinished` holds the seeds that have not reached their end, by algorithm. Some have no curve.
     """
     columns = ("solved", "episodes to solve", "steps", "minutes")
     rows: dict[Any, tuple[str, ...]] = {}
-    for name, found in curves.groupby("algorithm", sort=False):
+    for name in dict.fromkeys([*curves["algorithm"], *unfinished]):
+        found = curves[curves["algorithm"] == name]
+        left = unfinished.get(name, set())
         solving = found[found["validation_success"] >= threshold]
         episodes = solving.groupby("seed")["episodes"].min().to_numpy()
         ends = found.groupby("seed")[["transitions", "seconds"]].max()
-        steps, seconds = ends.mean()
-        solved = f"{len(episodes)} of {len(ends)}"
-        if unfinished.get(name):
-            solved += f", {unfinished[name]} unfinished"
-        rows[name] = (solved, mean_text(episodes, ",.0f"), f"{steps:,.0f}", f"{seconds / 60:,.1f}")
+        solved = f"{len(episodes)} of {len(left | set(ends.index))}"
+        solved += f", {len(left)} unfinished" if left else ""
+        costs = (NOTHING, NOTHING)
+        if len(ends):
+            costs = (f"{ends['transitions'].mean():,.0f}", f"{ends['seconds'].mean() / 60:,.1f}")
+        rows[name] = (solved, mean_text(episodes, ",.0f"), *costs)
     rows |= PAPER_SOLVED if with_paper else {}
     return pd.DataFrame(rows, columns).T
 

@@ -25,11 +25,11 @@ def one_start(monkeypatch):
 @pytest.mark.usefixtures("one_start")
 def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    source = Path(r"$\frac{$.safetensors")  # which Matplotlib would take for mathematics
+    source = Path(r"$\frac{$=0.1-x.safetensors")  # which Matplotlib would take for mathematics
     source.write_bytes((FOLDER / "fast-base.safetensors").read_bytes())
     options = "--parts structural first-push-p control --strengths 0 1 --tasks 2"
     arguments = ["fast-base", str(source), *options.split()]
-    out = tmp_path / "runs" / f"profile-fast-base+{source.stem}"
+    out = tmp_path / "runs" / r"profile-fast-base+$\frac{$=0.1-x"
     out.mkdir(parents=True)
     (out / "success.png").write_text("of an earlier profile")
 

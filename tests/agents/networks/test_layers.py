@@ -81,3 +81,7 @@ def test_only_kernels_of_our_layers_are_drawn_in_any_module(module):
     params = init_module(module, jax.random.key(0), jnp.ones((1, 3)))["params"]
     np.testing.assert_array_equal(params["scale"], 1)
     assert len(np.unique(params["Dense_0"]["kernel"])) == 12
+
+
+def test_a_module_may_have_no_parameters():
+    assert init_module(nn.Sequential([jnp.tanh]), jax.random.key(0), jnp.ones((1, 3))) == {}

@@ -1,9 +1,12 @@
 """The folder of a run: its settings, what may change in them, and its one writer."""
 
+import dataclasses
 import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from agents.config import Config
@@ -22,6 +25,17 @@ def test_a_run_is_the_same_after_json():
     assert Run(Config(curiosity="icm")).algorithm == "ppo+icm"
 
 
+def test_numbers_of_numpy_and_lists_are_stored_as_those_of_python(tmp_path):
+    given: Any = {"checkpoint_every": np.int64(2), "test_tasks": np.uint16(4), "sets": ["p"]}
+    imports: Any = ["my_module"]
+    run = Run(Config(), np.arange(9)[3], imports=imports)
+    options = RunOptions(**given)
+    RunFolder(tmp_path).write_config(run, options)
+    found = RunFolder(tmp_path).stored()
+    assert (found["seed"], found["imports"]) == (3, ["my_module"])
+    assert found["options"] == {**dataclasses.asdict(RunOptions()), **given}
+
+
 @pytest.mark.parametrize(
     ("make", "values", "words"),
     [
@@ -31,6 +45,8 @@ def test_a_run_is_the_same_after_json():
         (RunOptions, {"evaluate_every": -1}, ["evaluate_every must be an integer >= 0, got -1"]),
         (RunOptions, {"test_tasks": 10**9}, ["test_tasks must be", "<= 1000000, got 1000000000"]),
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
+        (RunOptions, {"sets": "pst"}, ["sets must be a tuple of names, got 'pst'"]),
+        (partial(Run, Config()), {"imports": "json"}, ["imports must be a tuple of names"]),
         (RunOptions, {"sets": ()}, ["sets must name one or more task sets"]),
         (RunOptions, {"devices": 100_000}, ["devices must be an integer >= 1 and <= 1024"]),
         (partial(Run, Config()), {"algorithm": "=1+1"}, ["algorithm must begin with a letter"]),
@@ -57,6 +73,8 @@ def test_impossible_runs_options_and_names_are_refused(make, values, words):
         ({}, {"hidden": 8}, ["hidden=64, not 8", "iterations, max_transitions, stop_when_solved"]),
         ({"lr_decay_fraction": 0.5}, {"iterations": 999}, ["iterations=250, not 999", "schedules"]),
         ({"intrinsic_coef_init": 3.0}, {"iterations": 999}, ["iterations=250", "schedules span"]),
+        ({"intrinsic_coef_init": 3.0, "curiosity": "none"}, {"iterations": 999}, None),
+        ({"intrinsic_coef_init": 3.0, "intrinsic_anneal_fraction": 0}, {"iterations": 999}, None),
     ],
 )
 def test_only_the_end_of_a_run_may_change(before, after, words):

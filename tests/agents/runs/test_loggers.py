@@ -1,5 +1,6 @@
 """Reads logged metrics with the readers of TensorBoard and Weights & Biases."""
 
+import contextlib
 import sys
 from types import SimpleNamespace
 
@@ -74,11 +75,35 @@ def test_tensorboard_shows_metrics_of_a_killed_and_resumed_run_once(tmp_path):
     assert logged == list(zip(rows["iteration"], rows["loss"], strict=True))
 
 
-@pytest.mark.interop
-def test_a_resumed_run_is_the_same_run_of_wandb(tmp_path, monkeypatch):
-    pytest.importorskip("wandb")
+@pytest.fixture
+def offline(monkeypatch):
+    """Weights & Biases without a network."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
+    return pytest.importorskip("wandb")
+
+
+@pytest.mark.interop
+def test_seeds_of_one_program_are_runs_of_wandb_beside_the_callers(tmp_path, offline):
+    """A row belongs to the run that logs it."""
+    seeds = ("0", "1")
+    with offline.init(dir=tmp_path) as callers, contextlib.ExitStack() as stack:
+        for name in seeds:
+            path = RunFolder(tmp_path / name).path
+            path.mkdir()
+            chosen = {"tensorboard": False, "wandb": True}
+            log_row = stack.enter_context(open_loggers(path, Run(small_config()), **chosen))
+            log_row({**row(1), f"seed_{name}": 0.25})
+        assert offline.run is callers
+    for name in seeds:
+        (log,) = (tmp_path / name / "wandb").glob("offline-run-*/*.wandb")
+        found = [seed for seed in seeds if f"seed_{seed}".encode() in log.read_bytes()]
+        assert found == [name]
+
+
+@pytest.mark.interop
+@pytest.mark.usefixtures("offline")
+def test_a_resumed_run_is_the_same_run_of_wandb(tmp_path):
     folder = RunFolder(tmp_path)
     check_loggers(RunOptions(wandb=True))
     log(folder, [1, 2], loss=0.25, wandb=True)

@@ -61,7 +61,10 @@ def test_seeds_of_one_program_stop_together_and_go_on_from_where_they_stand(alon
 
 
 def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
-    """Seed 0 cannot be begun, 1 diverges in iteration 2, 2 is solved then, 3 goes on."""
+    """Seed 0 cannot be begun, 1 diverges in iteration 2, 2 is solved then, 3 goes on.
+
+    Seed 4 cannot begin to train.
+    """
     advance = program.Cohort.advance
 
     def end(cohort):
@@ -82,16 +85,19 @@ def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(program.Cohort, "advance", end)
     monkeypatch.setattr(Evaluator, "__call__", record)
     config = small_config(iterations=3, stop_when_solved=1.0)
-    runs = {tmp_path / f"{seed}": Run(config, seed) for seed in range(4)}
+    runs = {tmp_path / f"{seed}": Run(config, seed) for seed in range(5)}
     RunFolder(tmp_path / "0").checkpoints.mkdir(parents=True)
     costs = {"iteration": 1, "episodes": 8, "transitions": 48, "seconds": 1.0}
     append_rows(tmp_path / "0" / "metrics.csv", [{**costs, "validation_success": 0.0}])
-    failed, diverged, solved, other = train_runs(runs, PLAIN).values()
+    (tmp_path / "4").mkdir()
+    (tmp_path / "4" / "provenance.json").write_text("{")
+    failed, diverged, solved, other, damaged = train_runs(runs, PLAIN).values()
     assert "no checkpoint" in str(failed)
+    assert "provenance.json" in str(damaged)
     assert "diverged in iteration 2" in str(diverged)
     assert isinstance(solved, Scores)
     assert isinstance(other, Scores)
-    assert [final_state(path)[0] for path in runs if path.name != "0"] == [0, 2, 3]
+    assert [final_state(path)[0] for path in runs if path.name != "0"] == [0, 2, 3, 0]
     (iteration,) = read_rows(tmp_path / "2" / "evaluations.csv")["iteration"]
     assert iteration == 2
     assert_same(tested[0], agents.load(tmp_path / "2").params)

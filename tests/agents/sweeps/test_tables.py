@@ -164,6 +164,16 @@ def test_seeds_that_lack_a_set_are_left_out_of_its_comparison():
     assert found.notna().all(axis=None)
 
 
+def test_a_seed_that_lacks_a_set_has_no_mean_and_leaves_the_bars_of_others():
+    given = rows("a", [5, 6]) + rows("a", [9], task_set="st")
+    tested = tables.reported(pd.DataFrame(given))
+    table = tables.success_table(tested, with_paper=False)
+    assert table.loc[["{St}", tables.MEAN], "a"].tolist() == ["90.0", "70.0"]
+    figure = figures.draw_success(tested, {**ABOUT, "train_set": "st"})
+    widths = {axis.get_title(): axis.patches[0].get_width() for axis in figure.axes}
+    assert widths == {"{P}": 55, "{St}": 90, tables.MEAN: 70}
+
+
 def test_algorithms_of_one_seed_are_not_compared():
     tested = pd.DataFrame(rows("ppo", [5]) + rows("ppo+icm", [6, 7]))
     assert len(tables.differences(tables.reported(tested))) == 0
@@ -172,9 +182,10 @@ def test_algorithms_of_one_seed_are_not_compared():
 def test_training_is_summed_up_with_the_papers_trials():
     three = ((0, 1), (0, 0, 1), (0, 0, 0))
     made = pd.concat([curves("ppo+icm", three), curves("<b>", ((0.5,),))])
-    table = tables.training_table(made, 1.0, True, {"<b>": 1})
+    table = tables.training_table(made, 1.0, True, {"<b>": {0, 1}, "lost": {5}})
     assert table.loc["ppo+icm"].tolist() == ["2 of 3", "250 [0, 885]", "2,667", "2.7"]
-    assert table.loc["<b>"].tolist() == ["0 of 1, 1 unfinished", "–", "1,000", "1.0"]
+    assert table.loc["<b>"].tolist() == ["0 of 2, 2 unfinished", "–", "1,000", "1.0"]
+    assert table.loc["lost"].tolist() == ["0 of 1, 1 unfinished", "–", "–", "–"]
     assert table.loc["PPO + ICM, paper"].tolist()[:2] == ["5 of 5", "102,000 ± 60,000"]
     assert tables.training_table(made, 0.5, False, {}).loc["<b>", "solved"] == "1 of 1"
 
@@ -247,11 +258,13 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
         append_rows(folder.metrics, done.to_dict("records"))
         tested = pd.DataFrame(rows("ppo", [1])).drop(columns=["algorithm", "seed"])
         append_rows(folder.evaluations, tested.to_dict("records"))
+    launched = {tmp_path / "seed2": Run(small_config(), 2)}  # which left no settings
     for command in ("first", "second", "first"):
-        records.collect(tmp_path, command)
+        records.collect(tmp_path, command, launched)
     shown = records.write_tables(tmp_path)
-    assert "2 of 2, 1 unfinished" in shown
-    assert "Unfinished, so the table may change: ppo+effects seed 1." in shown
+    assert "2 of 3, 2 unfinished" in shown
+    note = "Unfinished, so the table may change: ppo+effects seed 1, ppo+effects seed 2."
+    assert note in " ".join(shown.split())
     text = (tmp_path / "table.md").read_text()
     assert "\n    first\n\n    second\n" in text
 
@@ -262,7 +275,7 @@ def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
         folder.write_config(Run(small_config(env_id=name, stop_when_solved=threshold)))
         metrics = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, metrics.to_dict("records"))
-    records.collect(tmp_path, "sweep")
+    records.collect(tmp_path, "sweep", {})
     about = read_json(tmp_path / "grid.json")
     assert about["title"].endswith(": trained on base or {Sy}")
     assert about["train_set"] == "training set"
@@ -277,13 +290,13 @@ def test_what_others_have_written_is_plain_text(tmp_path):
     note_provenance(folder.provenance, "cpu")
     (machine,) = read_json(folder.provenance)
     write_json(folder.provenance, [{**machine, "processor": "<b>[x](y)`"}])
-    records.collect(tmp_path, "sweep `<script>`")
+    records.collect(tmp_path, "sweep `<script>`", {})
     records.write_tables(tmp_path)
     text = (tmp_path / "table.md").read_text()
     assert "\n    sweep `<script>`\n" in text, "a block of code"
     assert r"\<b\>\[x\](y)\`" in text
     folder.path.rename(tmp_path / "=1+1")
-    assert_refused(["got '=1+1'"], records.collect, tmp_path, "sweep")
+    assert_refused(["got '=1+1'"], records.collect, tmp_path, "sweep", {})
 
 
 def test_what_cannot_be_made_again_is_kept(tmp_path):
@@ -294,10 +307,10 @@ def test_what_cannot_be_made_again_is_kept(tmp_path):
         done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, done.to_dict("records"))
     records.check(tmp_path)
-    records.collect(tmp_path, "first")
+    records.collect(tmp_path, "first", {})
     about = read_json(tmp_path / "grid.json")
     write_json(tmp_path / "grid.json", {**about, "note": "mine"})
-    records.collect(tmp_path, "second")
+    records.collect(tmp_path, "second", {})
     assert read_json(tmp_path / "grid.json")["note"] == "mine"
     records.check(tmp_path)
     shutil.rmtree(tmp_path / "seed1")
