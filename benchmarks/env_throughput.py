@@ -49,6 +49,8 @@ class StepOptions(harness.Options):
                 raise ValueError(
                     f"num_envs must be multiples of devices={self.devices}, got {num_envs}"
                 )
+        for name in self.sets:
+            tt.task_set(name)
         use_devices(self.devices)
         super().check()
 
@@ -274,8 +276,8 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
 
 def main(options: Options) -> list[Throughput]:
     """Measures, writes the record and prints a table."""
-    subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
     console = harness.begin(options)
+    subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
     bandwidth = copy_bandwidth()
     console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
     results = [

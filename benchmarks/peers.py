@@ -128,8 +128,8 @@ def measure(
 
 def main(options: Options) -> None:
     """Measures, writes the record, and prints a table and the skipped peers."""
-    subjects = [env_throughput.task_set_subject(name) for name in options.sets]
     console = harness.begin(options)
+    subjects = [env_throughput.task_set_subject(name) for name in options.sets]
     results, skipped = measure(options, subjects)
     first = {result.num_envs: result.steps_per_s for result in reversed(results)}
     columns = ("envs", "M steps/s", "ratio", "µs/step", "B/obs.", "GB/s")

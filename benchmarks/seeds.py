@@ -90,7 +90,7 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
         config.env_id,
         learner.path,
         seeds,
-        sum(steps[1:]) / sum(calls[1:]),
+        sum(steps[1:]) / options.repeats / timing.median_s,
         timing.median_s / options.iterations,
         timing,
     )

@@ -181,11 +181,13 @@ def test_the_wheel_holds_the_environment_and_requires_its_imports():
     extras = project["optional-dependencies"]
     required = modules_of(project["dependencies"])
     allowed = required | modules_of(extras["pictures"] + extras["gymnasium"] + extras["gymnax"])
+    used = set()
     for module, names in IMPORTS.items():
         if module.split(".")[0] == "trap_tube_jax":
-            used = {name.split(".")[0] for name in names} - {"trap_tube_jax"}
-            assert used <= allowed | sys.stdlib_module_names, module
-    assert required == {"jax", "flax", "chex", "numpy", "scipy"}
+            imported = {name.split(".")[0] for name in names} - {"trap_tube_jax"}
+            assert imported <= allowed | sys.stdlib_module_names, module
+            used |= imported
+    assert required <= used
 
 
 def test_all_files_name_the_same_version():

@@ -25,7 +25,7 @@ def one_line(error: Exception) -> str:
 
 
 def announce(work: str) -> None:
-    """Says on stderr what a command is about to do and for how long, if that takes seconds."""
+    """Announces on stderr a step that takes seconds or more, with its expected duration."""
     print(f"{work} ...", file=sys.stderr, flush=True)
 
 

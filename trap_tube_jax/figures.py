@@ -1,4 +1,4 @@
-"""Figures of Matplotlib that look alike on every machine."""
+"""Draws Matplotlib figures alike on every machine."""
 
 import contextlib
 from collections.abc import Iterator

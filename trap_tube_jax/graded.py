@@ -1,7 +1,7 @@
 """The perceptual and the structural transfer at strengths from 0 to 1.
 
-A strength bounds the distance of the draws: of layouts from the base task's, of features from the
-state's. Strength 0 draws exactly these; strength 1 is the paper's transfer. Draws are nested: a
+The strength bounds how far a drawn layout may lie from the base task's, and drawn features from
+the state's. Strength 0 draws exactly these; strength 1 is the paper's transfer. Draws are nested: a
 layout, or a direction of a feature point, that is possible at one strength is possible at every
 higher one.
 
@@ -47,7 +47,7 @@ def graded_perceptual(strength: float) -> Transfer:
     choices and their distances.
 
     Args:
-      strength: 0, the base task's layout, to 1, `perceptual` itself.
+      strength: s, from 0 (the base task's layout) to 1 (`perceptual` itself).
 
     Returns:
       A transfer (key, state) -> state. It keeps the state's palette, time and flags.
@@ -79,7 +79,7 @@ def graded_structural(strength: float) -> Transfer:
     no circle, the point is (1 - s) r b + s u; for r = 0, where there is no b, it is s u.
 
     Args:
-      strength: s, from 0, the palette as it is, to 1, `structural` itself.
+      strength: s, from 0 (keeps the palette) to 1 (`structural` itself).
 
     Returns:
       A transfer (key, state) -> state that changes the palette only.

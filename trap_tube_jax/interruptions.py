@@ -1,4 +1,4 @@
-"""Signals that end a command: one line, the exit code 128 + number, and nothing lost.
+"""Ends commands on a signal: one line, the exit code 128 + number, and saved work.
 
 A signal ends a command at once, whatever it computes, except within `deferring`, which lets it
 finish and save what it has begun.
@@ -41,7 +41,7 @@ class _DeferredSignal:
 
 
 def _start_again() -> str:
-    """Says how to go on after a command that saves nothing on the way."""
+    """Returns the hint of a command that saves no progress."""
     return "The same command starts again."
 
 
@@ -146,7 +146,7 @@ def block_signals() -> None:
 
 
 def close_stdout() -> None:
-    """Sends what is still to be printed nowhere, or Python would complain about a closed pipe."""
+    """Redirects stdout to the null device, or Python would report the closed pipe at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 

@@ -208,7 +208,7 @@ def _play(game: Game) -> None:
     with _single_keys(sys.stdin.fileno()) as terminal:
         while True:
             print(CLEAR_SCREEN + screen(game), flush=True)
-            typed = os.read(terminal, 64).decode(errors="replace")
+            typed = os.read(terminal, 4096).decode(errors="replace")
             for key in KEYS.findall(typed) or ["q"]:  # a closed terminal reads as nothing
                 if key == "q":
                     return

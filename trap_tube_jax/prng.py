@@ -19,7 +19,7 @@ def typed_key(key: Any) -> jax.Array:
     if isinstance(key, jax.Array | np.ndarray):
         if key.shape == () and jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
             return jnp.asarray(key)
-        if key.dtype == np.uint32 and key.shape == _raw_shape():
+        if key.dtype == np.uint32 and key.shape == raw_shape():
             return jax.random.wrap_key_data(jnp.asarray(key))
         found = f"{key.dtype} of shape {key.shape}"
     raise ValueError(
@@ -28,7 +28,8 @@ def typed_key(key: Any) -> jax.Array:
     )
 
 
-def _raw_shape() -> tuple[int, ...]:
+def raw_shape() -> tuple[int, ...]:
+    """Returns the shape of a raw key under `jax_default_prng_impl`."""
     return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0))).shape
 
 

@@ -22,8 +22,8 @@ class TaskSet:
     Attributes:
       id: name that `make` takes.
       short: name in tables and file names.
-      label: name in text: the paper's notation, such as "{P, St}", for the paper's sets, and the
-        short name for others.
+      label: name in text: the paper's notation for the paper's sets and mixtures of them, such as
+        "{P, St}"; the short name for others.
       transfers: the transfers, in the order in which they apply.
       base: the state that the transfers start from; None is the base task.
       max_steps: steps after which an unsolved episode is truncated.

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.checks import check_integer, expand, integer_array
+from trap_tube_jax.checks import check_integer, describe_array, expand, integer_array
 from trap_tube_jax.dynamics import holds_tool, step
 from trap_tube_jax.environment import check_actions
 from trap_tube_jax.geometry import unit_vector
@@ -120,7 +120,7 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
     last frame shows the final board without a hand.
 
     Args:
-      state: one unbatched state, unfinished.
+      state: one unbatched state.
       actions: i32[T, 2], (grasp, move) pairs, each 0 up, 1 down, 2 left, 3 right; or (-1, -1),
         the padding of a `Plan`, which moves nothing. T may be 0.
       cell_size: s >= 1, pixels per cell and side.
@@ -167,12 +167,14 @@ def save_gif(
       >>> frames = tt.episode_frames(state, tt.solve(state).actions)
       >>> tt.save_gif(frames, "plan.gif", fps=4)
     """
-    pictures = np.asarray(frames)
+    allowed = "frames must be uint8[T, height, width, 3], each at least 1"
+    try:
+        pictures = np.asarray(frames)
+    except ValueError as error:
+        raise ValueError(f"{allowed}: {error}") from error
     shape = pictures.shape
-    if pictures.dtype != np.uint8 or len(shape) != 4 or not shape[0] or shape[-1] != 3:
-        raise ValueError(
-            f"frames must be uint8[T, height, width, 3], T >= 1, got {pictures.dtype}{list(shape)}"
-        )
+    if pictures.dtype != np.uint8 or len(shape) != 4 or 0 in shape or shape[-1] != 3:
+        raise ValueError(f"{allowed}, got {describe_array(pictures)}")
     if not isinstance(fps, numbers.Real) or not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         raise ValueError(f"fps must be from {FPS_RANGE[0]} to {FPS_RANGE[1]}, got {fps!r}")
     if not isinstance(hold, numbers.Real) or not 0 <= hold <= MAX_HOLD:
@@ -196,7 +198,7 @@ def _durations(num_frames: int, fps: float, hold: float) -> np.ndarray:
 def _distinct_pictures(
     pictures: np.ndarray, durations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joins equal pictures that follow one another, up to the longest duration of a GIF."""
+    """Merges runs of equal pictures; a duration is at most the longest that a GIF can store."""
     is_new = np.append(True, np.any(pictures[1:] != pictures[:-1], axis=(1, 2, 3)))
     durations = np.add.reduceat(durations, np.flatnonzero(is_new))
     return pictures[is_new], durations.clip(max=MAX_DURATION)
@@ -258,7 +260,7 @@ def _blend(image: Any, ink: Any, opacity: Any) -> Any:
 
 @functools.cache
 def _signs(cell_size: int) -> np.ndarray:
-    """Returns the part of every pixel that a sign covers, f32[8, s, s]. The tool has none."""
+    """Returns the fraction of every pixel that a sign covers, f32[8, s, s]. The tool has none."""
     y, x = _offsets((0.5, 0.5), 1, cell_size)
     distance = np.full((NUM_OBJECTS, cell_size, cell_size), np.inf, np.float32)
     distance[TRAP] = _cross(y, x)
@@ -325,7 +327,7 @@ def _offsets(center: Any, num_cells: int, cell_size: int) -> tuple[Any, Any]:
 
 
 def _coverage(distance: Any, cell_size: int) -> Any:
-    """Returns the part of a pixel that is inside the shape, 0 to 1, as f32."""
+    """Returns the fraction of a pixel that is inside the shape, 0 to 1, as f32."""
     return (0.5 - distance * cell_size).clip(0, 1)
 
 

@@ -109,9 +109,17 @@ class Mixture:
         choice_key, transfer_key = jax.random.split(threefry_key(key))
         ticket = jax.random.randint(choice_key, (), 0, sum(self.weights), jnp.int32)
         tickets = np.repeat(np.arange(len(self.weights), dtype=np.int32), self.weights)
-        # Compositions return the same types, whatever the transfers do.
-        branches = [compose(transfer) for transfer in self.transfers]
-        return jax.lax.switch(jnp.asarray(tickets)[ticket], branches, transfer_key, state)
+        # Under vmap all branches run and read their operands, which a key may be only once.
+        words = jax.random.key_data(transfer_key)
+        impl = jax.random.key_impl(transfer_key)
+
+        def branch(transfer: Transfer) -> Callable[[jax.Array, State], State]:
+            # Compositions return the same types, whatever the transfers do.
+            apply = compose(transfer)
+            return lambda words, state: apply(jax.random.wrap_key_data(words, impl=impl), state)
+
+        branches = [branch(transfer) for transfer in self.transfers]
+        return jax.lax.switch(jnp.asarray(tickets)[ticket], branches, words, state)
 
     @property
     def __name__(self) -> str:
@@ -160,7 +168,7 @@ def perceptual(key: jax.Array, state: State) -> State:
 
 
 def draw_layout(key: jax.Array, state: State, layouts: LayoutTables) -> State:
-    """Replaces the layout of `state` by one drawn from `layouts`; see `perceptual`."""
+    """Replaces the layout of `state` with one drawn from `layouts`; see `perceptual`."""
     check_state(state)
     tables = jax.tree.map(jnp.asarray, layouts)
     layout, food, tool, agent = jax.random.bits(threefry_key(key), (4,), jnp.uint32)

@@ -25,6 +25,7 @@ from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.checks import check_integer, check_own_state, describe_array, names_adapters
 from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
+from trap_tube_jax.prng import raw_shape
 from trap_tube_jax.state import State, TimeStep
 from trap_tube_jax.wrappers import (
     AutoReset,
@@ -138,7 +139,7 @@ class VectorEnvironment:
     ) -> tuple[VectorState, jax.Array]:
         """Starts the next episode where `done` bool[B], in the state and in the picture."""
         num_envs = len(done)
-        size = self._chunk_size(len(done))
+        size = self._chunk_size(num_envs)
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
         def start_chunk(carry):
@@ -161,7 +162,7 @@ class VectorEnvironment:
             return started + size, (VectorState(episodes, background), picture)
 
         _, (state, picture) = jax.lax.while_loop(
-            lambda carry: carry[0] < finished[num_envs - 1],
+            lambda carry: carry[0] < finished[-1],
             start_chunk,
             (jnp.int32(0), (state, picture)),
         )
@@ -178,7 +179,8 @@ def _check_keys(keys: Any) -> None:
     found = type(keys).__name__
     if isinstance(keys, jax.Array | np.ndarray):
         is_typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
-        if keys.ndim == (1 if is_typed else 2) and len(keys):
+        is_raw = keys.dtype == np.uint32 and keys.shape[1:] == raw_shape()
+        if keys.ndim and len(keys) and (keys.ndim == 1 if is_typed else is_raw):
             return
         found = describe_array(keys)
     raise ValueError(

@@ -142,7 +142,8 @@ class EpisodeStatisticsState(ByValue, struct.PyTreeNode, eq=False):
       last_return: f32[], the undiscounted return of the last finished episode.
       last_length: i32[], the number of steps of the last finished episode.
       episodes: i32[], finished episodes since the reset.
-      over: bool[], the last step ended an episode and started no other, so the next is not counted.
+      over: bool[], the last step ended an episode without starting another, so the next step is
+        not counted.
     """
 
     inner: Any

@@ -37,7 +37,7 @@ def test_throughput_measures_every_set_batch_and_pattern(timed, monkeypatch):
     measured = [(x.name, x.num_envs, x.pattern) for x in results]
     assert measured == list(itertools.product(("base", "sy"), (2, 4), ("sum", "last")))
     assert {x.observation_bytes for x in results} == {3 * 4}
-    assert {x.timing for x in results} == {harness.Timing(7, 2, 1, 3)}
+    assert {x.timing for x in results} == {harness.Timing(7, 2, 1, 6)}
     assert results[2].steps_per_s == 4 * 3 / 2
 
 

@@ -5,6 +5,7 @@ import json
 import re
 import runpy
 import shlex
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -119,3 +120,10 @@ def test_stated_speeds_are_of_their_records():
     assert f"Commit `{commit}`" in sentence
     speeds = re.findall(r"\b(\d+\.\d)\b", sentence)
     assert set(speeds) == {f"{result['steps_per_s'] / 1e6:.1f}" for result in results}
+
+
+def test_the_cpu_is_split_before_jax_starts():
+    command = "--sets base --num-envs 4 --num-steps 2 --repeats 1 --devices 2"
+    words = [sys.executable, "-m", "benchmarks.env_throughput", *command.split()]
+    shown = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert "'devices': 2" in shown

@@ -141,6 +141,13 @@ def test_indices_of_no_action_are_refused(easy, easy_env, index):
             adapter.step_env(key, state, index, params)
 
 
+def test_a_pair_in_place_of_an_index_is_answered_with_the_option(easy):
+    env, params = easy
+    _, state = env.reset(jax.random.key(0), params)
+    with pytest.raises(ValueError, match="flat_actions=False to pass"):
+        env.step(jax.random.key(0), state, np.array([0, 3]), params)
+
+
 def test_batches_of_purejaxrls_wrappers_scan(easy, easy_env):
     """As PureJaxRL trains: vmap over environments, scan over steps, `info` stacked over both."""
     env, params = easy

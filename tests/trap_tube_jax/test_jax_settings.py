@@ -25,7 +25,7 @@ TRANSFERS = (
     *tt.task_set("two-traps").transfers,
     *(tt.graded_perceptual(0.5), tt.perceptual),
     *(tt.graded_structural(0.5), tt.structural),
-    tt.symbolic,
+    *tt.task_set("sy+base").transfers,
     raised_agent,
 )
 BASE = tt.base_state().replace(food=np.array([5, 6]))  # int64, NumPy's default

@@ -208,7 +208,9 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
     ("frames", "options", "message"),
     [
         (np.zeros((2, 4, 4, 3), np.float32), {}, "got float32"),
-        (np.zeros((0, 4, 4, 3), np.uint8), {}, "T >= 1, got uint8[0, 4, 4, 3]"),
+        (np.zeros((0, 4, 4, 3), np.uint8), {}, "each at least 1, got uint8[0, 4, 4, 3]"),
+        (np.zeros((1, 0, 4, 3), np.uint8), {}, "each at least 1, got uint8[1, 0, 4, 3]"),
+        ([FRAMES[0], FRAMES[0][1:]], {}, "frames must be uint8[T, height, width, 3]"),
         ("a.gif", {}, "frames must be uint8[T, height, width, 3]"),
         (FRAMES, {"fps": 0}, "from 1 to 50, got 0"),
         (FRAMES, {"fps": 51}, "from 1 to 50, got 51"),

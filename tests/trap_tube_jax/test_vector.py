@@ -127,7 +127,8 @@ def test_a_batch_of_other_environments_or_chunks_is_refused():
 def test_a_batch_refuses_a_single_key_and_other_states():
     vector = tt.VectorEnvironment(tt.make("base"))
     keys = jax.random.split(jax.random.key(0), 3)
-    for key in (keys[0], jax.random.PRNGKey(0), 0, None, "keys", keys[:0], list(keys)):
+    raw = np.zeros((3, 2), np.int32)
+    for key in (keys[0], jax.random.PRNGKey(0), 0, None, "keys", keys[:0], list(keys), raw):
         assert_refused(["PRNG keys [B]", "jax.random.split"], vector.reset, key)
     state, timestep = jax.eval_shape(vector.reset, keys)
     actions = np.zeros((3, 2), np.int32)

@@ -1,4 +1,4 @@
-"""The environments with the interfaces of other libraries, which the modules need.
+"""Adapters to the interfaces of other libraries. Each module needs its library.
 
 to_gymnasium: `gymnasium.make` and `gymnasium.make_vec`.
 to_gymnax: the five-value step of gymnax 0.x, and `gymnax.make` of gymnax >= 1.0.

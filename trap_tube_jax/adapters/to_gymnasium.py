@@ -346,7 +346,7 @@ def _keys(seeds: Sequence[Any]) -> jax.Array:
 
 
 def _select(mask: np.ndarray, new: jax.Array, old: jax.Array) -> jax.Array:
-    """Selects rows of `new` [B, ...] where `mask` bool[B], else of `old`; uses up no keys."""
+    """Selects rows of `new` [B, ...] where `mask` bool[B], else of `old`; consumes no keys."""
     if jnp.issubdtype(new.dtype, jax.dtypes.prng_key):
         data = _select(mask, jax.random.key_data(new), jax.random.key_data(old))
         return jax.random.wrap_key_data(data, impl="threefry2x32")

@@ -141,7 +141,12 @@ class _TrapTube(environment.Environment):
 
 
 def _pair(index: Any) -> jax.Array:
-    """Returns the action i32[2] of an index; raises ValueError for concrete ones beyond 0 to 15."""
+    """Returns the action i32[2] of an index; raises ValueError for pairs, and beyond 0 to 15."""
+    if np.ndim(index):
+        raise ValueError(
+            "an action is one index 4 * grasp + move; make the environment with flat_actions=False "
+            f"to pass (grasp, move), got shape {np.shape(index)}"
+        )
     pair = action_from_index(index)
     if not isinstance(pair, Tracer) and np.any(np.asarray(pair) == NO_DIRECTION):
         raise ValueError(f"an action's index must be from 0 to {NUM_ACTIONS - 1}, got {index!r}")

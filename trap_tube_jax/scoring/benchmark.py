@@ -20,10 +20,7 @@ from trap_tube_jax.observation import observe
 from trap_tube_jax.registry import TaskSet, make, task_set
 from trap_tube_jax.scoring.python_agent import PythonAgent
 from trap_tube_jax.scoring.scores import Scores
-from trap_tube_jax.scoring.suite import (
-    play_blocks,
-    score_of,
-)
+from trap_tube_jax.scoring.suite import play_blocks, score_of
 from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, fixed_tasks
 from trap_tube_jax.solver.search import solve_batch
 from trap_tube_jax.state import State, take
@@ -200,10 +197,10 @@ def _scores(
     if isinstance(sets, str) or not sets:
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
     check_integer("optimality", optimality, minimum=0)
-    made = []
-    entries = [task_set(name) for name in sets]
+    entries = list(dict.fromkeys(map(task_set, sets)))
     # Make all environments first, so that a bad argument fails before any play.
     envs = [make(entry.short, num_features=num_features) for entry in entries]
+    made = []
     for entry, env in zip(entries, envs, strict=True):
         states = fixed_tasks(env, entry.id, tasks)
         solved, length = play(entry, states)

@@ -28,6 +28,7 @@ def first_push(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
 
     start = jax.tree.map(jnp.asarray, task)
     _, displacement = jax.lax.scan(step, start, jnp.asarray(actions))
+    displacement = jnp.pad(displacement, ((1, 0), (0, 0)))  # row 0, in case there is no push
     return displacement[jnp.argmax(jnp.any(displacement != 0, axis=-1))]
 
 

@@ -19,7 +19,8 @@ class PythonAgent:
         """Looks up how to call the agent.
 
         Raises:
-          ValueError: the agent has no function to call, or expects other observations than uint8.
+          ValueError: the agent has no function to call, or expects observations of another dtype
+            than uint8.
         """
         act = getattr(agent, "predict", None) or getattr(agent, "act", None)
         if not callable(act):

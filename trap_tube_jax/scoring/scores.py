@@ -1,6 +1,6 @@
 """Scores of play on fixed tasks: the share solved, its interval, and optimality.
 
-Source: protocol.md, "What is reported".
+Source: protocol.md, "Reporting".
 """
 
 import dataclasses

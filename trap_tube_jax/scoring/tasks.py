@@ -26,7 +26,7 @@ Purpose = Literal["test", "validation", "confirmation"]
 # The version of the fixed tasks. Scores of different versions are not comparable.
 PROTOCOL = 1
 ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
-FEW_LAYOUTS = 5  # a set with at most as many layouts, colours aside, has few
+FEW_LAYOUTS = 5  # a set with at most this many layouts, colours aside, has few
 SETS_OF_FEW = tuple(x.short for x in PAPER_TASK_SETS if perceptual not in x.transfers)
 
 # "trap", and the first letters of "tube", "validation" and "confirmation". The first word of

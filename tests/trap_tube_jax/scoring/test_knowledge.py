@@ -37,6 +37,7 @@ RIGHT_OF_FOOD = [RIGHTWARD, DOWNWARD, DOWNWARD]
         ("..x......e..", [*RIGHT_OF_FOOD, LEFTWARD, *[RIGHTWARD] * 2], (0, -1), -1),
         ("..x......e..", LEFT_OF_FOOD, NONE, 0),  # the tool is beside the food
         ("..x......e..", [DOWNWARD], NONE, 0),  # the wall is below the food
+        ("..x......e..", np.zeros((0, 2), np.int32), NONE, 0),  # a task without a plan
         # The trap is next to the food, so that the tool can push it one way only.
         (".....x...e..", [*LEFT_OF_FOOD, RIGHTWARD], (0, 1), 0),
         (".....e...x..", [*RIGHT_OF_FOOD, LEFTWARD], (0, -1), 1),  # the exit lets it pass
