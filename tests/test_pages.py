@@ -89,6 +89,19 @@ def test_links_lead_to_files_and_headings_and_pictures_are_described(name):
             assert not anchor or anchor in anchors(path), target
 
 
+def test_sections_that_the_code_names_are_headings():
+    pages = {page.name: page for page in PAGES if page.name != "README.md"}
+    named = 0
+    for folder in ("trap_tube_jax", "agents", "benchmarks"):
+        for path in ROOT.joinpath(folder).rglob("*.py"):
+            text = " ".join(path.read_text().split())
+            for page, sections in re.findall(r'(\w+\.md), ((?:(?:, | and )?"[^"]+")+)', text):
+                headings = re.findall(r"^#+ (.+)$", pages[page].read_text(), re.MULTILINE)
+                assert set(re.findall('"([^"]+)"', sections)) <= set(headings), path
+                named += 1
+    assert named > 25
+
+
 def commands():
     """Returns the commands `python -m MODULE ...` of all pages, and where they stand."""
     found = {}

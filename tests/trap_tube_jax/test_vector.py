@@ -124,6 +124,13 @@ def test_a_batch_of_other_environments_or_chunks_is_refused():
     assert type(tt.VectorEnvironment(env, chunk_size=size).chunk_size) is int
 
 
+def test_raw_keys_draw_the_same_tasks():
+    vector = tt.VectorEnvironment(tt.make("p"))
+    keys = jax.random.split(jax.random.key(0), 3)
+    (_, typed), (_, raw) = map(vector.reset, (keys, jax.random.key_data(keys)))
+    assert_same(typed, raw)
+
+
 def test_a_batch_refuses_a_single_key_and_other_states():
     vector = tt.VectorEnvironment(tt.make("base"))
     keys = jax.random.split(jax.random.key(0), 3)
