@@ -3,7 +3,7 @@
 fast-base           the preset `fast` on base: the median of ten seeds
 icm-base            the preset `paper` on base, PPO + ICM
 best-pstsy          the preset `best` on {P, St, Sy}: the median of five seeds
-colors-p+pstsy      `best` with `object_colors` on {P} and {P, St, Sy}: one seed
+colors-p+pstsy      `best` with `object_colors` and less replay on {P} and {P, St, Sy}: one seed
 colors-p+psy+pstsy  the same on {P}, {P, Sy} and {P, St, Sy}, with episodes of 40 steps: one seed
 """
 

@@ -135,7 +135,7 @@ PRESETS_OF = {
     "fast-base": ("fast", {}),
     "icm-base": ("paper", {"stop_when_solved": 1.0}),
     "best-pstsy": ("best", {}),
-    "colors-p+pstsy": ("best", {"object_colors": True}),
+    "colors-p+pstsy": ("best", {"object_colors": True, "replay_fractions": (0.0625, 0.125, 0.25)}),
     "colors-p+psy+pstsy": (
         "best",
         {
