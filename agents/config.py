@@ -75,7 +75,7 @@ class Config:
       lr_decay_fraction: final fraction of training that decays the step size. It decays
         geometrically towards a fiftieth.
       adam_epsilon: Adam's epsilon.
-      max_gradient_norm: largest global norm of a gradient; a larger gradient is scaled down to it.
+      max_gradient_norm: largest global norm of a gradient. A larger gradient is scaled down to it.
       curiosity: intrinsic reward, by its registered name. README.md lists them.
       intrinsic_coef: weight of the intrinsic reward. The reward is normalised; with separate value
         heads its advantage is weighted instead.
@@ -98,8 +98,8 @@ class Config:
         their positions relative to agent and food.
       filters: channels of first and later convolutions; layer widths of `objects`.
       object_colors: `objects` also knows the colours of the base task.
-      hidden: units of the GRU, of the layer before it, and of the hidden layers of `icm`, `rnd` and
-        `noveld`.
+      hidden: units of the GRU. The layer before it, and hidden layers of `icm`, `rnd` and `noveld`,
+        have as many.
       embedding: units of embeddings of action and reward.
       recurrent: keeps the GRU's state between steps; otherwise the agent remembers only its
         previous action and reward.

@@ -292,7 +292,7 @@ def test_help_documents_every_setting(capsys, monkeypatch):
     text = " ".join(output.split())
     for field in dataclasses.fields(Config):
         assert f"--{field.name.replace('_', '-')}" in text
-    assert "global norm of clipped gradients" in text
+    assert "largest global norm of a gradient" in text
     assert "(fast, best or paper)" in text
 
 
