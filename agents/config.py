@@ -258,7 +258,7 @@ class Config:
 
     @property
     def has_schedule(self) -> bool:
-        """Whether `iterations` decides more than the end of training."""
+        """Tells whether `iterations` decides more than the end of training."""
         anneals = self.curiosity != "none" and bool(self.intrinsic_coef_init)
         anneals = anneals and self.intrinsic_anneal_fraction > 0
         return anneals or self.lr_decay_fraction > 0
