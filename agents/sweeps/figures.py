@@ -82,7 +82,7 @@ def draw_success(tested: Table, about: Mapping[str, Any]) -> Any:
     figure, axes = make_panels(titles, 5, 0.25 * len(names) + 0.4, about["title"])
     for axis, column in zip(axes, table, strict=True):
         for row, name in enumerate(algorithms):
-            values = table.loc[name, column].dropna().to_numpy()
+            values = table.loc[name, column].dropna()
             axis.barh(row, values.mean(), color=COLORS[5])
             axis.plot(values, [row] * len(values), "o", color=COLORS[0], alpha=0.7, markersize=4)
         for row, (means, sds) in enumerate(paper.values(), len(algorithms)):

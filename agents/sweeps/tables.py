@@ -34,7 +34,7 @@ NOTE = (
     "intervals of Welch's t-test, corrected by Holm's method for the comparisons in a row; * marks "
     "p < 0.05."
 )
-MEAN = "mean without base"  # over task sets, each counting the same
+MEAN = "mean without base"  # over the task sets of all algorithms, each counting the same
 NOTHING = "–"
 
 
@@ -80,16 +80,15 @@ def reported(results: Table) -> Table:
 def by_set(tested: Table) -> Table:
     """Returns percent solved by algorithm and seed, a column per set and one for their mean.
 
-    A seed that lacks a set of its algorithm has no mean.
+    The mean is over the sets that every algorithm has; a seed that lacks one of them has no mean.
     """
     table = tested.pivot(index=["algorithm", "seed"], columns="task_set", values="percent")
     order = [name for name in ALL_SETS if name in table]
     table = table[[*order, *(name for name in table if name not in order)]]
-    others = table.drop(columns="base", errors="ignore")
-    if len(others.columns):
-        known = others.notna()
-        is_complete = (known == known.groupby(level="algorithm").transform("any")).all(axis=1)
-        table[MEAN] = others.mean(axis=1).where(is_complete)
+    is_shared = table.notna().groupby(level="algorithm").any().all()
+    shared = [name for name in table if is_shared[name] and name != "base"]
+    if shared:
+        table[MEAN] = table[shared].mean(axis=1, skipna=False)
     return table.reindex(tested["algorithm"].unique(), level="algorithm")
 
 

@@ -90,7 +90,7 @@ def test_success_is_by_set_and_algorithm_with_the_papers_figures():
     assert table.loc["{Sy}"].tolist() == ["66.7 (3 of 5)", "–", "35.5 ± 10.9", "40.2 ± 16.9"]
     assert table.loc["{St}", "ppo+icm"] == "93.3 [64.6, 100.0]"
     assert table.loc["own"].tolist() == ["–", "100.0", "–", "–"]
-    assert table.loc[tables.MEAN, "ppo+icm"] == "73.3 [48.5, 98.2]"  # base does not count
+    assert table.loc[tables.MEAN].tolist() == ["60.0 [35.2, 84.8]", "10.0", "–", "–"]  # of {P}
     other = tables.tables(results, curves(), {**ABOUT, "train_set": "sy"})
     assert "PPO, paper" not in other["Test tasks solved, %"]
 
@@ -172,6 +172,18 @@ def test_a_seed_that_lacks_a_set_has_no_mean_and_leaves_the_bars_of_others():
     figure = figures.draw_success(tested, {**ABOUT, "train_set": "st"})
     widths = {axis.get_title(): axis.patches[0].get_width() for axis in figure.axes}
     assert widths == {"{P}": 55, "{St}": 90, tables.MEAN: 70}
+
+
+def test_the_mean_is_over_the_sets_of_all_algorithms_without_base():
+    given = [row for name in ("p", "st", "base") for row in rows("a", [5, 7], task_set=name)]
+    given += rows("a", [0, 2], task_set="mine")  # only its training set
+    given += [row for name in ("p", "st") for row in rows("b", [6], task_set=name)]
+    tested = tables.reported(pd.DataFrame(given))
+    table = tables.success_table(tested, with_paper=False)
+    assert table.loc[tables.MEAN].tolist() == ["60.0 [0.0, 100.0]", "60.0"]
+    figure = figures.draw_success(tested, ABOUT)  # with no bar where nothing is known
+    (mine,) = (axis for axis in figure.axes if axis.get_title() == "mine")
+    assert [mine.patches[0].get_width(), np.isnan(mine.patches[1].get_width())] == [10, True]
 
 
 def test_algorithms_of_one_seed_are_not_compared():
