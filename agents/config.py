@@ -219,10 +219,6 @@ class Config:
         """Returns all settings as plain values, for JSON."""
         return dataclasses.asdict(self)
 
-    def step_limit(self, name: str) -> int:
-        """Returns the step limit of training episodes on a task set."""
-        return tt.task_set(name).max_steps if self.max_steps is None else self.max_steps
-
     def validate(self, env: tt.Environment) -> None:
         """Raises ValueError unless these settings can be trained with in an environment."""
         for name in ("num_features", "max_steps"):
@@ -250,6 +246,11 @@ class Config:
                 f"iterations={self.iterations} of {self.gradient_steps} gradient steps are "
                 f"{self.iterations * self.gradient_steps:,}; allowed: at most {MAX_INT32:,}"
             )
+
+    @property
+    def step_limit(self) -> int:
+        """Step limit of training episodes."""
+        return self.max_steps or tt.task_set(self.env_id).max_steps
 
     @property
     def num_value_heads(self) -> int:

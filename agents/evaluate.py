@@ -65,10 +65,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     shortest = None
     if options.optimality:
         announce("Searching for shortest plans, up to a minute per 1,000 tasks")
-        shortest = {name: tt.solve_batch(drawn).length for name, drawn in evaluator.tasks.items()}
+        shortest = {
+            name: tt.solve_batch(drawn).length for name, drawn in evaluator.suite.tasks.items()
+        }
     announce(f"Playing {tasks:,} tasks of every set, up to a minute per 1,000")
     played = evaluator(policy.params)
-    scores = evaluator.scores(played, shortest)
+    scores = evaluator.suite.scores(played, shortest=shortest)
     title = f"{policy.name}, iteration {policy.iteration}, {options.purpose} tasks"
     print(title, scores, sep="\n\n", flush=True)
     if options.output is not None:
@@ -78,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"\nresults: {options.output}")
     if options.gif is not None:
         options.gif.parent.mkdir(parents=True, exist_ok=True)
-        shown = save_first_solved(options.gif, evaluator, played, train_set)
+        shown = save_first_solved(options.gif, evaluator.suite, played, train_set)
         print(f"\nsolved episode of {shown}: {options.gif}" if shown else "\nnothing is solved")
 
 

@@ -109,7 +109,7 @@ class ThroughGymnax:
 
         self._env, self._params = to_gymnax.make(config.env_id, flat_actions=False)
         self.observation_spec = self._env.observation_space()
-        self.max_steps = config.step_limit(config.env_id)
+        self.max_steps = config.step_limit
 
     def reset(self, key: jax.Array) -> tuple[tuple[tt.State, jax.Array], tt.TimeStep]:
         """Draws a task."""
@@ -199,7 +199,7 @@ def rejax_program(config: Config) -> Program:
     from trap_tube_jax.adapters import to_gymnax  # noqa: PLC0415
 
     env, params = to_gymnax.make(config.env_id)
-    num_steps = config.step_limit(config.env_id)
+    num_steps = config.step_limit
     ppo = rejax.PPO.create(
         env=env,
         env_params=params,

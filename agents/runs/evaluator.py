@@ -1,10 +1,9 @@
 """Greedy evaluation on the fixed tasks of the benchmark's protocol."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Self
 
 import jax
-import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation, evaluate
@@ -18,7 +17,7 @@ class Evaluator:
     """Greedy play on the tasks of several sets, compiled once for any parameters.
 
     Attributes:
-      suite: the tasks and their step limits.
+      suite: the tasks and their step limits; scores what was played.
     """
 
     def __init__(self, config: Config, suite: Suite):
@@ -43,25 +42,9 @@ class Evaluator:
         suite = Suite.of_sets(sets, num_tasks, num_features=config.num_features, purpose=purpose)
         return cls(config, suite)
 
-    @property
-    def tasks(self) -> Mapping[str, tt.State]:
-        """The states [B] of every set, by its short name."""
-        return self.suite.tasks
-
     def __call__(self, params: Params) -> dict[str, Evaluation]:
         """Plays all tasks; returns NumPy arrays by the names of the sets."""
         return self.suite.play(lambda states: self._play(params, states))
-
-    def scores(
-        self,
-        played: Mapping[str, Evaluation],
-        shortest: Mapping[str, np.ndarray] | None = None,
-    ) -> tt.Scores:
-        """Scores the outcomes that a call returned.
-
-        `shortest` has the lengths i32[B] of the shortest plans of every set, to compare with.
-        """
-        return self.suite.scores(played, shortest=shortest)
 
 
 def default_sets(config: Config) -> tuple[str, ...]:

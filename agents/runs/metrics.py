@@ -229,5 +229,5 @@ def is_last(row: Row, config: Config) -> bool:
     if 0 < config.stop_when_solved <= row["validation_success"]:
         return True
     limit = config.max_transitions
-    longest = config.episodes_per_iteration * config.step_limit(config.env_id)
+    longest = config.episodes_per_iteration * config.step_limit
     return limit is not None and row["transitions"] + longest > limit

@@ -165,7 +165,7 @@ class Progress:
         self.console.out("Playing test tasks, which takes up to a minute ...")
         evaluator = self.program.test
         played = evaluator(policy.params)
-        scores = evaluator.scores(played)
+        scores = evaluator.suite.scores(played)
         rows = evaluation_rows(scores, policy, "test")
         if options.report:
             self.folder.page.unlink(missing_ok=True)  # from now on it shows other scores
@@ -173,7 +173,7 @@ class Progress:
         self.console.out(scores)
         if options.report:  # last, since a figure may fail
             self.console.out("Drawing the report, which takes up to half a minute ...")
-            report.write(self.folder, self.run, evaluator, played)
+            report.write(self.folder, self.run, evaluator.suite, played)
         return scores
 
     def _check_evaluations(self) -> None:
@@ -224,7 +224,7 @@ class Progress:
 
     def _validate(self, evaluator: Evaluator) -> None:
         policy = self._policy()
-        scores = evaluator.scores(evaluator(policy.params))
+        scores = evaluator.suite.scores(evaluator(policy.params))
         append_rows(self.folder.evaluations, evaluation_rows(scores, policy, "validation"))
         self._keep_best()
 

@@ -21,7 +21,6 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.files import draft_of, write_bytes
 from agents.runs.drawing import COLORS, drawing, to_png
-from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import Table, read_rows
 from agents.runs.provenance import read_provenance
@@ -29,6 +28,7 @@ from agents.runs.run import Run
 from trap_tube_jax import solver
 from trap_tube_jax._version import __version__
 from trap_tube_jax.objects import DIRECTION_NAMES, NO_DIRECTION
+from trap_tube_jax.scoring import Suite
 from trap_tube_jax.scoring.tasks import label
 from trap_tube_jax.state import take
 
@@ -49,8 +49,8 @@ PANELS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 Played = Mapping[str, Evaluation]
 
 
-def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played) -> None:
-    """Writes curves, GIF and page of a run, from an evaluator and its outcomes `played`.
+def write(folder: RunFolder, run: Run, suite: Suite, played: Played) -> None:
+    """Writes curves, GIF and page of a run, from its test tasks and their outcomes `played`.
 
     A file that cannot be drawn costs one line of warning.
     """
@@ -60,21 +60,21 @@ def write(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played) -> 
         write_bytes(folder.curves, curves)
     with drawing(folder.animation):
         train_set = tt.task_set(run.config.env_id).short
-        save_first_solved(folder.animation, evaluator, played, train_set)
+        save_first_solved(folder.animation, suite, played, train_set)
     with drawing(folder.page):
-        write_bytes(folder.page, _page(folder, run, evaluator, played, curves).encode())
+        write_bytes(folder.page, _page(folder, run, suite, played, curves).encode())
 
 
-def _page(folder: RunFolder, run: Run, evaluator: Evaluator, played: Played, curves: bytes) -> str:
+def _page(folder: RunFolder, run: Run, suite: Suite, played: Played, curves: bytes) -> str:
     config = run.config
-    episodes = json.dumps(_episodes(evaluator, played))
+    episodes = json.dumps(_episodes(suite, played))
     return string.Template(PAGE.read_text(encoding="utf-8")).substitute(
         title=html.escape(folder.title),
         about=html.escape(
             f"{run.algorithm} on {tt.task_set(config.env_id).label}, seed {run.seed}. "
             f"{_origin(folder)}"
         ),
-        scores=_score_rows(evaluator.scores(played)),
+        scores=_score_rows(suite.scores(played)),
         curves=base64.b64encode(curves).decode(),
         settings=html.escape(json.dumps(run.to_dict(), indent=1)),
         episodes=episodes.replace("</", "<\\/"),
@@ -134,7 +134,7 @@ def draw_curves(rows: Table, title: str) -> bytes:
     return to_png(figure, dpi=100)
 
 
-def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: str) -> str | None:
+def save_first_solved(path: Path, suite: Suite, played: Played, prefer: str) -> str | None:
     """Writes a GIF of the first solved episode, if possible on the task set `prefer`.
 
     Returns the episode's task set, or None without writing a file if no episode is solved.
@@ -144,14 +144,14 @@ def save_first_solved(path: Path, evaluator: Evaluator, played: Played, prefer: 
         if np.any(outcome.solved):
             index = int(np.argmax(outcome.solved))
             actions = np.asarray(outcome.action[index, : outcome.length[index]])
-            state = take(evaluator.tasks[name], index)
+            state = take(suite.tasks[name], index)
             with draft_of(path) as draft:
                 tt.save_gif(tt.episode_frames(state, actions, GIF_CELL_SIZE), draft, fps=4)
             return name
     return None
 
 
-def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
+def _episodes(suite: Suite, played: Played) -> list[dict[str, Any]]:
     """Returns the first solved and the first unsolved episode of every set.
 
     An episode holds `title`, `solved`, the replays `agent` and `plan` (see `_replay`), and
@@ -163,7 +163,7 @@ def _episodes(evaluator: Evaluator, played: Played) -> list[dict[str, Any]]:
         for solved in (True, False)
         if len(found := np.flatnonzero(np.asarray(outcome.solved) == solved))
     ]
-    states = [take(evaluator.tasks[name], index) for name, index in shown]
+    states = [take(suite.tasks[name], index) for name, index in shown]
     plans = solver.solve_batch(jax.tree.map(lambda *x: np.stack(x), *states)).actions
     episodes = []
     for state, shortest, (name, index) in zip(states, plans, shown, strict=True):

@@ -88,7 +88,6 @@ def test_unknown_preset_lists_the_known():
 def test_the_step_limit_of_the_task_set_holds_unless_the_settings_give_one(fresh_task_sets):
     tt.register("Short-v0", (), max_steps=30)
     config = Config(env_id="Short-v0")
-    assert make_learner(config).env.max_steps == config.step_limit("Short-v0") == 30
-    assert config.step_limit("p") == 50
+    assert make_learner(config).env.max_steps == config.step_limit == 30
     longer = Config(env_id="Short-v0", max_steps=60)
-    assert make_learner(longer).env.max_steps == longer.step_limit("p") == 60
+    assert make_learner(longer).env.max_steps == longer.step_limit == 60

@@ -70,7 +70,7 @@ def test_stepping_scoring_and_evaluating_have_one_result(fresh_task_sets):
     tt.register("Near-v0", (near,), base=tt.base_state(1), max_steps=STEPS)
     policy = random_policy(4)
     evaluator = Evaluator.of_sets(policy.config, ["Near-v0"], 8)
-    (evaluated,) = evaluator.scores(evaluator(policy.params)).sets
+    (evaluated,) = evaluator.suite.scores(evaluator(policy.params)).sets
     solved, length, _ = drive(policy, evaluation_tasks("Near-v0", 8))
     scored = tt.score(policy, ["Near-v0"], tasks=8)["Near-v0"]
     assert 0 < scored.percent < 100

@@ -38,7 +38,7 @@ def test_custom_tasks_are_scored(played):
     evaluator, _, outcomes = played
     assert outcomes["mine"].solved.any()
     assert 1 in outcomes["mine"].length[outcomes["mine"].solved]
-    by_set = {score.set: score for score in evaluator.scores(outcomes).sets}
+    by_set = {score.set: score for score in evaluator.suite.scores(outcomes).sets}
     assert by_set["mine"].percent == 25 * outcomes["mine"].solved.sum()
     assert (by_set["mine"].interval is None, by_set["base"].interval is None) == (False, True)
 
@@ -54,7 +54,7 @@ def test_episodes_beyond_the_step_limit_of_their_set_are_not_solved(played):
     evaluator, params, outcomes = played
     mine = outcomes["mine"]
     limits = {"one": 1, "twelve": STEPS}
-    mine_twice: Any = dict.fromkeys(limits, evaluator.tasks["mine"])
+    mine_twice: Any = dict.fromkeys(limits, evaluator.suite.tasks["mine"])
     found = Evaluator(CONFIG, Suite(mine_twice, limits))(params)
     np.testing.assert_array_equal(found["twelve"].solved, mine.solved)
     np.testing.assert_array_equal(found["twelve"].length, mine.length)
@@ -73,13 +73,13 @@ def test_a_limit_of_training_does_not_change_the_protocol(fresh_task_sets):
 
 def test_tasks_have_the_feature_channels_that_the_policy_reads():
     evaluator = Evaluator.of_sets(Config(num_features=5), ["p"], 2)
-    assert evaluator.tasks["p"].palette.shape == (2, 8, 5)
+    assert evaluator.suite.tasks["p"].palette.shape == (2, 8, 5)
 
 
 def test_scores_use_the_papers_notation():
     outcome = Evaluation(jnp.array([True, False]), jnp.array([11, 50]), *[jnp.zeros((2, 50))] * 2)
     evaluator = Evaluator.of_sets(Config(), ["pst"], 2)
-    (score,) = evaluator.scores({"pst": outcome}, {"pst": np.array([11, 12])}).sets
+    (score,) = evaluator.suite.scores({"pst": outcome}, shortest={"pst": np.array([11, 12])}).sets
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
     assert score.mean_steps == 11
     assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)

@@ -68,7 +68,7 @@ def found(tmp_path_factory):
     folder.path.mkdir()
     append_rows(folder.metrics, [METRICS])
     evaluator = Evaluator.of_sets(CONFIG, tuple(ALL_SETS), 2)
-    report.write(folder, Run(CONFIG), evaluator, evaluator(random_params(CONFIG)))
+    report.write(folder, Run(CONFIG), evaluator.suite, evaluator(random_params(CONFIG)))
     frames = folder.path / "frames.html"
     frames.write_text(FRAMES.format(page=html.escape(folder.page.read_text())), encoding="utf-8")
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=90000")

@@ -30,22 +30,22 @@ CONFIG = small_config(curiosity="effects", stop_when_solved=0.0)
 
 @pytest.fixture(scope="module")
 def played():
-    """An untrained policy's evaluator on base, {P} and a set of known outcome, and outcomes."""
+    """An untrained policy's outcomes on tasks of base, {P} and a set of known outcome."""
     tasks = {name: evaluation_tasks(name, 2) for name in ("base", "p")}
     tasks["mine"] = food_next_to_agent(3)
     evaluator = Evaluator(CONFIG, Suite(tasks, dict.fromkeys(tasks, 6)))
-    return evaluator, evaluator(random_params(CONFIG))
+    return evaluator.suite, evaluator(random_params(CONFIG))
 
 
 @pytest.fixture(scope="module")
 def page(played, tmp_path_factory):
     """The folder of a report, and the episodes that the page's script reads."""
-    evaluator, outcome = played
+    suite, outcome = played
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "<mine>")
     folder.path.mkdir()
     append_rows(folder.metrics, [metrics_row(1), metrics_row(2, policy_loss=0.5)])
     note_provenance(folder.provenance, "cpu")
-    report.write(folder, Run(CONFIG), evaluator, outcome)
+    report.write(folder, Run(CONFIG), suite, outcome)
     start = '<script type="application/json" id="data">'
     end = "</script>"
     return folder, json.loads(folder.page.read_text().partition(start)[2].partition(end)[0])
@@ -137,14 +137,14 @@ def test_a_figure_that_fails_costs_a_line_and_leaves_the_other_files(
 
 
 def test_a_solved_episode_becomes_a_gif(played, tmp_path):
-    evaluator, outcome = played
+    suite, outcome = played
     path = tmp_path / "solved.gif"
-    assert report.save_first_solved(path, evaluator, outcome, prefer="base") == "mine"
+    assert report.save_first_solved(path, suite, outcome, prefer="base") == "mine"
     with Image.open(path) as picture:
         index = int(np.argmax(outcome["mine"].solved))
         assert getattr(picture, "n_frames", 1) == outcome["mine"].length[index] + 1
     unsolved = {"base": outcome["base"]}
-    assert report.save_first_solved(tmp_path / "x.gif", evaluator, unsolved, "base") is None
+    assert report.save_first_solved(tmp_path / "x.gif", suite, unsolved, "base") is None
     assert not (tmp_path / "x.gif").exists()
 
 
