@@ -19,6 +19,7 @@ import pytest
 from agents.sweeps import tables
 from helpers.jax_settings import HAS_DEFAULT_DRAWS
 from helpers.paths import ROOT
+from trap_tube_jax.scoring.scores import wilson_interval
 from trap_tube_jax.scoring.tasks import ALL_SETS, label
 
 PAGES = [*ROOT.glob("*.md")]
@@ -27,9 +28,9 @@ for folder in ("trap_tube_jax", "agents", "benchmarks", "tests"):
 NAMES = sorted(str(page.relative_to(ROOT)) for page in PAGES)
 PROTOCOL = "trap_tube_jax/protocol.md"
 RESULTS = ROOT / "benchmarks" / "results"
-BEST, CURIOSITIES, PAPER, TABLE_2 = (
+BEST, CURIOSITIES, PAPER, PROFILES, TABLE_2 = (
     f"benchmarks/results/{name}.md"
-    for name in ("best_preset", "curiosities", "paper_preset", "table_2")
+    for name in ("best_preset", "curiosities", "paper_preset", "profiles", "table_2")
 )
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -184,6 +185,12 @@ def percent_of(file: str) -> Any:
     return (100 * table["solved"] / table["tasks"])[list(ALL_SETS)]
 
 
+def first_pushes(file: str, policy: str) -> Any:
+    """Returns how many first pushes in {P} went to the exit, and how many away from it."""
+    rows = pd.read_csv(RESULTS / file).query("policy == @policy and part == 'first-push-p'")
+    return rows.set_index("level").loc[["to the exit", "away from it"], "tasks"]
+
+
 def random_actions() -> list[float]:
     scores = json.loads((RESULTS / "leaderboard" / "random.json").read_text())
     return [score["percent"] for score in scores["sets"]]
@@ -192,7 +199,8 @@ def random_actions() -> list[float]:
 def test_stated_results_are_those_of_the_records():
     """Each number of a table of solved tasks that has a record."""
     best, fast = (percent_solved(name) for name in ("exp2_best", "fast_base"))
-    rows = {"README.md": [], PROTOCOL: [], BEST: [], CURIOSITIES: [], PAPER: [], TABLE_2: []}
+    pages = ("README.md", PROTOCOL, BEST, CURIOSITIES, PAPER, PROFILES, TABLE_2)
+    rows: dict[str, list[str]] = {page: [] for page in pages}
     rows["README.md"].append(f"| preset `best` | {means(best[list(ALL_SETS[1:])])} |")
     for name, (paper, _) in tables.PAPER_SUCCESS.items():
         rows[PROTOCOL].append(f"{cells(paper)} | ≤ 25,600,000 |")
@@ -214,6 +222,14 @@ def test_stated_results_are_those_of_the_records():
     for sets, record, seed in (("p+pstsy", "colors", 202), ("p+psy+pstsy", "colors_short", 91)):
         solved = cells(percent_of(f"{record}/test.csv"))
         rows[PROTOCOL].append(f"| {sets} | {solved} | {steps(record)[seed]:,.0f} |")
+        policy = f"colors-{sets}"  # chosen on the first tasks, which the record holds
+        pushes = first_pushes("colors/first_pushes.csv", policy)
+        right, wrong = pushes - first_pushes(f"{record}/profile.csv", policy)
+        share = right / (right + wrong)
+        low, high = wilson_interval(right, right + wrong)
+        solved = percent_of(f"{record}/confirmation.csv")[["p", "pst", "psy", "pstsy"]]
+        shown = f"{100 * share:.1f} [{100 * low:.0f}, {100 * high:.0f}] | {cells(solved)}"
+        rows[PROFILES].append(f"| `{policy}` | {sets} | {shown} |")
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])
