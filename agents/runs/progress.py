@@ -189,7 +189,8 @@ class Progress:
                 raise ValueError(
                     f"{self.stored.evaluations} has the evaluation of iteration {done} on "
                     f"{row['task_set']}, which is after the newest checkpoint and would not be "
-                    "made again; continue with the same --sets and --evaluate-every as before"
+                    "made again; continue with the same --sets, --evaluate-every and length of "
+                    "training as before"
                 )
 
     def _row(self, metrics: Metrics, seconds: float) -> Row:
