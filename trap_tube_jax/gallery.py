@@ -117,8 +117,10 @@ def _distinct_tasks(entry: TaskSet, tasks: int, seed: int) -> np.ndarray:
     keys = jax.random.split(jax.random.key(seed), DRAWS)
     states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
     pictures = np.asarray(jax.vmap(lambda state: render(state, CELL_SIZE))(states))
-    _, first = np.unique(pictures.reshape(DRAWS, -1), axis=0, return_index=True)
-    shown = np.sort(first)[:tasks]
+    first: dict[bytes, int] = {}
+    for index, picture in enumerate(pictures):
+        first.setdefault(picture.tobytes(), index)
+    shown = np.array(list(first.values())[:tasks])
     rows, columns = used_window(take(states, shown), CELL_SIZE)
     return pictures[shown, rows, columns]
 
