@@ -191,6 +191,14 @@ def first_pushes(file: str, policy: str) -> Any:
     return rows.set_index("level").loc[["to the exit", "away from it"], "tasks"]
 
 
+def knowledge(pushes: Any, record: str) -> str:
+    """Returns the share of right first pushes, with its interval, and the percent solved."""
+    shares = [pushes.iloc[0] / pushes.sum(), *wilson_interval(pushes.iloc[0], pushes.sum())]
+    right, low, high = (100 * share for share in shares)
+    solved = percent_of(f"{record}/confirmation.csv")[["p", "pst", "psy", "pstsy"]]
+    return f"{right:.1f} [{low:.0f}, {high:.0f}] | {cells(solved)}"
+
+
 def random_actions() -> list[float]:
     scores = json.loads((RESULTS / "leaderboard" / "random.json").read_text())
     return [score["percent"] for score in scores["sets"]]
@@ -224,12 +232,11 @@ def test_stated_results_are_those_of_the_records():
         rows[PROTOCOL].append(f"| {sets} | {solved} | {steps(record)[seed]:,.0f} |")
         policy = f"colors-{sets}"  # chosen on the first tasks, which the record holds
         pushes = first_pushes("colors/first_pushes.csv", policy)
-        right, wrong = pushes - first_pushes(f"{record}/profile.csv", policy)
-        share = right / (right + wrong)
-        low, high = wilson_interval(right, right + wrong)
-        solved = percent_of(f"{record}/confirmation.csv")[["p", "pst", "psy", "pstsy"]]
-        shown = f"{100 * share:.1f} [{100 * low:.0f}, {100 * high:.0f}] | {cells(solved)}"
-        rows[PROFILES].append(f"| `{policy}` | {sets} | {shown} |")
+        pushes -= first_pushes(f"{record}/profile.csv", policy)
+        rows[PROFILES].append(f"| `{policy}` | {sets} | {knowledge(pushes, record)} |")
+    pushes = first_pushes("colors_seed_300/first_pushes.csv", "runs/colours/best-seed300")
+    found = knowledge(pushes, "colors_seed_300")
+    rows[PROFILES].append(f"| the same, seed 300 | p+pstsy | {found} |")
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])
