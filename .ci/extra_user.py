@@ -10,7 +10,7 @@ import subprocess
 import sys
 
 ADAPTERS = "trap_tube_jax/adapters/README.md"
-PDOC = ["-m", "pdoc", "--docformat", "google", "-o", "reference"]
+PDOC = ["-W", "error", "-m", "pdoc", "--docformat", "google", "-o", "reference"]
 SOLVE = ["-m", "trap_tube_jax.solver"]
 TRAIN = ["-m", "agents.train", "--iterations", "1", "--episodes-per-iteration", "64"]
 SWEEP_ON_A_CLUSTER = """

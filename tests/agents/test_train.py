@@ -35,13 +35,14 @@ from helpers.tiny_policy import random_policy
 from trap_tube_jax import interruptions
 
 ITERATIONS = 30
+LENGTH = ["--iterations", ITERATIONS, "--sets", "base", "p"]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The folder and the output of a run that nothing interrupts."""
     out = tmp_path_factory.mktemp("runs")
-    arguments = [*options(), "--iterations", ITERATIONS, "--name", "whole", "--out", out]
+    arguments = [*options(), *LENGTH, "--name", "whole", "--out", out]
     return out / "whole", run("agents.train", *arguments)
 
 
@@ -60,8 +61,8 @@ def test_a_run_leaves_its_results_and_says_where(whole):
 def test_killed_runs_continue_to_the_same_bits(whole, tmp_path):
     """Killed at a moment that differs every time; it can be evaluated before it goes on."""
     path = tmp_path / "killed"
-    arguments = ["--name", "killed", "--out", tmp_path, "--checkpoint-every", 1]
-    process = start("agents.train", *options(), "--iterations", ITERATIONS, *arguments)
+    arguments = ["--name", "killed", "--out", tmp_path, "--checkpoint-every", 1, "--no-report"]
+    process = start("agents.train", *options(), *LENGTH, *arguments)
     read_iterations(process, 3)
     process.kill()
     process.communicate()

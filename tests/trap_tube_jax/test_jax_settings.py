@@ -35,7 +35,7 @@ STEPS = 4
 def play() -> Any:
     """Episodes of two steps, alone and in a batch, and a picture; keys as their bits."""
     env = tt.Environment(TRANSFERS, base=BASE, max_steps=2)
-    alone = tt.EpisodeStatistics(tt.AutoReset(env))
+    alone = tt.EpisodeStatistics(tt.AutoReset(tt.make("p", max_steps=2)))
     batch = tt.EpisodeStatistics(tt.VectorEnvironment(env, chunk_size=2))
     keys = jax.random.split(jax.random.key(5), 3)
     record: list[Any] = []

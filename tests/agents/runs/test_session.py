@@ -322,7 +322,8 @@ def test_a_run_that_is_killed_before_its_first_iteration_begins_again(tmp_path, 
     assert len(untimed(tmp_path / "x")) == 1
 
 
-def test_a_run_trains_on_a_mixture_and_goes_on(tmp_path):
+def test_a_run_on_a_mixture_is_scored_on_it_and_goes_on(tmp_path, monkeypatch):
+    replace_training(monkeypatch, count_up)
     for iterations in (1, 2):
         run = Run(small_config(iterations=iterations, env_id="base+{P}"))
         train_run(tmp_path / "x", run, RunOptions(sets=("base+p",), test_tasks=3, report=False))
