@@ -58,6 +58,7 @@ def test_a_run_leaves_its_results_and_says_where(whole):
     assert machine["commit"] == commit()
 
 
+@pytest.mark.slow
 def test_killed_runs_continue_to_the_same_bits(whole, tmp_path):
     """Killed at a moment that differs every time; it can be evaluated before it goes on."""
     path = tmp_path / "killed"

@@ -110,6 +110,7 @@ def test_rewards_advantages_and_losses_equal_the_learners():
     )
 
 
+@pytest.mark.slow
 def test_an_update_lowers_the_loss():
     plain = plain_ppo.PlainPPO(CONFIG)
     state = jax.jit(plain.init)(jax.random.key(0))

@@ -32,7 +32,7 @@ def paths(**settings: Any) -> tuple[Learner, Learner]:
 @pytest.mark.parametrize(
     ("curiosity", "encoder"),
     [
-        ("icm", "paper"),
+        pytest.param("icm", "paper", marks=pytest.mark.slow),
         ("effects", "objects"),
         pytest.param("rnd", "paper", marks=pytest.mark.slow),
     ],

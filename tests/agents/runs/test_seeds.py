@@ -36,6 +36,7 @@ def assert_same_rows(found, wanted):
         pd.testing.assert_frame_equal(ours.astype(float), theirs.astype(float), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_seeds_of_one_program_equal_seeds_alone(alone, tmp_path):
     runs = {tmp_path / f"{seed}": small_run(3, seed=seed) for seed in SEEDS}
     assert all(train_runs(runs, TRACKED).values())
