@@ -139,7 +139,7 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
         lines.append(f"Report with curves and episodes to step through: {folder.page}")
     if config.stop_when_solved and len(solving):
         more = "python -m agents.train --preset best"
-        lines.append(f"Next, learn all transfers in 40 minutes: {more}")
+        lines.append(f"Next, learn all transfers in 40 to 130 minutes: {more}")
     elif not config.has_schedule and config.max_transitions is None:
         again = resume_command(folder, run)
         lines.append(f"Train longer: {again} --iterations {2 * config.iterations}")

@@ -215,7 +215,7 @@ GRIDS = {
     "best": Grid(
         Options(preset="best", env="pstsy", seeds=5),
         BEST_RUN,
-        about="preset best on {P, St, Sy}; 40 minutes per seed",
+        about="preset best on {P, St, Sy}; 40 to 130 minutes per seed",
     ),
     "curiosities": Grid(
         Options(preset="best", env="pstsy", seeds=5),

@@ -17,53 +17,63 @@ from trap_tube_jax.controls import CONTROLS, LayoutDraw
 OPTIMISED = False  # few steps
 KEY = jax.random.key(0)
 GRADED = (tt.graded_perceptual(0.5), tt.graded_structural(0.25))
-ENVIRONMENTS: dict[str, Any] = {
-    "base": tt.make("base"),
-    "shorter": tt.make("base", max_steps=5),
-    "own base": tt.Environment(base=EASY),
-    "more features": tt.make("base", num_features=4),
-    "paper": tt.make("pstsy"),
-    "graded": tt.Environment(GRADED),
-    "control": tt.make("two-traps"),
-    "auto-reset": tt.AutoReset(tt.make("pstsy")),
-    "statistics": tt.EpisodeStatistics(tt.AutoReset(tt.make("pstsy"))),
-    "vector": tt.VectorEnvironment(tt.make("pstsy")),
-    "small chunks": tt.VectorEnvironment(tt.make("pstsy"), chunk_size=2),
-    "next step": NextStepVectorEnvironment(tt.make("pstsy")),
-}
-TRANSFERS: list[tt.Transfer] = [
-    *(tt.perceptual, tt.structural, tt.symbolic, *GRADED, tt.graded_perceptual(0.75)),
-    *(tt.compose(), tt.compose(tt.perceptual, *GRADED), tt.compose(tt.structural)),
-    *map(LayoutDraw, CONTROLS),
-]
-STATES = [
-    *(
-        ENVIRONMENTS[name].reset(jax.random.clone(KEY))
-        for name in ("own base", "more features", "statistics")
-    ),
-    tt.VectorEnvironment(tt.make("base")).reset(jax.random.split(jax.random.clone(KEY), 2)),
-]
-TASK_SETS = (*tt.PAPER_TASK_SETS, *tt.CONTROL_TASK_SETS)
-PUBLIC = [*ENVIRONMENTS.values(), *TRANSFERS, *TASK_SETS, *itertools.chain(*STATES)]
-PUBLIC += [tt.base_state(), tt.make("base").observation_spec]
-PUBLIC += [tt.solve(EASY), tt.solve(tt.base_state()), tt.distances(EASY)]
+
+
+@pytest.fixture(scope="module")
+def environments() -> dict[str, Any]:
+    return {
+        "base": tt.make("base"),
+        "shorter": tt.make("base", max_steps=5),
+        "own base": tt.Environment(base=EASY),
+        "more features": tt.make("base", num_features=4),
+        "paper": tt.make("pstsy"),
+        "graded": tt.Environment(GRADED),
+        "control": tt.make("two-traps"),
+        "auto-reset": tt.AutoReset(tt.make("pstsy")),
+        "statistics": tt.EpisodeStatistics(tt.AutoReset(tt.make("pstsy"))),
+        "vector": tt.VectorEnvironment(tt.make("pstsy")),
+        "small chunks": tt.VectorEnvironment(tt.make("pstsy"), chunk_size=2),
+        "next step": NextStepVectorEnvironment(tt.make("pstsy")),
+    }
+
+
+@pytest.fixture(scope="module")
+def public(environments: dict[str, Any]) -> list[Any]:
+    """Returns public objects, of which no two are equal."""
+    transfers: list[tt.Transfer] = [
+        *(tt.perceptual, tt.structural, tt.symbolic, *GRADED, tt.graded_perceptual(0.75)),
+        *(tt.compose(), tt.compose(tt.perceptual, *GRADED), tt.compose(tt.structural)),
+        *map(LayoutDraw, CONTROLS),
+    ]
+    states = [
+        *(
+            jax.jit(environments[name].reset)(jax.random.clone(KEY))
+            for name in ("own base", "more features", "statistics")
+        ),
+        jax.jit(environments["vector"].reset)(jax.random.split(jax.random.clone(KEY), 2)),
+    ]
+    return [
+        *(*environments.values(), *transfers, *tt.PAPER_TASK_SETS, *tt.CONTROL_TASK_SETS),
+        *(*itertools.chain(*states), tt.base_state(), environments["base"].observation_spec),
+        *(tt.solve(EASY), tt.solve(tt.base_state()), tt.distances(EASY)),
+    ]
 
 
 @pytest.mark.parametrize("duplicate", COPIES.values(), ids=COPIES)
-def test_a_copy_equals_its_original_and_nothing_else(duplicate):
-    copies = [duplicate(value) for value in PUBLIC]
-    for (i, value), (j, other) in itertools.product(enumerate(PUBLIC), enumerate(copies)):
+def test_a_copy_equals_its_original_and_nothing_else(public, duplicate):
+    copies = [duplicate(value) for value in public]
+    for (i, value), (j, other) in itertools.product(enumerate(public), enumerate(copies)):
         assert (value == other) == (i == j), (value, other)
-    assert [hash(value) for value in PUBLIC] == [hash(value) for value in copies]
+    assert [hash(value) for value in public] == [hash(value) for value in copies]
 
 
 @pytest.mark.parametrize("name", ["graded", "control", "statistics"])
-def test_an_unpickled_environment_plays_the_same(name):
+def test_an_unpickled_environment_plays_the_same(environments, name):
     def play(env: Any) -> Any:
         state, first = jax.jit(env.reset)(jax.random.clone(KEY))
         return [first, *jax.jit(env.step)(state, np.zeros(2, np.int32))]
 
-    env = ENVIRONMENTS[name]
+    env = environments[name]
     assert play(pickle.loads(pickle.dumps(env))) == play(env)
 
 

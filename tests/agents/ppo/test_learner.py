@@ -51,9 +51,6 @@ def recolour(key: jax.Array, state: tt.State) -> tt.State:
     return state.replace(palette=state.palette.at[AGENT].set(color))
 
 
-RECOLOURED = tt.Environment((tt.perceptual, recolour))
-
-
 def recolour_rarely(key: jax.Array, state: tt.State) -> tt.State:
     """Draws a colour for the agent in 5 % of tasks."""
     chosen = jax.random.bernoulli(key, 0.05)
@@ -61,8 +58,7 @@ def recolour_rarely(key: jax.Array, state: tt.State) -> tt.State:
     return state.replace(palette=state.palette.at[AGENT].set(color))
 
 
-RARELY_RECOLOURED = tt.Environment((recolour_rarely,))
-MIXED_WITH_RECOLOURED = tt.Environment((Mixture((tt.perceptual, tt.compose(recolour)), (1, 1)),))
+MIXED = Mixture((tt.perceptual, tt.compose(recolour)), (1, 1))
 SOLVED = np.array([True, False, False, False, False, True, True, True])  # 4 new, 2, 2
 
 
@@ -355,12 +351,15 @@ def test_an_iteration_can_be_compiled_for_a_gpu(preset, monkeypatch):
         ({}, tt.make("base", num_features=4), "num_features is 4, the config's 3"),
         ({"encoder": "objects"}, OWN_COLORS, "know agent and food by the colours"),
         ({"align_to_food": True}, OWN_COLORS, "know agent and food by the colours"),
-        ({"align_to_food": True}, RECOLOURED, "know agent and food by the colours"),
-        ({"align_to_food": True}, RARELY_RECOLOURED, "know agent and food by the colours"),
-        ({"align_to_food": True}, MIXED_WITH_RECOLOURED, "know agent and food by the colours"),
         ({"iterations": 2**20, "epochs": 10_000, "max_steps": 1}, None, "gradient steps"),
     ],
 )
 def test_settings_that_cannot_be_trained_with_are_refused(settings, env, message):
     with pytest.raises(ValueError, match=message):
         make_learner(Config(**settings), env)
+
+
+@pytest.mark.parametrize("transfers", [(tt.perceptual, recolour), (recolour_rarely,), (MIXED,)])
+def test_a_turned_board_needs_the_colours_of_agent_and_food(transfers):
+    with pytest.raises(ValueError, match="know agent and food by the colours"):
+        make_learner(Config(align_to_food=True), tt.Environment(transfers))
