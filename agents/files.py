@@ -34,6 +34,13 @@ def is_file(path: Path) -> bool:
     return False
 
 
+def check_folder(path: Path) -> None:
+    """Raises ValueError if a folder cannot be made since a file has its name, or a parent's."""
+    existing = next(found for found in (path, *path.parents, Path()) if found.exists())
+    if not existing.is_dir():
+        raise ValueError(f"{existing} is not a folder; give another path")
+
+
 def check_file(path: Path) -> None:
     """Raises FileNotFoundError or ValueError unless a path names a regular file."""
     if not is_file(path):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from agents.arrays import SUFFIX
 from agents.command_line import option, parse
-from agents.files import is_file, read_json, write_bytes, write_json
+from agents.files import check_folder, is_file, read_json, write_bytes, write_json
 from agents.profiles import plots
 from agents.profiles.measure import (
     Table,
@@ -87,7 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _check_free(folder: Path, iterations: dict[str, int]) -> None:
-    """Raises ValueError if a folder holds a run, or the profile of other policies."""
+    """Raises ValueError if a folder holds a run, the profile of other policies, or is a file."""
+    check_folder(folder)
     origin = folder / "provenance.json"
     found = read_json(origin) if is_file(origin) else {"iterations": iterations}
     if not isinstance(found, dict) or found.get("iterations") != iterations:

@@ -10,6 +10,7 @@ from agents.command_line import parse_all
 from agents.files import lock_folder
 from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder
+from agents.runs.metrics import read_rows
 from agents.sweeps import records
 from agents.sweeps.grids import Grid
 from agents.sweeps.launcher import launch
@@ -43,7 +44,7 @@ def main(
                 records.check(root)
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 failed = launch(runs, run_options, executor, console, options.seeds_per_program)
-                if any(RunFolder(path).metrics.exists() for path in runs):
+                if any(len(read_rows(RunFolder(path).metrics)) for path in runs):
                     records.collect(root, f"{program} {shlex.join(arguments)}".strip(), runs)
                     console.out(records.write_tables(root))
                     files = [root / "results.csv", root / "table.md", *records.draw(root)]

@@ -12,8 +12,8 @@ import pandas as pd
 
 import agents
 import trap_tube_jax as tt
-from agents.runs.drawing import COLORS
-from agents.sweeps import figures, tables
+from agents.runs.drawing import COLORS, make_panels
+from agents.sweeps import tables
 from trap_tube_jax.checks import expand
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.figures import default_style
@@ -131,7 +131,7 @@ def draw_table_2() -> Figure:
         "PPO, published": tables.PAPER_SUCCESS["PPO, paper"],
     }
     titles = [label(name) for name in tables.PAPER_SETS]
-    figure, axes = figures.make_panels(titles, 4, 1.75, "Trained on {P, St, Sy}")
+    figure, axes = make_panels(titles, 4, 1.75, "Trained on {P, St, Sy}")
     for index, (axis, name) in enumerate(zip(axes, tables.PAPER_SETS, strict=True)):
         for agent, table in seeds.items():
             _draw_seeds(axis, ROWS.index(agent), table[name].to_numpy())

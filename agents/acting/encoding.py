@@ -58,12 +58,9 @@ class Encoding:
           f32[B, T + 1, F] for the policy and f32[B, T + 1, F'] for the curiosity.
         """
         observation = episodes.observations()
-        batch = observation.shape[:2]
-        features = self.encode(params, jax.lax.collapse(observation, 0, 2))
-        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), features)
-
-    def encode(self, params: Params, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Encodes observations u8[M, 12, 12, N] for the policy and for the curiosity."""
-        # Evaluations have neither a curiosity nor its parameters.
-        curious = self.encode_for_curiosity(params.get("curiosity", {}), observation)
-        return self.agent.encode(params, observation), curious
+        rows = jax.lax.collapse(observation, 0, 2)
+        features = (
+            self.agent.encode(params, rows),
+            self.encode_for_curiosity(params["curiosity"], rows),
+        )
+        return jax.tree.map(lambda x: x.reshape(*observation.shape[:2], -1), features)

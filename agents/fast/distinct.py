@@ -16,10 +16,10 @@ from agents.acting.encoding import Encoding
 from agents.acting.episodes import Episodes, with_cells
 from agents.fast import chunks, windows
 from agents.fast.convolution import convolutions_as_products
-from agents.fast.grouping import Groups, group, group_rows, slots
+from agents.fast.grouping import group, group_rows, slots
 from agents.networks.agent import Params
 from agents.networks.encoder import Encoder
-from trap_tube_jax.positions import NUM_POSITIONS, layout_rows, position_id
+from trap_tube_jax.positions import layout_rows, position_id
 from trap_tube_jax.state import take
 
 CACHE_BITS = 20  # hash bits; `Cache` has a slot for each value
@@ -100,12 +100,13 @@ class FastEncoding(Encoding):
         """Encodes all observations of episodes; see `Encoding`."""
         position = episodes.position_ids()
         layout_id = group_rows(layout_rows(episodes.layout)).group_id
-        groups = _group_observations(layout_id, position)
+        layout_id = jnp.broadcast_to(layout_id[:, None], position.shape)
+        groups = group(layout_id.reshape(-1), position.reshape(-1))
         episode, time = jnp.divmod(groups.representative, position.shape[1])
         layout = take(episodes.layout, episode)
         states = jax.vmap(with_cells)(layout, episodes.cells[episode, time])
         rows = jax.vmap(tt.observe)(states)
-        read = {name: params[name] for name in ("encoder", "curiosity") if name in params}
+        read = {name: params[name] for name in ("encoder", "curiosity")}
         features = chunks.map_rows(self._encode_rows, self.chunk, read, rows, groups.total)
         group_id = groups.group_id.reshape(position.shape)
         return jax.tree.map(lambda x: x[group_id], features)
@@ -114,7 +115,7 @@ class FastEncoding(Encoding):
         """Encodes rows for policy and curiosity; see `chunks.map_rows`."""
         features, remembered = self._encode_policy_rows(params, rows, remembered)
         with convolutions_as_products():
-            curious = self.encode_for_curiosity(params.get("curiosity", {}), rows)
+            curious = self.encode_for_curiosity(params["curiosity"], rows)
         return (features, curious), remembered
 
     def _encode_policy_rows(self, params: Params, rows: jax.Array, remembered: Any) -> Any:
@@ -123,13 +124,3 @@ class FastEncoding(Encoding):
             return windows.encode_rows(params["encoder"], rows, remembered)
         with convolutions_as_products():
             return self.agent.encode(params, rows), None
-
-
-def _group_observations(layout_id: jax.Array, position: jax.Array) -> Groups:
-    """Groups equal observations of episodes with layouts i32[B] at positions i32[B, T + 1]."""
-    batch = len(layout_id)
-    if batch * NUM_POSITIONS < 2**32:  # one key sorts faster than two
-        first = layout_id.astype(jnp.uint32)[:, None] * jnp.uint32(NUM_POSITIONS)
-        return group((first + position.astype(jnp.uint32)).reshape(-1))
-    layout_id = jnp.broadcast_to(layout_id[:, None], position.shape)
-    return group(layout_id.reshape(-1), position.reshape(-1))

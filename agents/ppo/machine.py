@@ -1,7 +1,7 @@
 """Chooses the encoding, the unrolling of the GRU and the seeds per program for the machine.
 
-A CPU gains from encoding each distinct observation once, in small chunks. That slows a GPU or TPU:
-such a chunk is dozens of small kernels, launched by a loop whose length depends on the data. An
+A CPU gains from encoding each distinct observation once, in small chunks. Such chunks slow a GPU
+or TPU: each is dozens of small kernels, launched by a loop whose length depends on the data. An
 accelerator gains from unrolling the GRU instead, whose kernels are small, too.
 """
 

@@ -10,8 +10,7 @@ import trap_tube_jax as tt
 from agents.files import write_bytes
 from agents.profiles.measure import Table
 from agents.profiles.tasks import control_layouts
-from agents.runs.drawing import COLORS, drawing, to_png
-from agents.sweeps.figures import WIDTH, make_panels
+from agents.runs.drawing import COLORS, WIDTH, drawing, make_panels, to_png
 from trap_tube_jax.rendering import used_window
 from trap_tube_jax.scoring.scores import wilson_interval
 

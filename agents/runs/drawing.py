@@ -2,8 +2,9 @@
 
 import contextlib
 import io
+import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from trap_tube_jax.figures import default_style
 
 # Okabe and Ito's palette, which is colour-blind safe.
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
+
+WIDTH = 8.3  # inches, as in a page 830 pixels wide
 
 
 @contextlib.contextmanager
@@ -29,3 +32,24 @@ def to_png(figure: Any, dpi: int) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=dpi)
     return file.getvalue()
+
+
+def make_panels(
+    titles: Sequence[str], columns: int, height: float, title: str = "", *, sharex: bool = True
+) -> tuple[Any, list[Any]]:
+    """Makes a figure of Matplotlib with titled panels, in rows of `height` inches."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
+
+    rows = math.ceil(len(titles) / columns)
+    figure = Figure(figsize=(WIDTH, rows * height + 0.9), layout="constrained")
+    figure.suptitle(title, parse_math=False)
+    grid = figure.subplots(rows, columns, sharex=sharex, sharey=True, squeeze=False)
+    axes = list(grid.flat)
+    for axis in axes[len(titles) :]:
+        axis.remove()
+    for axis, name in zip(axes, titles, strict=False):
+        axis.set_title(name, fontsize=10)
+        axis.grid(alpha=0.3)
+        axis.set_axisbelow(True)
+        axis.tick_params(labelbottom=True)
+    return figure, axes[: len(titles)]

@@ -5,7 +5,7 @@ import difflib
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from agents.files import Plain, is_file, naming_file, read_json, write_json
+from agents.files import Plain, check_folder, is_file, naming_file, read_json, write_json
 from agents.runs.run import DeviceOptions, Run, RunOptions, check_algorithm
 from trap_tube_jax._version import __version__
 from trap_tube_jax.checks import check_seed, check_stored_name, expand
@@ -109,8 +109,9 @@ class RunFolder:
 
 
 def check_output(path: Path) -> None:
-    """Raises ValueError if a file to be written is one of a run's files, or no regular file."""
+    """Raises ValueError if a file cannot be written, or would replace a run's file."""
     is_file(path)
+    check_folder(path.parent)
     if run := run_of(path):
         raise ValueError(f"{path} is a file of the run {run.path}; give another path")
 

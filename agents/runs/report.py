@@ -5,6 +5,7 @@ through next to the shortest plan.
 """
 
 import base64
+import fnmatch
 import html
 import io
 import json
@@ -36,13 +37,14 @@ CELL_SIZE = 16  # pixels of the page's boards
 GIF_CELL_SIZE = 24
 PAGE = Path(__file__).with_name("report.html")  # its $names are filled in
 
-PANELS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    ("tasks solved", "fraction", ("success", "validation_success")),
-    ("episode length", "steps", ("episode_length",)),
-    ("intrinsic reward", "mean per step, unscaled", ("intrinsic_reward",)),
-    ("losses", "weighted", ("policy_loss", "value_loss", "forward_loss", "inverse_loss")),
-    ("entropy", "nats, grasp + move", ("entropy",)),
-    ("gradient norm", "before clipping", ("gradient_norm",)),
+# Titles, units and metrics of the panels of learning curves; a star stands for any text.
+PANELS: tuple[tuple[str, str, str], ...] = (
+    ("tasks solved", "fraction", "*success"),
+    ("episode length", "steps", "episode_length"),
+    ("intrinsic reward", "mean per step, unscaled", "intrinsic_reward"),
+    ("losses", "weighted", "*_loss"),
+    ("entropy", "nats, grasp + move", "entropy"),
+    ("gradient norm", "before clipping", "gradient_norm"),
 )
 
 # Outcomes of greedy play by task set.
@@ -116,8 +118,8 @@ def draw_curves(rows: Table, title: str) -> bytes:
 
     panels = [
         (name, unit, found)
-        for name, unit, metrics in PANELS
-        if (found := [metric for metric in metrics if metric in rows])
+        for name, unit, pattern in PANELS
+        if (found := fnmatch.filter(rows.columns, pattern))
     ]
     figure = Figure(figsize=(10, 2.6 * math.ceil(len(panels) / 2) + 0.5), layout="constrained")
     figure.suptitle(title, parse_math=False)

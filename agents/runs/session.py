@@ -45,7 +45,7 @@ def train_run(
     Args:
       path: the run's folder, made if missing; `~` is the home folder.
       run: what to train; of a stored run only `EXTENDABLE` settings may differ.
-      options: options for carrying the run out.
+      options: options for carrying the run out; by default a stored run's own.
       console: where progress is shown; nowhere if None.
       stop: training stops as on SIGTERM once it returns True. Unlike a signal, it reaches threads
         and other hosts.
@@ -66,6 +66,8 @@ def train_run(
       1
     """
     path = Path(path)
+    if options is None and RunFolder(path).config.is_file():
+        options = RunFolder(path).read()[1]
     consoles = {} if console is None else {path: console}
     outcome = train_runs({path: run}, options, consoles=consoles, stop=stop)[path]
     if isinstance(outcome, Exception):

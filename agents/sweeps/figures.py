@@ -1,17 +1,15 @@
 """Figures of a grid's results, after the paper's figures of experiments 1 and 2."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from agents.files import write_bytes
-from agents.runs.drawing import COLORS, drawing, to_png
+from agents.runs.drawing import COLORS, drawing, make_panels, to_png
 from agents.runs.metrics import Table
 from agents.sweeps import tables
 from trap_tube_jax.scoring.tasks import label
 
-WIDTH = 8.3  # inches, as in a page 830 pixels wide
 DPI = 150
 UNITS = {"transitions": "environment steps", "episodes": "episodes"}
 MAX_RANGES = 3  # of seeds that a panel can show
@@ -119,27 +117,6 @@ def draw_differences(compared: Table, about: Mapping[str, Any]) -> Any:
     what = f"test tasks solved, points above {compared['reference'].iloc[0]}"
     figure.supxlabel(f"{what}: mean and 95 % interval", fontsize=10)
     return figure
-
-
-def make_panels(
-    titles: Sequence[str], columns: int, height: float, title: str = "", *, sharex: bool = True
-) -> tuple[Any, list[Any]]:
-    """Makes a figure of Matplotlib with titled panels, in rows of `height` inches."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  slow to import
-
-    rows = math.ceil(len(titles) / columns)
-    figure = Figure(figsize=(WIDTH, rows * height + 0.9), layout="constrained")
-    figure.suptitle(title, parse_math=False)
-    grid = figure.subplots(rows, columns, sharex=sharex, sharey=True, squeeze=False)
-    axes = list(grid.flat)
-    for axis in axes[len(titles) :]:
-        axis.remove()
-    for axis, name in zip(axes, titles, strict=False):
-        axis.set_title(name, fontsize=10)
-        axis.grid(alpha=0.3)
-        axis.set_axisbelow(True)
-        axis.tick_params(labelbottom=True)
-    return figure, axes[: len(titles)]
 
 
 def _draw_seeds(axis: Any, rows: Table, color: str, name: str, has_range: bool) -> str:

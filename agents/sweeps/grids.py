@@ -108,6 +108,8 @@ class Grid:
         given = dict(map(_parse, options.settings))
         if len(given) < len(options.settings):
             raise ValueError(f"give a setting only once, got {' '.join(options.settings)}")
+        if options.env != self.options.env and "env_id" in given:
+            raise ValueError("give --env or --settings env_id=..., not both")
         fixed = sorted({name for point in self.points.values() for name in point} & given.keys())
         if fixed:
             raise ValueError(f"the grid's points decide {', '.join(fixed)}; use --only")
@@ -225,7 +227,7 @@ GRIDS = {
             "ppo": {"curiosity": "none"},
             **{f"ppo+{name}": {"curiosity": name} for name in CURIOSITIES},
         },
-        "preset best with every intrinsic reward; 5 hours on one core",
+        "preset best with every intrinsic reward; 7 hours on one core",
     ),
     "ingredients": Grid(
         Options(preset="best", env="pstsy", seeds=8, seed=10),

@@ -65,6 +65,13 @@ def test_neither_a_run_nor_a_profile_of_other_policies_is_replaced(origin, tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["provenance.json"]
 
 
+def test_a_profile_inside_a_file_is_refused_before_it_plays(tmp_path, capsys):
+    (tmp_path / "x").touch()
+    for output in (tmp_path / "x", tmp_path / "x" / "y" / "z"):
+        message = refused(capsys, profile.main, "fast-base", "--output", output)
+        assert f"{tmp_path / 'x'} is not a folder; give another path" in message
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -208,6 +208,10 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
         (["--seeds-per-program", "0"], "seeds_per_program must be an integer"),
         (["--name", "a/b"], "folder's name"),
         (["--env", "nowhere"], "nowhere"),
+        (
+            ["--env", "sy", "--settings", "env_id=p"],
+            "give --env or --settings env_id=..., not both",
+        ),
     ],
 )
 def test_impossible_sweeps_are_refused_and_leave_nothing(
@@ -246,6 +250,26 @@ def test_named_grids_are_known_and_their_points_are_fixed(capsys):
             assert grid.about in listed
     message = refused(capsys, experiments.main, "exp1", "--settings", "curiosity=rnd")
     assert "the grid's points decide curiosity; use --only" in message
+
+
+def test_a_grid_whose_runs_fail_before_their_first_iteration_has_no_table(
+    capsys, monkeypatch, tmp_path
+):
+    """Not even after a killed worker left the file of metrics without rows."""
+    root = tmp_path / "x"
+
+    def fail(runs, *_):
+        for path in runs:
+            path.mkdir(parents=True)
+            RunFolder(path).metrics.touch()
+        return list(runs)
+
+    monkeypatch.setattr(sweep, "launch", fail)
+    with pytest.raises(SystemExit) as exit_info:
+        sweep.main(["--processes", "1", "--out", str(tmp_path), "--name", "x"])
+    assert exit_info.value.code == 1
+    assert not list(root.glob("*.csv"))
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_a_grid_from_its_command_to_its_table(capsys, tmp_path):

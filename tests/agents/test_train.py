@@ -245,6 +245,9 @@ def test_an_evaluation_replaces_no_file_of_a_run(option, name, capsys, whole):
 def test_an_evaluation_refuses_to_write_to_a_folder_before_it_plays(option, capsys, tmp_path):
     message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path)
     assert f"{tmp_path} is not a regular file" in message
+    (tmp_path / "x").touch()
+    message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path / "x" / "y" / "z.csv")
+    assert f"{tmp_path / 'x'} is not a folder" in message
 
 
 def test_an_unknown_training_set_is_refused_before_anything_is_played(capsys, tmp_path):

@@ -121,13 +121,3 @@ def test_every_distinct_observation_is_encoded_once(bits, monkeypatch):
         count = distinct_observations(episodes)
         assert len(counts) == episodes.cells.shape[1]
         assert sum(counts) == count if bits else sum(counts) > count
-
-
-def test_observations_are_grouped_alike_by_one_key_and_by_two(monkeypatch):
-    layout_id = jnp.array([0, 1, 1, 2])
-    position = jnp.array([[5, 5, 7], [5, 7, 7], [7, 5, 5], [5, 5, 5]])
-    one = distinct._group_observations(layout_id, position)
-    monkeypatch.setattr(distinct, "NUM_POSITIONS", 2**31)
-    two = distinct._group_observations(layout_id, position)
-    np.testing.assert_array_equal(one.group_id, [0, 0, 1, 2, 3, 3, 3, 2, 2, 4, 4, 4])
-    jax.tree.map(np.testing.assert_array_equal, one, two)

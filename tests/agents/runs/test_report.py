@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
 from PIL import Image
 from rich.console import Console
 
@@ -105,6 +106,16 @@ def test_curves_have_as_many_panels_where_nothing_is_solved():
         with Image.open(io.BytesIO(content)) as picture:
             heights.append(picture.height)
     assert heights[0] == heights[1]
+
+
+def test_curves_show_every_loss(monkeypatch):
+    shown = []
+    monkeypatch.setattr(Axes, "plot", lambda *_, label, **__: shown.append(label))
+    monkeypatch.setattr(Axes, "legend", lambda *_, **__: None)
+    rows = pd.DataFrame([metrics_row(1, loss=1.0, policy_loss=0.0, motion_loss=0.0, my_loss=0.0)])
+    report.draw_curves(rows, "")
+    losses = [label for label in shown if "loss" in label]
+    assert losses == ["policy loss", "motion loss", "my loss"]
 
 
 def test_figures_are_drawn_under_matplotlibs_defaults(played, tmp_path, monkeypatch, capsys):

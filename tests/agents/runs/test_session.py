@@ -141,6 +141,12 @@ def test_a_finished_run_returns_at_once(copy, monkeypatch):
     assert "to play other tasks, run python -m agents.evaluate" in output.getvalue()
 
 
+def test_a_stored_run_keeps_its_options_unless_others_are_given(copy):
+    before = (copy / "config.json").read_bytes()
+    assert train_run(copy, small_run()) is None
+    assert (copy / "config.json").read_bytes() == before
+
+
 def test_the_best_policy_is_never_newer_than_the_last_checkpoint(tmp_path, monkeypatch):
     """Of a run that is killed between two checkpoints."""
     monkeypatch.setattr(progress, "append_rows", lambda path, rows: _raise_at(3, path, rows))
