@@ -116,6 +116,19 @@ def test_make_vec_makes_the_compiled_batch():
     assert TrapTubeVectorEnv.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
 
 
+def test_an_environment_that_is_given_stays_as_it_is():
+    env = tt.Environment(max_steps=6)
+    assert TrapTubeVectorEnv(env, 2, max_episode_steps=3).env.max_steps == 3
+    assert env.max_steps == 6
+
+
+def test_final_observations_may_be_changed():
+    env = tt.Environment(max_steps=1)
+    envs = TrapTubeVectorEnv(env, 2, autoreset_mode="SameStep")
+    envs.reset(seed=0)
+    assert envs.step([[0, 0], [0, 0]])[4]["final_obs"][0].flags.writeable
+
+
 @pytest.mark.parametrize(("limit", "length"), [(3, 3), (9, 5)])
 def test_the_smaller_of_two_step_limits_holds_for_one_and_many(limit, length):
     options = {"max_steps": 5, "max_episode_steps": limit}

@@ -42,6 +42,14 @@ def test_spaces_and_parameters_are_gymnaxs(easy):
     assert hash(params) == hash(params.replace(max_steps_in_episode=6))
     assert isinstance(params, gymnax.EnvParams)
     assert to_gymnax.make("TrapTube-v0")[1].max_steps_in_episode == 50
+    env, params = to_gymnax.make("p", num_features=5)
+    assert env.observation_space(params).shape == (12, 12, 5)
+
+
+def test_an_environment_that_is_given_stays_as_it_is():
+    env = tt.Environment(max_steps=6)
+    to_gymnax.make(env)
+    assert env.max_steps == 6
 
 
 def test_five_values_equal_those_of_the_wrapped_environment(easy, easy_env):

@@ -60,6 +60,7 @@ def test_a_solved_episode_ends_once():
     step = jax.jit(batch.step)
     state, _ = jax.jit(batch.reset)(jax.random.split(jax.random.key(0), 2))
     # The first moves onto the food, and ignores its next action.
+    pictures = []
     for actions, expected in (
         ([[0, 3], [0, 1]], ([1, 0], [True, False], [0, 1])),
         ([[0, 3], [0, 0]], ([0, 0], [False, False], [1, 1])),
@@ -67,6 +68,10 @@ def test_a_solved_episode_ends_once():
         state, timestep = step(state, np.array(actions))
         found = (timestep.reward, timestep.terminated, timestep.discount)
         assert tuple(x.tolist() for x in found) == expected
+        pictures.append((timestep.observation[0], timestep.final_observation[0]))
+    (last, _), (first, final) = pictures
+    np.testing.assert_array_equal(final, last)
+    assert (first != last).any()
     assert state.episodes.inner.agent.tolist() == [[0, 0], [0, 0]]
     assert state.episodes.inner.time.tolist() == [0, 2]
 

@@ -13,6 +13,7 @@ from helpers.easy_task import EASY
 from helpers.refusal import refused
 from trap_tube_jax import gallery
 from trap_tube_jax.objects import OBJECT_NAMES
+from trap_tube_jax.solver import pictures
 from trap_tube_jax.solver.pictures import save_distances, save_histogram
 
 
@@ -36,6 +37,14 @@ def test_the_gallery_shows_distinct_tasks_of_the_seed_and_a_legend(tmp_path, mon
     assert [axis.get_title() for axis in legend] == list(OBJECT_NAMES)
     corners = [np.asarray(axis.images[0].get_array())[5, 1] for axis in legend]
     np.testing.assert_array_equal(corners, tt.base_palette())
+
+
+def test_a_histogram_shows_shares_of_all_tasks(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(pictures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    save_histogram({"one of four has no plan": np.array([4, -1, 8, 8])}, tmp_path / "x.png")
+    heights = [bar.get_height() for bar in drawn[0].axes[0].patches]
+    assert {steps: height for steps, height in enumerate(heights) if height} == {4: 25, 8: 50}
 
 
 def test_pictures_are_drawn_under_matplotlibs_defaults(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 import trap_tube_jax as tt
 from helpers.refusal import assert_refused
 from helpers.trees import assert_same
+from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.vector import draw_movable, draw_static
 
 OPTIMISED = False  # few environments, few steps
@@ -140,5 +141,6 @@ def test_a_batch_refuses_a_single_key_and_other_states():
     state, timestep = jax.eval_shape(vector.reset, keys)
     actions = np.zeros((3, 2), np.int32)
     words = ["VectorState, got AutoResetTimeStep", "return (state, timestep)"]
-    assert_refused(words, vector.step, timestep, actions)
+    for batch in (vector, NextStepVectorEnvironment(tt.make("base"))):
+        assert_refused(words, batch.step, timestep, actions)
     assert_refused(["integer[3, 2]", "int32[2, 2]"], vector.step, state, actions[:2])

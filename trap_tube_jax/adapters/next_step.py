@@ -21,8 +21,8 @@ class NextStepVectorEnvironment(VectorEnvironment):
     @names_adapters
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes actions i32[B, 2], or starts the next episode where one has ended."""
-        was_done = state.episodes.inner.done
         stepped, timestep, final_picture = self._advance(state, actions)
+        was_done = state.episodes.inner.done
         state, picture = self._reset_done(was_done, stepped, final_picture)
         timestep = timestep.replace(
             terminated=timestep.terminated & ~was_done,

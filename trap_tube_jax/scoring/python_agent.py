@@ -19,8 +19,8 @@ class PythonAgent:
         """Looks up how to call the agent.
 
         Raises:
-          ValueError: the agent has no function to call, or expects observations of another dtype
-            than uint8.
+          ValueError: the agent has no function to call, or one that needs other arguments, or it
+            expects observations of another dtype than uint8.
         """
         act = getattr(agent, "predict", None) or getattr(agent, "act", None)
         if not callable(act):
@@ -32,6 +32,14 @@ class PythonAgent:
         self._act: Any = act
         self._takes_state = "state" in known
         self._options = {"deterministic": True} if "deterministic" in known else {}
+        given = {"state": None, **self._options} if self._takes_state else self._options
+        try:
+            inspect.signature(act).bind(None, **given)
+        except TypeError as error:
+            raise ValueError(
+                f"an agent acts by predict(observation) or act(observation): {error}; "
+                "for a policy with act(observation, carry, key) use tt.score"
+            ) from None
         self._reset = getattr(agent, "reset", None)
         self._normalize = _normalization(agent)
 

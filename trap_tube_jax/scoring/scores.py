@@ -34,7 +34,7 @@ class Optimality:
     ) -> "Optimality":
         """Compares outcomes bool[B] and lengths i32[B] with shortest plans i32[B], -1 for none."""
         solvable = (shortest >= 0) & (shortest <= max_steps)
-        ratio = shortest[solved] / np.maximum(length[solved], 1)
+        ratio = shortest[solved] / length[solved]
         return cls(
             solvable=int(solvable.sum()),
             percent_of_solvable=100 * float(solved[solvable].mean()) if solvable.any() else None,

@@ -62,6 +62,14 @@ def test_a_policy_reaches_the_evaluators_outcomes(seed, settings):
         assert not np.array_equal(actions, drive(plain, tasks)[2])
 
 
+def test_a_board_stays_turned_as_at_the_first_observation():
+    policy = random_policy(align_to_food=True)
+    boards = jax.vmap(tt.observe)(food_next_to_agent())
+    _, carry = policy.act(boards, policy.initial(4))
+    _, after = policy.act(boards[::-1], carry)
+    assert_same(after.symmetry, carry.symmetry)
+
+
 def test_stepping_scoring_and_evaluating_have_one_result(fresh_task_sets):
     def near(key, state):
         cells = jnp.array(FOOD_CELLS, jnp.int32)

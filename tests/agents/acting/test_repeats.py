@@ -22,6 +22,17 @@ def test_an_action_is_avoided_where_it_was_taken_until_it_is_forgotten():
         assert action[0].tolist() == best, gap
 
 
+def test_the_penalty_grows_with_every_repeat():
+    logits = jnp.log(jnp.array([[[0.97, 0.01, 0.01, 0.01], [0.9, 0.05, 0.03, 0.02]]]))
+    repeats = Repeats.empty(1)
+    taken = []
+    for _ in range(4):
+        board = jnp.zeros((1, 12, 12, 1), jnp.uint8)
+        action, repeats = repeats.choose(ActionDistribution(logits), 1.0, board)
+        taken.append(action[0].tolist())
+    assert taken == [[0, 0]] * 3 + [[0, 1]]
+
+
 def test_under_a_high_penalty_greedy_play_repeats_no_action():
     env = tt.Environment(base=tt.base_state(1), max_steps=STEPS)
     step = jax.jit(jax.vmap(env.step))

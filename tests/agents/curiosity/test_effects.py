@@ -120,3 +120,7 @@ def test_an_effect_pays_the_inverse_of_its_kinds_rate(by_hand):
     _, memory = curiosity.reward({}, jnp.array([0.5, 0.1, 0.2]), experience)
     expected = [0.75 * 0.5 + 0.25 / 3, 0.75 * 0.1 + 0.25 / 2, 0.75 * 0.2]
     np.testing.assert_allclose(memory, expected, rtol=1e-6)
+    # The rarest effects pay 10,000.
+    still = Effects(Config(reward_ema_decay=1.0))
+    pay, _ = still.reward({}, jnp.array([2e-3, 1e-5, 0.2]), experience)
+    np.testing.assert_allclose(pay, [[1e4, 0, 500, 1e4], [0, 1e4 + 500, 0, 0]], rtol=1e-5)

@@ -126,3 +126,17 @@ def test_colors_of_objects_matter_only_if_asked_for(knows_colors):
     boards = jnp.stack([tt.observe(state), tt.observe(recolored)])
     features = jax.jit(agent.encode)(jax.jit(agent.init)(jax.random.key(0)), boards)
     assert bool((features[0] != features[1]).any()) == knows_colors
+
+
+def test_features_are_a_maximum_and_a_share_over_objects_that_exist(monkeypatch):
+    """However many rows there are: here all but one of a board of ground alone are empty."""
+    agent = Agent(Config(encoder="objects", filters=(16, 8), hidden=4))
+    params = jax.jit(agent.init)(jax.random.key(0))
+    board = jnp.zeros((1, 12, 12, 3), jnp.uint8)
+    found = agent.encode(params, board)
+    rows = object_encoder.MAX_OBJECTS
+    monkeypatch.setattr(object_encoder, "MAX_OBJECTS", 1)
+    alone = agent.encode(params, board)
+    assert (alone[:, :8] < 0).any(), "a maximum with the empty rows would be 0"
+    np.testing.assert_allclose(found[:, :8], alone[:, :8], rtol=1e-5)
+    np.testing.assert_allclose(rows * found[:, 8:], alone[:, 8:], rtol=1e-5)

@@ -1,5 +1,7 @@
 """Advantages of two streams of rewards, normalised apart."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +22,11 @@ def test_the_intrinsic_weight_decays_geometrically():
     np.testing.assert_allclose(found, [8, 4, 2, 1, 0.5, 0.5], rtol=1e-6)
     constant = advantages.intrinsic_coef_schedule(Config(intrinsic_coef=0.7))
     assert [constant(iteration) for iteration in (0, 9)] == [0.7, 0.7]
+    # 0.29 * 100 is 28.999... in floating point.
+    weight = advantages.intrinsic_coef_schedule(
+        dataclasses.replace(config, intrinsic_anneal_fraction=0.29, iterations=100)
+    )
+    np.testing.assert_allclose([weight(28), weight(29)], [0.5 * 16 ** (1 / 29), 0.5], rtol=1e-5)
 
 
 def plain_advantages(reward, discount, value, mask, lambda_):

@@ -51,3 +51,13 @@ def test_tasks_are_drawn_from_all_of_their_list_and_no_other(replay):
     drawn = bits(replay.draw(jax.random.key(1), (300, 200)))
     for part, keys in zip((drawn[:300], drawn[300:]), bits(replay.keys), strict=True):
         assert {tuple(key) for key in part} == {tuple(key) for key in keys}
+
+
+def test_a_list_takes_over_the_failures_of_the_list_before():
+    replay = TaskReplay.untried(jax.random.key(0), 3, CAPACITY)
+    keys = jax.random.split(jax.random.key(1), 10)
+    played = bits(keys)
+    after = replay.remember(keys, jnp.ones(10, bool), (1, 2, 3))
+    assert after.next.tolist() == [4, 1, 2]
+    for row, part in zip(bits(after.keys), (played[:4], played[4:5], played[5:7]), strict=True):
+        np.testing.assert_array_equal(row[: len(part)], part)

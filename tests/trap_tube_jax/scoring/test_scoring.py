@@ -327,6 +327,8 @@ def test_an_agent_that_cannot_be_scored_is_refused(near):
     assert_refused(words, tt.score_gymnasium, Single(None), ["base", "near"], num_features=5)
     assert_refused(["initial(batch)", "object has no initial"], tt.score, object())
     assert_refused(["predict(observation)", "neither"], tt.score_gymnasium, object())
+    words = ["predict(observation)", "missing a required argument: 'carry'", "use tt.score"]
+    assert_refused(words, tt.score_gymnasium, Rightward(), ["near"])
 
     class Floats(Single):
         observation_space = np.zeros(3, np.float32)  # all that is looked at is the dtype
@@ -386,6 +388,23 @@ class Broken:
         return jnp.zeros((len(observation), 2), jnp.int32), carry * jnp.nan
 
 
+class BrokenOnce:
+    """A policy whose second carry holds NaN, and whose second action may be given."""
+
+    def __init__(self, second=(0, 0)):
+        self.second = second
+
+    def initial(self, batch):
+        return jnp.int32(0), jnp.zeros(batch)
+
+    def act(self, observation, carry, key):
+        time, memory = carry
+        is_second = time == 1
+        action = jnp.where(is_second, jnp.array(self.second), jnp.zeros(2, jnp.int32))
+        memory = jnp.where(is_second & (self.second == (0, 0)), jnp.nan, jnp.zeros_like(memory))
+        return jnp.broadcast_to(action, (len(observation), 2)), (time + 1, memory)
+
+
 @pytest.mark.parametrize("tasks", [2, 3])
 def test_act_must_return_a_carry(near, tasks):
     policy: Any = Random()
@@ -405,8 +424,11 @@ def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     words = ["an invalid action", "(grasp, move)", "0 to 3"]
     for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):
         assert_refused(words, tt.score, action, ["near"], 20)
-    with pytest.raises(ValueError, match="act returned a carry with NaN on near"):
-        tt.score(Broken(), ["near"], 20)
+    for policy in (Broken(), BrokenOnce()):
+        with pytest.raises(ValueError, match="act returned a carry with NaN on near"):
+            tt.score(policy, ["near"], 20)
+    tt.register("Far-v0", (), base=near.base.replace(food=jnp.array([9, 9])), max_steps=2)
+    assert_refused(words, tt.score, BrokenOnce([9, 9]), ["Far-v0"], 20)  # in the last step
     floats = Constant(np.array([0, 3], np.float32))
     assert_refused(["must hold integers", "float32[20, 2]"], tt.score, floats, ["near"], 20)
     flat: Any = Random()

@@ -242,8 +242,10 @@ def test_distances_equal_brute_forces_and_count_down_along_the_plan(workshop, wo
     np.testing.assert_array_equal(found.to_goal[tuple(index)], to_goal)
     assert np.count_nonzero(found.to_goal >= 0) == np.count_nonzero(to_goal >= 0)
     plan = tt.solve(workshop)
-    left = [int(found.lookup(state)) for state in replay(workshop, plan)]
-    assert left == list(range(plan.length, -1, -1))
+    states = replay(workshop, plan)
+    left = list(range(plan.length, -1, -1))
+    assert [int(found.lookup(state)) for state in states] == left
+    assert found.lookup(jax.tree.map(lambda *x: np.stack(x), *states)).tolist() == left
 
 
 def test_finished_and_invalid_states_are_refused():
