@@ -22,7 +22,7 @@ from trap_tube_jax.state import concatenate_trees, take
 
 LONG = 100  # steps, twice the paper's limit
 FAILED = [f"failed: {name}" for name in SUBGOALS]
-COUNTS = ["tasks", "solved", "solved_100", "direct", *FAILED]
+COUNTS = ["tasks", "solved", "solved_100", "direct", "choices", "right", *FAILED]
 MEANS = ["steps", "plan", "optimality"]
 
 _first_push = jax.jit(jax.vmap(first_push))
@@ -48,8 +48,9 @@ def profile(
     Returns:
       One row per policy, part and level. Columns: the number of tasks, of tasks solved within 50
       and within 100 steps (`solved`, `solved_100`), and of controls solved directly (`direct`, see
-      `episodes`); mean steps and mean optimality (shortest plan / steps) of the tasks solved
-      within 50; mean length of the shortest plan of the solvable tasks; and, for each of
+      `episodes`); the number of first pushes that chose between exit and trap, and of right ones
+      (`choices`, `right`); mean steps and mean optimality (shortest plan / steps) of the tasks
+      solved within 50; mean length of the shortest plan of the solvable tasks; and, for each of
       `FAILED`, the number of failed episodes that reached this subgoal last.
 
     Raises:
@@ -93,12 +94,15 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
     planned = np.asarray(_first_push(tasks, plan.actions))
     steps = np.where(solved, played.length, np.nan)
     subgoals = last_subgoals(tasks, actions, cells)
+    choice = _choice_of_exit(tasks, _first_push(tasks, actions))
     columns = {
         "tasks": 1,
         "solved": solved,
         "solved_100": solved_100,
         "direct": (solved & is_direct(cells, planned)).astype(float),
-        "choice": _choice_of_exit(tasks, _first_push(tasks, actions)),
+        "choice": choice,
+        "choices": choice != 0,
+        "right": choice == 1,
         "steps": steps,
         "plan": np.where(plan.solvable, plan.length, np.nan),
         "optimality": plan.length / steps,

@@ -25,6 +25,8 @@ from agents.profiles.measure import (
 from agents.profiles.subgoals import Cells
 from agents.profiles.tasks import first_pushes, plan_lengths
 from trap_tube_jax.controls import food_outside, trap_turned
+from trap_tube_jax.objects import EXIT, NUM_OBJECTS, TRAP
+from trap_tube_jax.scoring.tasks import fixed_tasks
 
 UP, DOWN, LEFT, RIGHT = range(4)
 
@@ -99,6 +101,26 @@ def test_solutions_within_50_and_100_steps_and_direct_ones(state, actions, lengt
     )
     row = episodes(task, played, tt.solve_batch(task)).iloc[0]
     assert tuple(row[["solved", "solved_100", "direct"]]) == expected
+
+
+def test_first_pushes_by_shortest_plans_are_right_unless_trap_and_exit_are_exchanged():
+    task = jax.device_get(fixed_tasks(tt.make("p"), "profile", 16))
+    plan = tt.solve_batch(task)
+    played = Evaluation(
+        solved=jnp.ones(16, bool),
+        length=jnp.asarray(plan.length),
+        action=jnp.asarray(plan.actions),
+        value=jnp.zeros(plan.actions.shape[:2]),
+    )
+    code = np.arange(NUM_OBJECTS)
+    code[[TRAP, EXIT]] = [EXIT, TRAP]
+    exchanged = task.replace(board=code[task.board].astype(np.uint8))
+    choices = {
+        name: episodes(states, played, plan)[["choices", "right"]].sum().tolist()
+        for name, states in (("task", task), ("exchanged", exchanged))
+    }
+    assert choices["task"][0] == choices["task"][1] > 0
+    assert choices["exchanged"][0] > choices["exchanged"][1] == 0
 
 
 def test_a_push_against_the_planned_direction_is_not_direct():
