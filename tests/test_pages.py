@@ -191,6 +191,17 @@ def first_pushes(file: str, policy: str) -> Any:
     return rows.set_index("level").loc[["to the exit", "away from it"], "tasks"]
 
 
+def tried() -> list[str]:
+    """Returns the rows of the settings tried: right first pushes in {P}, and percent solved."""
+    rows = []
+    for policy, own in pd.read_csv(RESULTS / "colors" / "tried.csv").groupby("policy"):
+        pushes = first_pushes("colors/tried.csv", policy)
+        counts = own.groupby("part")[["solved", "tasks"]].sum()
+        solved = 100 * counts["solved"] / counts["tasks"]
+        rows.append(f"{policy} | {cells([100 * pushes.iloc[0] / pushes.sum(), *solved])}")
+    return rows
+
+
 def knowledge(pushes: Any, record: str) -> str:
     """Returns the share of right first pushes, with its interval, and the percent solved."""
     shares = [pushes.iloc[0] / pushes.sum(), *wilson_interval(pushes.iloc[0], pushes.sum())]
@@ -238,6 +249,7 @@ def test_stated_results_are_those_of_the_records():
         record = f"colors_seed_{seed}"
         pushes = first_pushes(f"{record}/first_pushes.csv", f"runs/colours/best-seed{seed}")
         rows[PROFILES].append(f"| the same, seed {seed} | p+pstsy | {knowledge(pushes, record)} |")
+    rows[PROFILES] += tried()
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])
