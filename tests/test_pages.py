@@ -194,7 +194,8 @@ def first_pushes(file: str, policy: str) -> Any:
 def tried() -> list[str]:
     """Returns the rows of the settings tried: right first pushes in {P}, and percent solved."""
     rows = []
-    for policy, own in pd.read_csv(RESULTS / "colors" / "tried.csv").groupby("policy"):
+    table: Any = pd.read_csv(RESULTS / "colors" / "tried.csv")
+    for policy, own in table.groupby("policy"):
         pushes = first_pushes("colors/tried.csv", policy)
         counts = own.groupby("part")[["solved", "tasks"]].sum()
         solved = 100 * counts["solved"] / counts["tasks"]

@@ -26,7 +26,8 @@ def test_the_intrinsic_weight_decays_geometrically():
     weight = advantages.intrinsic_coef_schedule(
         dataclasses.replace(config, intrinsic_anneal_fraction=0.29, iterations=100)
     )
-    np.testing.assert_allclose([weight(28), weight(29)], [0.5 * 16 ** (1 / 29), 0.5], rtol=1e-5)
+    found = np.array([weight(28), weight(29)])
+    np.testing.assert_allclose(found, [0.5 * 16 ** (1 / 29), 0.5], rtol=1e-5)
 
 
 def plain_advantages(reward, discount, value, mask, lambda_):

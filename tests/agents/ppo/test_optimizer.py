@@ -35,8 +35,8 @@ def test_the_cooldown_takes_the_nearest_number_of_steps():
     """0.29 * 100 is 28.999... in floating point."""
     config = Config(iterations=25, epochs=4, minibatch_size=1024, lr_decay_fraction=0.29)
     schedule = learning_rate_schedule(config)
-    found = [float(schedule(jnp.int32(count))) / config.learning_rate for count in (71, 72)]
-    np.testing.assert_allclose(found, [1, 50 ** (-1 / 29)], rtol=1e-5)
+    found = np.array([schedule(jnp.int32(count)) for count in (71, 72)])
+    np.testing.assert_allclose(found / config.learning_rate, [1, 50 ** (-1 / 29)], rtol=1e-5)
 
 
 def test_adam_takes_the_learning_rate_schedule_of_its_count():
