@@ -195,9 +195,9 @@ def tried() -> list[str]:
     """Returns the rows of the settings tried: right first pushes in {P}, and percent solved."""
     rows = []
     table: Any = pd.read_csv(RESULTS / "colors" / "tried.csv")
-    for policy, own in table.groupby("policy"):
+    for policy, group in table.groupby("policy"):
         pushes = first_pushes("colors/tried.csv", policy)
-        counts = own.groupby("part")[["solved", "tasks"]].sum()
+        counts = group.groupby("part")[["solved", "tasks"]].sum()
         solved = 100 * counts["solved"] / counts["tasks"]
         rows.append(f"{policy} | {cells([100 * pushes.iloc[0] / pushes.sum(), *solved])}")
     return rows

@@ -33,8 +33,8 @@ class Policy(struct.PyTreeNode):
     """A trained network that acts from observations alone.
 
     Start every episode with `initial`. The previous-reward input is always 0, since only the last
-    step pays. A policy is a pytree whose leaves are its parameters; to run several
-    checkpoints by one compiled program, `replace` only `params`.
+    step pays. A policy is a pytree whose leaves are its parameters; to run several checkpoints
+    by one compiled program, `replace` only `params`.
 
     Attributes:
       name: the policy's name in tables.

@@ -45,7 +45,7 @@ def train_run(
     Args:
       path: the run's folder, made if missing; `~` is the home folder.
       run: what to train; of a stored run only `EXTENDABLE` settings may differ.
-      options: options for carrying the run out; by default a stored run's own.
+      options: options for carrying the run out; by default the stored ones, if any.
       console: where progress is shown; nowhere if None.
       stop: training stops as on SIGTERM once it returns True. Unlike a signal, it reaches threads
         and other hosts.

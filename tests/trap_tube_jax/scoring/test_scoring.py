@@ -389,20 +389,15 @@ class Broken:
 
 
 class BrokenOnce:
-    """A policy whose second carry holds NaN, and whose second action may be given."""
-
-    def __init__(self, second=(0, 0)):
-        self.second = second
+    """A policy whose second carry holds NaN, and no other."""
 
     def initial(self, batch):
         return jnp.int32(0), jnp.zeros(batch)
 
     def act(self, observation, carry, key):
         time, memory = carry
-        is_second = time == 1
-        action = jnp.where(is_second, jnp.array(self.second), jnp.zeros(2, jnp.int32))
-        memory = jnp.where(is_second & (self.second == (0, 0)), jnp.nan, jnp.zeros_like(memory))
-        return jnp.broadcast_to(action, (len(observation), 2)), (time + 1, memory)
+        memory = jnp.where(time == 1, jnp.nan, jnp.zeros_like(memory))
+        return jnp.zeros((len(observation), 2), jnp.int32), (time + 1, memory)
 
 
 @pytest.mark.parametrize("tasks", [2, 3])
@@ -427,8 +422,8 @@ def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     for policy in (Broken(), BrokenOnce()):
         with pytest.raises(ValueError, match="act returned a carry with NaN on near"):
             tt.score(policy, ["near"], 20)
-    tt.register("Far-v0", (), base=near.base.replace(food=jnp.array([9, 9])), max_steps=2)
-    assert_refused(words, tt.score, BrokenOnce([9, 9]), ["Far-v0"], 20)  # in the last step
+    tt.register("Far-v0", (), base=near.base.replace(food=jnp.array([9, 9])), max_steps=4)
+    assert_refused(words, tt.score, Constant([0, 0], [9, 9]), ["Far-v0"], 20)  # in the last step
     floats = Constant(np.array([0, 3], np.float32))
     assert_refused(["must hold integers", "float32[20, 2]"], tt.score, floats, ["near"], 20)
     flat: Any = Random()
