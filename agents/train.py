@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 
 import trap_tube_jax as tt
+from agents.arrays import SUFFIX
 from agents.command_line import option, parse_all
 from agents.config import Config
 from agents.parallel import processes
@@ -15,9 +16,11 @@ from agents.parallel.devices import split_cpu
 from agents.runs import compilation
 from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder, check_name
+from agents.runs.loading import load
 from agents.runs.metrics import read_rows
 from agents.runs.run import DeviceOptions, Run, RunOptions
 from agents.runs.session import train_run
+from trap_tube_jax.checks import expand
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import exit_when_stopped, run_command
 
@@ -32,6 +35,8 @@ class Options:
 
     Attributes:
       preset: initial settings (fast, best or paper).
+      finetune: agent to fine-tune, with its settings. A run's folder, a file of parameters or a
+        shipped agent; schedules begin anew.
       seed: seed of all draws. agents.sweep trains several.
       name: the run's folder within --out, by default <preset>-<task set>-<seed>.
       out: the folder of all runs.
@@ -43,6 +48,7 @@ class Options:
     """
 
     preset: str = option("fast", "run")
+    finetune: str | None = option(None, "run")
     seed: int = option(0, "run")
     name: str | None = option(None, "run")
     out: Path = option(Path("runs"), "run")
@@ -73,16 +79,23 @@ def start_devices(first: Options, devices: DeviceOptions) -> None:
 
 
 def parse(first: Options, arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
-    """Reads a command line; the preset of `first`, or its stored run, has the defaults."""
+    """Reads a command line; preset, agent to fine-tune or stored run have the defaults."""
+    new = Options()
     if first.resume is None:
-        run = Run(Config.preset(first.preset))
+        config = Config.preset(first.preset)
+        if first.finetune is not None:
+            if first.preset != new.preset:
+                raise ValueError("--finetune begins with the agent's settings; leave out --preset")
+            config = load(first.finetune, imports=first.imports).config
+        run = Run(config, finetune=first.finetune)
         run_options = RunOptions()
-        defaults = Options()
+        defaults = new
     else:
-        new = Options()
-        if (first.name, first.preset, first.out) != (new.name, new.preset, new.out):
+        fixed = ("name", "out", "preset", "finetune")
+        if any(getattr(first, name) != getattr(new, name) for name in fixed):
             raise ValueError(
-                "--resume continues a run as it is; leave out --name, --out and --preset"
+                "--resume continues a run as it is; leave out "
+                f"{', '.join(f'--{name}' for name in fixed)}"
             )
         run, run_options = RunFolder(first.resume).read(first.imports)
         defaults = Options(seed=run.seed)
@@ -119,7 +132,10 @@ def run_path(options: Options, run: Run) -> Path:
     if options.resume is not None:
         return options.resume
     short = tt.task_set(run.config.env_id).short
-    name = f"{options.preset}-{short}-{run.seed}" if options.name is None else options.name
+    origin = options.preset
+    if run.finetune is not None:
+        origin = expand(run.finetune).resolve().name.removesuffix(SUFFIX)
+    name = f"{origin}-{short}-{run.seed}" if options.name is None else options.name
     check_name(name)
     return options.out / name
 

@@ -26,6 +26,7 @@ class StoredRun(TypedDict):
     seed: int
     algorithm: str
     imports: list[str]
+    finetune: NotRequired[str | None]
     options: RunOptions
 
 

@@ -10,11 +10,14 @@ import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import evaluate
+from agents.arrays import from_arrays, to_arrays
 from agents.config import Config
+from agents.networks.agent import PARTS
 from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_learner
 from agents.runs.evaluator import Evaluator, default_sets
-from agents.runs.run import RunOptions
+from agents.runs.loading import load
+from agents.runs.run import Run, RunOptions
 
 Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
 Metrics = dict[str, np.ndarray]
@@ -62,9 +65,23 @@ class Program:
         """Trained numbers."""
         return sum(leaf.size for leaf in jax.tree.leaves(self.state_shapes.params))
 
-    def init(self, seed: int) -> TrainState:
-        """Returns the first state of a seed."""
-        return self.learner.init(jax.random.key(seed))
+    def init(self, run: Run) -> TrainState:
+        """Returns the first state of a run.
+
+        Raises:
+          ValueError: the agent to fine-tune does not exist, or its network has other shapes.
+        """
+        state = self.learner.init(jax.random.key(run.seed))
+        if run.finetune is None:
+            return state
+        arrays = to_arrays(load(run.finetune).params)
+        try:
+            params = from_arrays(arrays, {part: state.params[part] for part in PARTS})
+        except ValueError as error:
+            raise ValueError(
+                f"{run.finetune} has another network than these settings: {error}"
+            ) from error
+        return state._replace(params={**state.params, **params})
 
 
 class Cohort:

@@ -70,7 +70,7 @@ class Progress:
         self._check_evaluations()
         if program.validation:
             check_best(stored, done, program.sets)
-        first = program.init(run.seed) if restored is None else restored
+        first = program.init(run) if restored is None else restored
         self.state: Callable[[], TrainState] = lambda: first
 
     @property
@@ -110,9 +110,10 @@ class Progress:
         self._line = stack.enter_context(TrainingLine(self.console, config.iterations))
         together = f", with {seeds - 1} other seed(s)" if seeds > 1 else ""
         train_set = tt.task_set(config.env_id).label
+        origin = "" if self.run.finetune is None else f" of {self.run.finetune}"
         self.console.out(
             f"{self.folder.path}: {train_set}, curiosity {config.curiosity}, "
-            f"seed {self.run.seed}, {self.program.num_parameters:,} parameters\n"
+            f"seed {self.run.seed}, {self.program.num_parameters:,} parameters{origin}\n"
             f"On {self.program.placement}, {self.program.learner.path} path{together}. "
             "Compiling, which takes up to a minute ..."
         )

@@ -3,12 +3,13 @@
 import dataclasses
 import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, Self
 
 import trap_tube_jax as tt
 from agents.command_line import option
 from agents.config import Config
-from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
+from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed, expand
 
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
@@ -25,6 +26,8 @@ class Run:
       algorithm: name in tables, by default `ppo+<curiosity>`; see `check_algorithm`.
       imports: modules that registered names of the settings. They are recorded, and imported
         again only at the caller's request.
+      finetune: agent whose parameters training starts from: a run's folder, a file of parameters
+        or a shipped agent. Only the policy network's are taken.
 
     Example:
       >>> run = agents.Run(agents.Config.preset("fast", env_id="sy"), seed=1)
@@ -36,6 +39,7 @@ class Run:
     seed: int = 0
     algorithm: str = ""
     imports: tuple[str, ...] = ()
+    finetune: str | Path | None = None
 
     def __post_init__(self) -> None:
         """Completes task set and algorithm; ValueError names a value that is not allowed."""
@@ -43,6 +47,9 @@ class Run:
         object.__setattr__(self, "imports", check_names("imports", self.imports))
         env_id = tt.task_set(self.config.env_id).id
         object.__setattr__(self, "config", dataclasses.replace(self.config, env_id=env_id))
+        if self.finetune is not None:
+            expand(self.finetune)
+            object.__setattr__(self, "finetune", str(self.finetune))
         if not self.algorithm:
             curiosity = self.config.curiosity
             name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"

@@ -273,6 +273,19 @@ def test_options_take_precedence_over_every_preset(preset):
     assert str(run_path(*read("")[:2])) == "runs/fast-base-0"
 
 
+def test_an_agent_to_fine_tune_has_the_initial_settings(tmp_path, capsys):
+    policy = random_policy(env_id="p", hidden=7)
+    save(tmp_path / "old.safetensors", policy)
+    arguments = f"--finetune {tmp_path / 'old.safetensors'} --env sy --discount 0.9"
+    found, wanted, _ = read(arguments)
+    config = dataclasses.replace(policy.config, env_id="SymbolicTrapTube-v0", discount=0.9)
+    assert wanted == Run(config, finetune=tmp_path / "old.safetensors")
+    assert str(run_path(found, wanted)) == "runs/old-sy-0"
+    assert "leave out --preset" in refused(capsys, main, *arguments.split(), "--preset", "best")
+    message = refused(capsys, main, "--resume", tmp_path, *arguments.split())
+    assert "leave out --name, --out, --preset, --finetune" in message
+
+
 def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     stored = Run(Config.preset("paper", hidden=32), 5, "mine", ("json",))
     how = RunOptions(test_tasks=7, sets=("p", "st"))

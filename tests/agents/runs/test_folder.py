@@ -19,7 +19,7 @@ from helpers.refusal import assert_refused
 
 
 def test_a_run_is_the_same_after_json():
-    run = Run(Config.preset("best"), 5, "mine", ("my_module",))
+    run = Run(Config.preset("best"), 5, "mine", ("my_module",), Path("runs/old"))
     assert Run.from_dict(json.loads(json.dumps(run.to_dict()))) == run
     assert Run(Config(curiosity="none")).algorithm == "ppo"
     assert Run(Config(curiosity="icm")).algorithm == "ppo+icm"
@@ -47,6 +47,7 @@ def test_numbers_of_numpy_and_lists_are_stored_as_those_of_python(tmp_path):
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
         (RunOptions, {"sets": "pst"}, ["sets must be a tuple of names, got 'pst'"]),
         (partial(Run, Config()), {"imports": "json"}, ["imports must be a tuple of names"]),
+        (partial(Run, Config()), {"finetune": "\n"}, [r"paths must be printable, got '\n'"]),
         (RunOptions, {"sets": ()}, ["sets must name one or more task sets"]),
         (RunOptions, {"devices": 100_000}, ["devices must be an integer >= 1 and <= 1024"]),
         (partial(Run, Config()), {"algorithm": "=1+1"}, ["algorithm must begin with a letter"]),
