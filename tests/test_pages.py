@@ -191,24 +191,51 @@ def first_pushes(file: str, policy: str) -> Any:
     return rows.set_index("level").loc[["to the exit", "away from it"], "tasks"]
 
 
-def tried() -> list[str]:
-    """Returns the rows of the settings tried: right first pushes in {P}, and percent solved."""
-    rows = []
-    table: Any = pd.read_csv(RESULTS / "colors" / "tried.csv")
-    for policy, group in table.groupby("policy"):
-        pushes = first_pushes("colors/tried.csv", policy)
-        counts = group.groupby("part")[["solved", "tasks"]].sum()
-        solved = 100 * counts["solved"] / counts["tasks"]
-        rows.append(f"{policy} | {cells([100 * pushes.iloc[0] / pushes.sum(), *solved])}")
-    return rows
-
-
-def knowledge(pushes: Any, record: str) -> str:
+def knowledge(pushes: Any, file: str) -> str:
     """Returns the share of right first pushes, with its interval, and the percent solved."""
     shares = [pushes.iloc[0] / pushes.sum(), *wilson_interval(pushes.iloc[0], pushes.sum())]
     right, low, high = (100 * share for share in shares)
-    solved = percent_of(f"{record}/confirmation.csv")[["p", "pst", "psy", "pstsy"]]
+    solved = percent_of(file)[["p", "pst", "psy", "pstsy"]]
     return f"{right:.1f} [{low:.0f}, {high:.0f}] | {cells(solved)}"
+
+
+def agents_that_know_colors() -> list[str]:
+    """Returns the rows of their table."""
+    rows = []
+    for agent, sets, record in (
+        ("seed 202, which chose settings", "p+pstsy", "colors"),
+        ("`colors-p+psy+pstsy`", "p+psy+pstsy", "colors_short"),
+    ):  # chosen on the first tasks, which the record holds
+        pushes = first_pushes("colors/first_pushes.csv", f"colors-{sets}")
+        pushes -= first_pushes(f"{record}/profile.csv", f"colors-{sets}")
+        rows.append(f"| {agent} | {sets} | {knowledge(pushes, f'{record}/confirmation.csv')} |")
+    for seed in (300, 301):
+        record = f"colors_seed_{seed}"
+        pushes = first_pushes(f"{record}/first_pushes.csv", f"runs/colours/best-seed{seed}")
+        known = knowledge(pushes, f"{record}/confirmation.csv")
+        rows.append(f"| seed {seed} | p+pstsy | {known} |")
+    for agent, policy, file in (
+        ("seed 301, fine-tuned", "seed 301, fine-tuned", "seed_301_finetuned"),
+        ("seed 330", "seed 330", "seed_330"),
+        ("`colors-finetuned`: seed 330, fine-tuned", "seed 330, fine-tuned", "seed_330_finetuned"),
+    ):
+        pushes = first_pushes("colors_finetuned/first_pushes.csv", policy)
+        known = knowledge(pushes, f"colors_finetuned/confirmation_{file}.csv")
+        rows.append(f"| {agent} | p+p+pst+pstsy | {known} |")
+    right, control = (
+        first_pushes("colors_finetuned/development.csv", f"seed 300{name}")
+        for name in (", settings chosen", ", control")
+    )
+    before = first_pushes("colors_finetuned/development.csv", "seed 300")
+    before, right, control = (100 * x.iloc[0] / x.sum() for x in (before, right, control))
+    rows += [f"from {before:.1f} to {right:.1f} %", f"without them, it has {control:.1f} %"]
+    return rows
+
+
+def steps_of_finetuned() -> int:
+    """Returns the environment steps of the shipped agent's training and fine-tuning."""
+    rows = rows_of("colors_finetuned", "curves").query("seed == 330")
+    return rows.groupby("algorithm")["transitions"].max().sum()
 
 
 def random_actions() -> list[float]:
@@ -239,18 +266,13 @@ def test_stated_results_are_those_of_the_records():
     repeats = repeats.set_index("task_set")
     shipped = 100 * (repeats["solved"] / repeats["tasks"])[list(ALL_SETS)]
     rows[PROTOCOL].append(f"| {cells(shipped)} | {steps('exp2_motion')[0]:,.0f} |")
-    for sets, record, seed in (("p+pstsy", "colors", 202), ("p+psy+pstsy", "colors_short", 91)):
+    for sets, record, taken in (
+        ("p+p+pst+pstsy", "colors_finetuned", steps_of_finetuned()),
+        ("p+psy+pstsy", "colors_short", steps("colors_short")[91]),
+    ):
         solved = cells(percent_of(f"{record}/test.csv"))
-        rows[PROTOCOL].append(f"| {sets} | {solved} | {steps(record)[seed]:,.0f} |")
-        policy = f"colors-{sets}"  # chosen on the first tasks, which the record holds
-        pushes = first_pushes("colors/first_pushes.csv", policy)
-        pushes -= first_pushes(f"{record}/profile.csv", policy)
-        rows[PROFILES].append(f"| `{policy}` | {sets} | {knowledge(pushes, record)} |")
-    for seed in (300, 301):
-        record = f"colors_seed_{seed}"
-        pushes = first_pushes(f"{record}/first_pushes.csv", f"runs/colours/best-seed{seed}")
-        rows[PROFILES].append(f"| the same, seed {seed} | p+pstsy | {knowledge(pushes, record)} |")
-    rows[PROFILES] += tried()
+        rows[PROTOCOL].append(f"| {sets} | {solved} | {taken:,.0f} |")
+    rows[PROFILES] += agents_that_know_colors()
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])

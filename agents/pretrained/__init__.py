@@ -3,8 +3,10 @@
 fast-base           the preset `fast` on base: the median of ten seeds
 icm-base            the preset `paper` on base, PPO + ICM
 best-pstsy          the preset `best` on {P, St, Sy}: the median of five seeds
-colors-p+pstsy      `best` with `object_colors` and less replay on {P} and {P, St, Sy}: one seed
-colors-p+psy+pstsy  the same on {P}, {P, Sy} and {P, St, Sy}, with episodes of 40 steps: one seed
+colors-finetuned    `best` with `object_colors` and less replay on {P} (twice), {P, St} and
+                    {P, St, Sy}, then fine-tuned with a limit of 35 steps: one seed
+colors-p+psy+pstsy  `best` with `object_colors` on {P}, {P, Sy} and {P, St, Sy}, with episodes of 40
+                    steps: one seed
 """
 
 from pathlib import Path

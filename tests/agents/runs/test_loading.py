@@ -135,7 +135,20 @@ PRESETS_OF = {
     "fast-base": ("fast", {}),
     "icm-base": ("paper", {"stop_when_solved": 1.0}),
     "best-pstsy": ("best", {}),
-    "colors-p+pstsy": ("best", {"object_colors": True, "replay_fractions": (0.0625, 0.125, 0.25)}),
+    "colors-finetuned": (
+        "best",
+        {
+            "object_colors": True,
+            "replay_fractions": (0.0625, 0.125, 0.25),
+            "max_steps": 35,
+            "discount": 0.95,
+            "iterations": 400,
+            "max_transitions": 4_000_000,
+            "learning_rate": 3e-4,
+            "lr_decay_fraction": 0.6,
+            "intrinsic_coef_init": 0.0,
+        },
+    ),
     "colors-p+psy+pstsy": (
         "best",
         {
