@@ -94,8 +94,8 @@ def parse(first: Options, arguments: Sequence[str] | None) -> tuple[Options, Run
         fixed = ("name", "out", "preset", "finetune")
         if any(getattr(first, name) != getattr(new, name) for name in fixed):
             raise ValueError(
-                "--resume continues a run as it is; leave out "
-                f"{', '.join(f'--{name}' for name in fixed)}"
+                "--resume continues a run as it is; leave out --name, --out, --preset and "
+                "--finetune"
             )
         run, run_options = RunFolder(first.resume).read(first.imports)
         defaults = Options(seed=run.seed)

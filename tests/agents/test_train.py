@@ -167,7 +167,7 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
         ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),
         ("--max-transitions 5", "must allow an iteration, which takes up to 12,800"),
         ("--name a/b", "name must be a folder's name without a path"),
-        ("--resume x", "--resume continues a run as it is; leave out --name, --out and --preset"),
+        ("--resume x", "--resume continues a run as it is; leave out --name, --out, --preset and"),
         ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
 )
@@ -283,7 +283,7 @@ def test_an_agent_to_fine_tune_has_the_initial_settings(tmp_path, capsys):
     assert str(run_path(found, wanted)) == "runs/old-sy-0"
     assert "leave out --preset" in refused(capsys, main, *arguments.split(), "--preset", "best")
     message = refused(capsys, main, "--resume", tmp_path, *arguments.split())
-    assert "leave out --name, --out, --preset, --finetune" in message
+    assert "leave out --name, --out, --preset and --finetune" in message
 
 
 def test_resumed_runs_keep_their_settings_and_options(tmp_path):
