@@ -47,7 +47,7 @@ class Config:
 
     Attributes:
       env_id: task set to train on, by id or short name, or a mixture such as p+pstsy.
-      num_features: number N of feature channels of the observation; 3 is RGB.
+      num_features: feature channels of the observation; 3 is RGB.
       max_steps: step limit of training episodes; None keeps the task set's limit. Evaluation always
         uses the task set's limit.
       iterations: rollouts to train for, at most. Schedules span this number.
@@ -97,7 +97,7 @@ class Config:
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
       filters: channels of first and later convolutions; layer widths of `objects`.
-      object_colors: `objects` also knows the colours of the base task.
+      object_colors: lets `objects` know the colours of base.
       hidden: units of the GRU. The layer before it, and hidden layers of `icm`, `rnd` and `noveld`,
         have as many.
       embedding: units of embeddings of action and reward.
