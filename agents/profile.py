@@ -18,7 +18,7 @@ from agents.profiles.measure import (
     profile,
     success_table,
 )
-from agents.profiles.tasks import FIRST_PUSH_PARTS, PARTS, STRENGTHS
+from agents.profiles.tasks import FIRST_TRIES, PARTS, STRENGTHS
 from agents.runs import compilation
 from agents.runs.loading import load
 from agents.runs.provenance import provenance
@@ -30,7 +30,7 @@ FIGURES = ("success.png", "controls.png")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Profiles trained agents: success by kind of task, and knowledge of the trap.
+    """Profiles trained agents: success by kind of task, and knowledge of the trap and tool.
 
     Agents play greedily, one episode per task, on tasks drawn with keys that training never uses.
     Writes profile.csv, provenance.json and, if their parts are measured, success.png and
@@ -42,8 +42,9 @@ class Options:
         policies is replaced.
       parts: some of structural, perceptual and both (success by strength), symbolic (by the object
         that is the tool), kind and plan-length (of the tasks of {P}), first-push-p and
-        first-push-pst (towards the exit or away from it, in {P} and {P, St}) and control (from
-        every cell where the agent may start).
+        first-push-pst (towards the exit or away from it, in {P} and {P, St}), first-pull-psy and
+        first-pull-pstsy (of the tool or another object, in {P, Sy} and {P, St, Sy}) and control
+        (from every cell where the agent may start).
       strengths: strengths of the graded transfers, from 0 (base) to 1 (the paper's transfer).
       tasks: number of tasks for each strength and symbolic swap, and for {P} and {P, St}.
       imports: modules to import first, which register names in an agent's settings.
@@ -101,12 +102,13 @@ def _print_tables(found: Table) -> None:
     """Prints the tables of the measured parts."""
     parts = set(found["part"])
     tables = {"Failed episodes, by last subgoal reached": failure_table(found)}
-    if parts - set(FIRST_PUSH_PARTS):
+    if parts - set(FIRST_TRIES):
         tables["Tasks solved, % [95 % interval]"] = success_table(found)
     if "control" in parts:
         tables["Controls solved directly, % [95 % interval]"] = control_table(found)
-    if parts & set(FIRST_PUSH_PARTS):
-        tables["First pushes where the food could go either way"] = knowledge_table(found)
+    if parts & set(FIRST_TRIES):
+        title = "First pushes where the food could go either way, and first pulls"
+        tables[title] = knowledge_table(found)
     for title, table in tables.items():
         print(f"{title}\n\n{table.to_string(line_width=80)}\n")
 

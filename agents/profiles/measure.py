@@ -11,12 +11,12 @@ import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.acting.policy import Policy
 from agents.profiles.subgoals import SUBGOALS, Cells, last_subgoals, replay, tool_moves
-from agents.profiles.tasks import FIRST_PUSH_PARTS, FIRST_PUSHES, PARTS, STRENGTHS, Part, Sampling
+from agents.profiles.tasks import FIRST_TRIES, PARTS, STRENGTHS, Part, Sampling
 from agents.runs.evaluator import Evaluator
 from agents.runs.metrics import Table
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
-from trap_tube_jax.scoring.knowledge import choice_of_exit, first_push
+from trap_tube_jax.scoring.knowledge import choice_of_exit, first_pull, first_push
 from trap_tube_jax.scoring.scores import wilson_interval
 from trap_tube_jax.state import concatenate_trees, take
 
@@ -27,6 +27,7 @@ MEANS = ["steps", "plan", "optimality"]
 
 _first_push = jax.jit(jax.vmap(first_push))
 _choice_of_exit = jax.jit(jax.vmap(choice_of_exit))
+_first_pull = jax.jit(jax.vmap(first_pull))
 
 
 def profile(
@@ -83,9 +84,9 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
     """Describes B episodes of at most 100 steps, a row per episode.
 
     An episode counts up to its 50th step; the column `solved_100` alone tells what comes later.
-    `choice` is the `choice_of_exit` of the first push. `direct` holds if the task is solved and
-    every push of the food has the direction in which a shortest plan pushes it first. Where this
-    plan pushes nothing, the tool must stay in its initial cell, too.
+    `choice` is the `choice_of_exit` of the first push, and `pull` the `first_pull`. `direct` holds
+    if the task is solved and every push of the food has the direction in which a shortest plan
+    pushes it first. Where this plan pushes nothing, the tool must stay in its initial cell, too.
     """
     solved_100 = np.asarray(played.solved)
     solved = solved_100 & (np.asarray(played.length) <= MAX_STEPS)
@@ -103,6 +104,7 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
         "choice": choice,
         "choices": choice != 0,
         "right": choice == 1,
+        "pull": _first_pull(tasks, actions),
         "steps": steps,
         "plan": np.where(plan.solvable, plan.length, np.nan),
         "optimality": plan.length / steps,
@@ -116,7 +118,7 @@ def success_table(profile: Table) -> Table:
 
     Has two columns per policy: within 50 steps, with a 95 % interval, and within 100 steps.
     """
-    rows = profile[~profile["part"].isin(FIRST_PUSH_PARTS)]
+    rows = profile[~profile["part"].isin(FIRST_TRIES)]
     within_50 = [percent(*row) for row in zip(rows["solved"], rows["tasks"], strict=True)]
     within_100 = [f"{share:.1f}" for share in 100 * rows["solved_100"] / rows["tasks"]]
     rows = rows.assign(**{"50 steps": within_50, "100 steps": within_100})
@@ -135,20 +137,21 @@ def control_table(profile: Table) -> Table:
 
 
 def knowledge_table(profile: Table) -> Table:
-    """Returns first-push accuracy, a row for each policy and task set.
+    """Returns the accuracy of first pushes and first pulls, a row for each policy and part.
 
-    Counts the episodes whose first push is a choice between the exit and the other way. Their
-    success within 50 steps stands beside it, for right and for wrong choices.
+    Counts the episodes whose first push is a choice between the exit and the other way, or that
+    have a first pull. Their success within 50 steps stands beside it, after right and wrong ones.
     """
-    rows = profile[profile["part"].isin(FIRST_PUSH_PARTS)]
+    rows = profile[profile["part"].isin(FIRST_TRIES)]
     found = {}
-    for name, groups in rows.groupby(["policy", "part"], sort=False):
+    for (policy, part), groups in rows.groupby(["policy", "part"], sort=False):
+        levels = FIRST_TRIES[part]
         counts = groups.set_index("level")[["tasks", "solved"]]
-        counts = counts.reindex([FIRST_PUSHES[1], FIRST_PUSHES[-1]], fill_value=0)
+        counts = counts.reindex([levels[1], levels[-1]], fill_value=0)
         (right, right_solved), (wrong, wrong_solved) = counts.to_numpy()
-        found[name] = {
-            "choices": f"{right + wrong:.0f}",
-            "to the exit, %": percent(right, right + wrong),
+        found[policy, part] = {
+            "tries": f"{right + wrong:.0f}",
+            "right, %": percent(right, right + wrong),
             "then solved, %": percent(right_solved, right),
             "else solved, %": percent(wrong_solved, wrong),
         }

@@ -13,6 +13,7 @@ from trap_tube_jax.state import take
 LAYOUT = ("board", "agent", "tool", "tool_extent", "food")
 STRENGTH_PARTS = ("structural", "perceptual", "both")
 SAMPLING = Sampling((0.0, 1.0), 3, 3)
+observe = jax.vmap(tt.observe)
 
 
 def level(part, name):
@@ -37,6 +38,10 @@ def test_transfers_change_layout_or_colours_and_draw_alike_in_all_parts():
     for part in ("kind", "plan-length", "first-push-p"):
         assert same(PARTS[part](SAMPLING).tasks, perceptual, *LAYOUT, "palette")
     assert same(PARTS["first-push-pst"](SAMPLING).tasks, both, *LAYOUT, "palette")
+    for part, tasks in {"first-pull-psy": perceptual, "first-pull-pstsy": both}.items():
+        swapped = PARTS[part](SAMPLING).tasks
+        assert not same(swapped, tasks, *LAYOUT)
+        assert np.array_equal(observe(swapped), observe(tasks))
 
 
 def test_controls_have_the_layouts_of_the_registered_sets_in_base_colours():
