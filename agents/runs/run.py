@@ -23,7 +23,8 @@ class Run:
     Attributes:
       config: the settings.
       seed: seed of all draws.
-      algorithm: name in tables, by default `ppo+<curiosity>`; see `check_algorithm`.
+      algorithm: name in tables, by default `ppo+<curiosity>`, of a fine-tuned agent followed by
+        `, fine-tuned`; see `check_algorithm`.
       imports: modules that registered names of the settings. They are recorded, and imported
         again only at the caller's request.
       finetune: agent whose parameters training starts from: a run's folder, a file of parameters
@@ -53,7 +54,8 @@ class Run:
         if not self.algorithm:
             curiosity = self.config.curiosity
             name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"
-            object.__setattr__(self, "algorithm", name)
+            suffix = "" if self.finetune is None else ", fine-tuned"
+            object.__setattr__(self, "algorithm", f"{name}{suffix}")
         check_algorithm(self.algorithm)
 
     def to_dict(self) -> dict[str, Any]:

@@ -23,6 +23,7 @@ def test_a_run_is_the_same_after_json():
     assert Run.from_dict(json.loads(json.dumps(run.to_dict()))) == run
     assert Run(Config(curiosity="none")).algorithm == "ppo"
     assert Run(Config(curiosity="icm")).algorithm == "ppo+icm"
+    assert Run(Config(), finetune="x").algorithm == "ppo+icm, fine-tuned"
 
 
 def test_numbers_of_numpy_and_lists_are_stored_as_those_of_python(tmp_path):
