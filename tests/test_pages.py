@@ -179,9 +179,12 @@ def means(percent: Any) -> str:
     return " | ".join(texts)
 
 
-def percent_of(file: str) -> Any:
+def percent_of(file: str, policy: str | None = None) -> Any:
     """Returns the percentages that `agents.evaluate` wrote to a CSV file."""
-    table = pd.read_csv(RESULTS / file).set_index("task_set")
+    table = pd.read_csv(RESULTS / file)
+    if policy:
+        table = table.query("policy == @policy")
+    table = table.set_index("task_set")
     return (100 * table["solved"] / table["tasks"])[list(ALL_SETS)]
 
 
@@ -191,51 +194,49 @@ def first_pushes(file: str, policy: str) -> Any:
     return rows.set_index("level").loc[["to the exit", "away from it"], "tasks"]
 
 
-def knowledge(pushes: Any, file: str) -> str:
+def knowledge(pushes: Any, percent: Any) -> str:
     """Returns the share of right first pushes, with its interval, and the percent solved."""
     shares = [pushes.iloc[0] / pushes.sum(), *wilson_interval(pushes.iloc[0], pushes.sum())]
     right, low, high = (100 * share for share in shares)
-    solved = percent_of(file)[["p", "pst", "psy", "pstsy"]]
-    return f"{right:.1f} [{low:.0f}, {high:.0f}] | {cells(solved)}"
+    return f"{right:.1f} [{low:.0f}, {high:.0f}] | {cells(percent[['p', 'pst', 'psy', 'pstsy']])}"
 
 
 def agents_that_know_colors() -> list[str]:
-    """Returns the rows of their table."""
-    rows = []
-    for agent, sets, record in (
-        ("seed 202, which chose settings", "p+pstsy", "colors"),
-        ("`colors-p+psy+pstsy`", "p+psy+pstsy", "colors_short"),
-    ):  # chosen on the first tasks, which the record holds
-        pushes = first_pushes("colors/first_pushes.csv", f"colors-{sets}")
-        pushes -= first_pushes(f"{record}/profile.csv", f"colors-{sets}")
-        rows.append(f"| {agent} | {sets} | {knowledge(pushes, f'{record}/confirmation.csv')} |")
-    for seed in (300, 301):
-        record = f"colors_seed_{seed}"
-        pushes = first_pushes(f"{record}/first_pushes.csv", f"runs/colours/best-seed{seed}")
-        known = knowledge(pushes, f"{record}/confirmation.csv")
-        rows.append(f"| seed {seed} | p+pstsy | {known} |")
-    for agent, policy, file in (
-        ("seed 301, fine-tuned", "seed 301, fine-tuned", "seed_301_finetuned"),
-        ("seed 330", "seed 330", "seed_330"),
-        ("`colors-finetuned`: seed 330, fine-tuned", "seed 330, fine-tuned", "seed_330_finetuned"),
-    ):
-        pushes = first_pushes("colors_finetuned/first_pushes.csv", policy)
-        known = knowledge(pushes, f"colors_finetuned/confirmation_{file}.csv")
-        rows.append(f"| {agent} | p+p+pst+pstsy | {known} |")
-    right, control = (
-        first_pushes("colors_finetuned/development.csv", f"seed 300{name}")
-        for name in (", settings chosen", ", control")
+    """Returns the rows of their table, and what the development tasks showed."""
+    pushes = first_pushes("profiles/profile.csv", "best-pstsy")
+    known = knowledge(pushes, percent_of("leaderboard/confirmation.csv"))
+    rows = [f"| best-pstsy, without colours | {known} |"]
+    for policy in rows_of("colors", "first_pushes")["policy"].unique():
+        pushes = first_pushes("colors/first_pushes.csv", policy)
+        if policy == "colors-p+psy+pstsy":  # chosen on the first tasks
+            pushes -= first_pushes("colors/development.csv", policy)
+        known = knowledge(pushes, percent_of("colors/confirmation.csv", policy))
+        rows.append(f"{policy} | {known} |")
+    before, chosen, control = (
+        first_pushes("colors/development.csv", f"seed 300, {name}")
+        for name in ("last iteration", "fine-tuned", "fine-tuned as a control")
     )
-    before = first_pushes("colors_finetuned/development.csv", "seed 300")
-    before, right, control = (100 * x.iloc[0] / x.sum() for x in (before, right, control))
-    rows += [f"from {before:.1f} to {right:.1f} %", f"without them, it has {control:.1f} %"]
+    before, chosen, control = (100 * x.iloc[0] / x.sum() for x in (before, chosen, control))
+    rows += [f"from {before:.1f} to {chosen:.1f} %", f"without them, it has {control:.1f} %"]
     return rows
 
 
-def steps_of_finetuned() -> int:
-    """Returns the environment steps of the shipped agent's training and fine-tuning."""
-    rows = rows_of("colors_finetuned", "curves").query("seed == 330")
-    return rows.groupby("algorithm")["transitions"].max().sum()
+def first_pulls() -> list[str]:
+    """Returns the ranges of right first pulls, and of success after right and wrong ones."""
+    rows = rows_of("first_pulls", "profile")
+    counts = rows.pivot_table(index=["policy", "part"], columns="level", values=["tasks", "solved"])
+    tasks, solved = counts["tasks"], counts["solved"]
+    shares = [tasks["the tool"] / tasks.sum(axis=1)]
+    shares += [solved[level] / tasks[level] for level in ("the tool", "another object")]
+    low_high = [(100 * share.min(), 100 * share.max()) for share in shares]
+    texts = ("{:.0f} to {:.0f} %", "{:.0f} to {:.0f} % of the tasks", "{:.0f} to {:.0f} %")
+    return [text.format(*ends) for text, ends in zip(texts, low_high, strict=True)]
+
+
+def steps_with_colors(*policies: str) -> int:
+    """Returns the environment steps of trainings in which agents learned colours."""
+    curves = rows_of("colors", "curves").groupby("policy")["transitions"]
+    return curves.max().loc[list(policies)].sum()
 
 
 def random_actions() -> list[float]:
@@ -266,13 +267,13 @@ def test_stated_results_are_those_of_the_records():
     repeats = repeats.set_index("task_set")
     shipped = 100 * (repeats["solved"] / repeats["tasks"])[list(ALL_SETS)]
     rows[PROTOCOL].append(f"| {cells(shipped)} | {steps('exp2_motion')[0]:,.0f} |")
-    for sets, record, taken in (
-        ("p+p+pst+pstsy", "colors_finetuned", steps_of_finetuned()),
-        ("p+psy+pstsy", "colors_short", steps("colors_short")[91]),
+    for sets, *policies in (
+        ("p+p+pst+pstsy", "seed 330, fine-tuned", "seed 330"),
+        ("p+psy+pstsy", "colors-p+psy+pstsy"),
     ):
-        solved = cells(percent_of(f"{record}/test.csv"))
-        rows[PROTOCOL].append(f"| {sets} | {solved} | {taken:,.0f} |")
-    rows[PROFILES] += agents_that_know_colors()
+        solved = cells(percent_of("colors/test.csv", policies[0]))
+        rows[PROTOCOL].append(f"| {sets} | {solved} | {steps_with_colors(*policies):,.0f} |")
+    rows[PROFILES] += agents_that_know_colors() + first_pulls()
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])
