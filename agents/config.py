@@ -167,6 +167,8 @@ class Config:
             _check_value(field, value)
         registry.curiosities.factory(self.curiosity)
         registry.encoders.factory(self.encoder)
+        if self.object_colors and self.encoder == "paper":
+            raise ValueError("object_colors needs encoder='objects', got 'paper'")
         if self.value_heads == "separate" and self.bootstrap != "value":
             raise ValueError(
                 f"value_heads='separate' needs bootstrap='value', got {self.bootstrap!r}"

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from agents.arrays import SUFFIX
 from agents.command_line import option, parse
 from agents.files import check_folder, is_file, read_json, write_bytes, write_json
 from agents.profiles import plots
@@ -20,7 +19,7 @@ from agents.profiles.measure import (
 )
 from agents.profiles.tasks import FIRST_TRIES, PARTS, STRENGTHS
 from agents.runs import compilation
-from agents.runs.loading import load
+from agents.runs.loading import load, short_name
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.interruptions import run_command
@@ -42,11 +41,11 @@ class Options:
         policies is replaced.
       parts: some of structural, perceptual and both (success by strength), symbolic (by the object
         that is the tool), kind and plan-length (of the tasks of {P}), first-push-p and
-        first-push-pst (towards the exit or away from it, in {P} and {P, St}), first-pull-psy and
-        first-pull-pstsy (of the tool or another object, in {P, Sy} and {P, St, Sy}) and control
+        first-push-pst (towards the exit or away from it, in {P} and {P, St}), first-grasp-psy and
+        first-grasp-pstsy (of the tool or another object, in {P, Sy} and {P, St, Sy}) and control
         (from every cell where the agent may start).
       strengths: strengths of the graded transfers, from 0 (base) to 1 (the paper's transfer).
-      tasks: number of tasks for each strength and symbolic swap, and for {P} and {P, St}.
+      tasks: number of tasks for each strength and symbolic swap, and for each set drawn.
       imports: modules to import first, which register names in an agent's settings.
     """
 
@@ -68,8 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     iterations = {name: policy.iteration for name, policy in policies.items()}
     command = f"python -m agents.profile {shlex.join(arguments)}"
     origin = {"command": command, "iterations": iterations, **provenance()}
-    paths = [Path(source).resolve() for source in policies]  # a source may be "."
-    names = "+".join(path.name.removesuffix(SUFFIX) for path in paths)
+    names = "+".join(map(short_name, policies))
     output = options.output or Path("runs", f"profile-{names}")
     _check_free(output, iterations)
     found = profile(policies, options.parts, options.strengths, options.tasks, announce)
@@ -107,7 +105,7 @@ def _print_tables(found: Table) -> None:
     if "control" in parts:
         tables["Controls solved directly, % [95 % interval]"] = control_table(found)
     if parts & set(FIRST_TRIES):
-        title = "First pushes where the food could go either way, and first pulls"
+        title = "First pushes where the food could go either way, and first grasps"
         tables[title] = knowledge_table(found)
     for title, table in tables.items():
         print(f"{title}\n\n{table.to_string(line_width=80)}\n")

@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 
 import trap_tube_jax as tt
-from agents.arrays import SUFFIX
 from agents.command_line import option, parse_all
 from agents.config import Config
 from agents.parallel import processes
@@ -16,11 +15,10 @@ from agents.parallel.devices import split_cpu
 from agents.runs import compilation
 from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder, check_name
-from agents.runs.loading import load
+from agents.runs.loading import load, short_name
 from agents.runs.metrics import read_rows
 from agents.runs.run import DeviceOptions, Run, RunOptions
 from agents.runs.session import train_run
-from trap_tube_jax.checks import expand
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import exit_when_stopped, run_command
 
@@ -38,7 +36,7 @@ class Options:
       finetune: agent to fine-tune, with its settings. A run's folder, a file of parameters or a
         shipped agent; schedules begin anew.
       seed: seed of all draws. agents.sweep trains several.
-      name: the run's folder within --out, by default <preset>-<task set>-<seed>.
+      name: the run's folder within --out, by default <preset or agent>-<task set>-<seed>.
       out: the folder of all runs.
       resume: folder of a run to continue with its options. Of its settings only --iterations,
         --max-transitions and --stop-when-solved may change.
@@ -134,7 +132,7 @@ def run_path(options: Options, run: Run) -> Path:
     short = tt.task_set(run.config.env_id).short
     origin = options.preset
     if run.finetune is not None:
-        origin = expand(run.finetune).resolve().name.removesuffix(SUFFIX)
+        origin = short_name(run.finetune)
     name = f"{origin}-{short}-{run.seed}" if options.name is None else options.name
     check_name(name)
     return options.out / name

@@ -221,9 +221,9 @@ def agents_that_know_colors() -> list[str]:
     return rows
 
 
-def first_pulls() -> list[str]:
-    """Returns the ranges of right first pulls, and of success after right and wrong ones."""
-    rows = rows_of("first_pulls", "profile")
+def first_grasps() -> list[str]:
+    """Returns the ranges of right first grasps, and of success after right and wrong ones."""
+    rows = rows_of("first_grasps", "profile")
     counts = rows.pivot_table(index=["policy", "part"], columns="level", values=["tasks", "solved"])
     tasks, solved = counts["tasks"], counts["solved"]
     shares = [tasks["the tool"] / tasks.sum(axis=1)]
@@ -273,7 +273,7 @@ def test_stated_results_are_those_of_the_records():
     ):
         solved = cells(percent_of("colors/test.csv", policies[0]))
         rows[PROTOCOL].append(f"| {sets} | {solved} | {steps_with_colors(*policies):,.0f} |")
-    rows[PROFILES] += agents_that_know_colors() + first_pulls()
+    rows[PROFILES] += agents_that_know_colors() + first_grasps()
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])

@@ -42,12 +42,17 @@ def expand(path: str | os.PathLike[str]) -> Path:
     Raises:
       ValueError: there is no such home folder, or a terminal would take the path for a command.
     """
-    if not str(path).isprintable():
-        raise ValueError(f"paths must be printable, got {str(path)!r}; rename it")
+    check_printable(path)
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
         raise ValueError(f"{path} cannot be expanded: {error}") from error
+
+
+def check_printable(path: str | os.PathLike[str]) -> None:
+    """Raises ValueError for a path that a terminal would take for a command."""
+    if not str(path).isprintable():
+        raise ValueError(f"paths must be printable, got {str(path)!r}; rename it")
 
 
 def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:

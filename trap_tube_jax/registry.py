@@ -127,11 +127,15 @@ def _mixture(entries: Sequence[TaskSet]) -> TaskSet:
     """
     first = entries[0]
     for entry in entries:
-        if entry.base is not None or entry.max_steps != first.max_steps:
+        if entry.base is not None:
             raise ValueError(
-                f"a mixture is of sets that start from the base task and have one step limit; "
-                f"{first.short} has {first.max_steps} steps, {entry.short} {entry.max_steps}"
-                + ("" if entry.base is None else " and a base state of its own")
+                f"a mixture is of sets that start from the base task; {entry.short} has a base "
+                "state of its own"
+            )
+        if entry.max_steps != first.max_steps:
+            raise ValueError(
+                f"a mixture is of sets that have one step limit; {first.short} has "
+                f"{first.max_steps} steps, {entry.short} {entry.max_steps}"
             )
     counts = collections.Counter(compose(*entry.transfers) for entry in entries)
     return TaskSet(

@@ -16,7 +16,7 @@ from agents.runs.evaluator import Evaluator
 from agents.runs.metrics import Table
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
-from trap_tube_jax.scoring.knowledge import choice_of_exit, first_pull, first_push
+from trap_tube_jax.scoring.knowledge import choice_of_exit, first_grasp, first_push
 from trap_tube_jax.scoring.scores import wilson_interval
 from trap_tube_jax.state import concatenate_trees, take
 
@@ -27,7 +27,7 @@ MEANS = ["steps", "plan", "optimality"]
 
 _first_push = jax.jit(jax.vmap(first_push))
 _choice_of_exit = jax.jit(jax.vmap(choice_of_exit))
-_first_pull = jax.jit(jax.vmap(first_pull))
+_first_grasp = jax.jit(jax.vmap(first_grasp))
 
 
 def profile(
@@ -43,7 +43,7 @@ def profile(
       policies: policies by display name, all with the same number of feature channels.
       parts: names of `tasks.PARTS`.
       strengths: of the graded transfers, from 0 (the base task) to 1 (the paper's transfer).
-      num_tasks: tasks of each strength and symbolic swap, and of the other draws from {P}.
+      num_tasks: tasks of each strength and symbolic swap, and of the other sets drawn.
       report: called with one line before each stage.
 
     Returns:
@@ -84,9 +84,9 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
     """Describes B episodes of at most 100 steps, a row per episode.
 
     An episode counts up to its 50th step; the column `solved_100` alone tells what comes later.
-    `choice` is the `choice_of_exit` of the first push, and `pull` the `first_pull`. `direct` holds
-    if the task is solved and every push of the food has the direction in which a shortest plan
-    pushes it first. Where this plan pushes nothing, the tool must stay in its initial cell, too.
+    `choice` is the `choice_of_exit` of the first push, `grasp` the `first_grasp`. `direct` holds if
+    the task is solved and every push of the food has the direction in which a shortest plan pushes
+    it first. Where this plan pushes nothing, the tool must stay in its initial cell, too.
     """
     solved_100 = np.asarray(played.solved)
     solved = solved_100 & (np.asarray(played.length) <= MAX_STEPS)
@@ -104,7 +104,7 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
         "choice": choice,
         "choices": choice != 0,
         "right": choice == 1,
-        "pull": _first_pull(tasks, actions),
+        "grasp": _first_grasp(tasks, actions),
         "steps": steps,
         "plan": np.where(plan.solvable, plan.length, np.nan),
         "optimality": plan.length / steps,
@@ -137,10 +137,10 @@ def control_table(profile: Table) -> Table:
 
 
 def knowledge_table(profile: Table) -> Table:
-    """Returns the accuracy of first pushes and first pulls, a row for each policy and part.
+    """Returns the accuracy of first pushes and first grasps, a row for each policy and part.
 
     Counts the episodes whose first push is a choice between the exit and the other way, or that
-    have a first pull. Their success within 50 steps stands beside it, after right and wrong ones.
+    have a first grasp. Their success within 50 steps stands beside it, after right and wrong ones.
     """
     rows = profile[profile["part"].isin(FIRST_TRIES)]
     found = {}

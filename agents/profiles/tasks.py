@@ -23,7 +23,7 @@ STRENGTHS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 SECOND_LAYOUTS = {"no-trap": "two exits", "two-traps": "other exit", "food-outside": "near"}
 BIN = 5  # steps, the width of the groups by plan length
 FIRST_PUSHES = {1: "to the exit", -1: "away from it", 0: "no choice"}
-FIRST_PULLS = {1: "the tool", -1: "another object", 0: "no pull"}
+FIRST_GRASPS = {1: "the tool", -1: "another object", 0: "no grasp"}
 
 
 class Part(NamedTuple):
@@ -59,9 +59,9 @@ def first_pushes(episodes: Any) -> pd.Categorical:
     return pd.Categorical(episodes["choice"].map(FIRST_PUSHES), list(FIRST_PUSHES.values()))
 
 
-def first_pulls(episodes: Any) -> pd.Categorical:
-    """Groups B episodes by the object of their first pull."""
-    return pd.Categorical(episodes["pull"].map(FIRST_PULLS), list(FIRST_PULLS.values()))
+def first_grasps(episodes: Any) -> pd.Categorical:
+    """Groups B episodes by the object of their first grasp."""
+    return pd.Categorical(episodes["grasp"].map(FIRST_GRASPS), list(FIRST_GRASPS.values()))
 
 
 def layout_kinds(tasks: tt.State) -> list[str]:
@@ -136,15 +136,17 @@ PARTS: dict[str, Callable[[Sampling], Part]] = {
     "plan-length": partial(_grouped, (tt.perceptual,), plan_lengths),
     "first-push-p": partial(_grouped, (tt.perceptual,), first_pushes),
     "first-push-pst": partial(_grouped, (tt.perceptual, tt.structural), first_pushes),
-    "first-pull-psy": partial(_grouped, (tt.perceptual, tt.symbolic), first_pulls),
-    "first-pull-pstsy": partial(_grouped, (tt.perceptual, tt.structural, tt.symbolic), first_pulls),
+    "first-grasp-psy": partial(_grouped, (tt.perceptual, tt.symbolic), first_grasps),
+    "first-grasp-pstsy": partial(
+        _grouped, (tt.perceptual, tt.structural, tt.symbolic), first_grasps
+    ),
     "control": _control,
 }
 FIRST_TRIES = {
     "first-push-p": FIRST_PUSHES,
     "first-push-pst": FIRST_PUSHES,
-    "first-pull-psy": FIRST_PULLS,
-    "first-pull-pstsy": FIRST_PULLS,
+    "first-grasp-psy": FIRST_GRASPS,
+    "first-grasp-pstsy": FIRST_GRASPS,
 }
 
 

@@ -75,6 +75,13 @@ def load(
     return read_policy(path).replace(greedy=greedy)
 
 
+def short_name(source: str | Path) -> str:
+    """Returns a name for files: that of the run, the file or the shipped agent."""
+    path = expand(source).resolve()  # a source may be "."
+    run = run_of(path)
+    return (run.path if run else path).name.removesuffix(SUFFIX)
+
+
 def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]) -> Policy:
     run, options = folder.read(imports)
     name = f"seed {run.seed}"

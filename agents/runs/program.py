@@ -71,9 +71,11 @@ class Program:
         Raises:
           ValueError: the agent to fine-tune does not exist, or its network has other shapes.
         """
-        state = self.learner.init(jax.random.key(run.seed))
+        key = jax.random.key(run.seed)
         if run.finetune is None:
-            return state
+            return self.learner.init(key)
+        # Other tasks than those of the first training, even with the same seed.
+        state = self.learner.init(jax.random.fold_in(key, 1))
         arrays = to_arrays(load(run.finetune).params)
         try:
             params = from_arrays(arrays, {part: state.params[part] for part in PARTS})

@@ -110,7 +110,7 @@ class Progress:
         self._line = stack.enter_context(TrainingLine(self.console, config.iterations))
         together = f", with {seeds - 1} other seed(s)" if seeds > 1 else ""
         train_set = tt.task_set(config.env_id).label
-        origin = "" if self.run.finetune is None else f" of {self.run.finetune}"
+        origin = "" if self.run.finetune is None else f", fine-tuned from {self.run.finetune}"
         self.console.out(
             f"{self.folder.path}: {train_set}, curiosity {config.curiosity}, "
             f"seed {self.run.seed}, {self.program.num_parameters:,} parameters{origin}\n"

@@ -23,9 +23,9 @@ def results(paths: Paths) -> pd.DataFrame:
 
     Returns:
       A data frame with a row for each run, evaluated iteration, purpose of the tasks (validation
-      or test) and task set. Columns: run, algorithm, seed, commit, the columns of
-      `evaluations.csv` (iteration, purpose, task_set, tasks, solved, layouts, layouts_total,
-      length), and every setting.
+      or test) and task set. Columns: run, algorithm, seed, finetune (the agent that training
+      started from, or ""), commit, the columns of `evaluations.csv` (iteration, purpose, task_set,
+      tasks, solved, layouts, layouts_total, length), and every setting.
 
     Raises:
       ValueError: a folder holds no run, or a file is damaged.
@@ -43,8 +43,10 @@ def results(paths: Paths) -> pd.DataFrame:
     for folder in find_runs(paths):
         machines = read_provenance(folder.provenance)
         commit = machines[-1]["commit"] if machines else None
-        table = _table(folder, folder.evaluations, commit=commit)
-        settings = folder.stored()["config"].items()
+        stored = folder.stored()
+        origin = stored.get("finetune") or ""
+        table = _table(folder, folder.evaluations, finetune=origin, commit=commit)
+        settings = stored["config"].items()
         tables.append(table.assign(**{k: str(v) if type(v) is list else v for k, v in settings}))
     return _join(tables)
 

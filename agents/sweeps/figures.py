@@ -107,7 +107,7 @@ def draw_differences(compared: Table, about: Mapping[str, Any]) -> Any:
     height = 0.25 * len(names) + 0.4
     figure, axes = make_panels(list(map(label, sets)), 5, height, about["title"])
     for axis, task_set in zip(axes, sets, strict=True):
-        rows = compared[compared["task_set"] == task_set].set_index("algorithm").loc[names]
+        rows = compared[compared["task_set"] == task_set].set_index("algorithm").reindex(names)
         axis.axvline(0, color="black", linewidth=0.8)
         for row, (middle, low, high) in enumerate(rows[["difference", "low", "high"]].to_numpy()):
             axis.plot([low, high], [row, row], color=COLORS[0])

@@ -147,7 +147,8 @@ def differences(tested: Table) -> Table:
     Returns:
       A row per task set and algorithm: `task_set`, `reference` and `algorithm`, the `difference` of
       their means over seeds, `low` and `high` of its 95 % interval, and `p` of Welch's t-test.
-      Interval and p are corrected by Holm's method for the comparisons in a task set.
+      Interval and p are corrected by Holm's method for the comparisons in a task set, and unknown
+      where neither algorithm varies.
     """
     seeds = tested.groupby("algorithm", sort=False)["seed"].nunique()
     several = list(seeds[seeds > 1].index)
@@ -168,7 +169,8 @@ def differences(tested: Table) -> Table:
             margin = stats.t.isf(0.025 / factor, freedom) * error
             low = difference - margin
             high = difference + margin
-            rows.append((task_set, reference, name, difference, low, high, min(1.0, factor * p)))
+            corrected = np.minimum(1.0, factor * p)
+            rows.append((task_set, reference, name, difference, low, high, corrected))
     columns = ["task_set", "reference", "algorithm", "difference", "low", "high", "p"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -176,13 +178,14 @@ def differences(tested: Table) -> Table:
 def welch(a: Any, b: Any) -> tuple[float, float, float, float]:
     """Compares the means of two samples by Welch's t-test.
 
-    Returns mean(a) - mean(b), its standard error, the degrees of freedom, and p.
+    Returns mean(a) - mean(b), its standard error, the degrees of freedom, and p; NaN for the last
+    three if neither sample varies.
     """
+    if np.ptp(a) == np.ptp(b) == 0:
+        return a[0] - b[0], np.nan, np.nan, np.nan
     parts = np.array([x.var(ddof=1) / len(x) for x in (a, b)])
     difference = a.mean() - b.mean()
     error = np.sqrt(parts.sum())
-    if not error:  # every seed solves as much, as in the first iterations
-        return difference, 0.0, 1.0, float(difference == 0)
     freedom = error**4 / np.sum(parts**2 / [len(a) - 1, len(b) - 1])
     p = 2 * float(stats.t.sf(abs(difference) / error, freedom))
     return difference, error, freedom, p
@@ -192,8 +195,14 @@ def holm_factors(p: Any) -> Any:
     """Returns the factors f64[M] by which Holm's method corrects M values of p.
 
     The i-th smallest counts M + 1 - i times, and more if its product would not exceed a smaller
-    p's. The 100 (1 - 0.05 / factor) % interval excludes 0 exactly where factor * p < 0.05.
+    p's. The 100 (1 - 0.05 / factor) % interval excludes 0 exactly where factor * p < 0.05. Values
+    that are NaN do not count, and have the factor NaN.
     """
+    known = ~np.isnan(p)
+    if not known.all():
+        factors = np.full(len(p), np.nan)
+        factors[known] = holm_factors(p[known])
+        return factors
     order = np.argsort(p)
     counts = np.arange(len(p), 0, -1.0)
     factors = np.empty(len(p))
@@ -205,14 +214,16 @@ def holm_factors(p: Any) -> Any:
 def difference_table(compared: Table) -> Table:
     """Formats `differences`: a row per set, a column per algorithm; * marks p < 0.05."""
     shown = [
-        f"{row.difference:+.1f} [{row.low:.1f}, {row.high:.1f}]{'*' if row.p < 0.05 else ''}"
+        f"{row.difference:+.1f}"
+        + ("" if np.isnan(row.p) else f" [{row.low:.1f}, {row.high:.1f}]")
+        + ("*" if row.p < 0.05 else "")
         for row in compared.itertuples()
     ]
     table = compared.assign(shown=shown).pivot(
         index="task_set", columns="algorithm", values="shown"
     )
     table = table.loc[compared["task_set"].unique(), compared["algorithm"].unique()]
-    return table.rename_axis(index=None, columns=None).rename(index=label)
+    return table.fillna(NOTHING).rename_axis(index=None, columns=None).rename(index=label)
 
 
 def mean_text(values: Any, form: str, high: float = np.inf) -> str:

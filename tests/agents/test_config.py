@@ -57,6 +57,7 @@ def test_a_preset_trains_in_a_custom_environment_without_curiosity_and_previous_
             {"value_heads": "separate"},
             ["value_heads='separate'", "bootstrap='value'", "'baseline'"],
         ),
+        ({"object_colors": True}, ["object_colors needs encoder='objects', got 'paper'"]),
         ({"intrinsic_coef_init": 0.01}, ["intrinsic_coef_init", "at least intrinsic_coef", "0.01"]),
         ({"intrinsic_coef_init": 1.0, "intrinsic_coef": 0.0}, ["> 0", "intrinsic_coef=0.0"]),
         ({"max_steps": 5.0}, ["max_steps", "integer", "5.0"]),

@@ -281,6 +281,10 @@ def test_an_agent_to_fine_tune_has_the_initial_settings(tmp_path, capsys):
     config = dataclasses.replace(policy.config, env_id="SymbolicTrapTube-v0", discount=0.9)
     assert wanted == Run(config, finetune=tmp_path / "old.safetensors")
     assert str(run_path(found, wanted)) == "runs/old-sy-0"
+    folder = RunFolder(tmp_path / "x")
+    folder.write_config(Run(Config()), RunOptions())
+    of_a_run = dataclasses.replace(wanted, finetune=folder.best)
+    assert str(run_path(found, of_a_run)) == "runs/x-sy-0"
     assert "leave out --preset" in refused(capsys, main, *arguments.split(), "--preset", "best")
     message = refused(capsys, main, "--resume", tmp_path, *arguments.split())
     assert "leave out --name, --out, --preset and --finetune" in message

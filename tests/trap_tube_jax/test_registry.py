@@ -183,6 +183,6 @@ def test_a_mixture_refuses_sets_that_do_not_mix(fresh_task_sets):
     tt.register("Short-v0", (), max_steps=20)
     tt.register("Own-v0", (), base=tt.base_state())
     assert_refused(["one step limit; p has 50 steps, Short-v0 20"], tt.make, "p+Short-v0")
-    assert_refused(["Own-v0 50 and a base state of its own"], tt.make, "p+Own-v0")
+    assert_refused(["base task; Own-v0 has a base state of its own"], tt.make, "Own-v0+p")
     assert_refused(["unknown task set 'pts' (did you mean"], tt.make, "p+pts")
     assert_refused(["joined by '+', got 'p+'"], tt.make, "p+")

@@ -1,4 +1,4 @@
-"""First pushes and first pulls, which show what an agent knew before it tried.
+"""First pushes and first grasps, which show what an agent knew before it tried.
 
 Source: protocol.md, "Knowledge of the trap" and "Search for the tool".
 """
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.dynamics import holds_tool, static_object
-from trap_tube_jax.geometry import bar_covers, same_cell, unit_vector
+from trap_tube_jax.geometry import bar_covers, unit_vector
 from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND
 from trap_tube_jax.state import State
 
@@ -36,7 +36,7 @@ def first_push(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
 def choice_of_exit(task: State, push: jax.typing.ArrayLike) -> jax.Array:
     """Tests whether a first push chose the exit, where the food could have gone the other way.
 
-    A push is a choice if static objects let the food move one cell forward or one cell backward,
+    A push is a choice if static objects let the food move one cell forward and one cell backward,
     and exactly one of these ways leads straight to an exit. Unbatched; vmap it.
 
     Args:
@@ -54,32 +54,30 @@ def choice_of_exit(task: State, push: jax.typing.ArrayLike) -> jax.Array:
     return jnp.where(can_move, forward.astype(jnp.int32) - backward.astype(jnp.int32), 0)
 
 
-def first_pull(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
-    """Tests whether the first pull of an episode held the tool.
+def first_grasp(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
+    """Tests whether the first grasp of an episode held the tool.
 
-    A pull is a step in which the agent moves, and its grasp holds the tool or points at a cell
-    that shows a trap, an exit or a tube. Unbatched; vmap it.
+    Grasps that point at neither tool, trap, exit nor tube do not count. Unbatched; vmap it.
 
     Args:
       task: the state at time 0.
       actions: integer[T, 2], (grasp, move). Actions after a solution change nothing.
 
     Returns:
-      i32[]: 1 if the first pull held the tool, -1 if it did not, and 0 without a pull.
+      i32[]: 1 if the first grasp held the tool, -1 if it did not, and 0 without a grasp.
     """
 
     def step(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-        after = dynamics.step(state, action)
         cell = state.agent + unit_vector(action[0])
         is_hidden = bar_covers(state.tool, state.tool_extent, cell)
         misses = (static_object(state.board, cell) > GROUND) & ~is_hidden
-        pull = holds_tool(state, action[0]).astype(jnp.int32) - misses
-        return after, jnp.where(same_cell(after.agent, state.agent), 0, pull)
+        grasp = holds_tool(state, action[0]).astype(jnp.int32) - misses
+        return dynamics.step(state, action), jnp.where(state.done, 0, grasp)
 
     start = jax.tree.map(jnp.asarray, task)
-    _, pulls = jax.lax.scan(step, start, jnp.asarray(actions))
-    pulls = jnp.pad(pulls, (1, 0))  # entry 0, in case there is no pull
-    return pulls[jnp.argmax(pulls != 0)]
+    _, grasps = jax.lax.scan(step, start, jnp.asarray(actions))
+    grasps = jnp.pad(grasps, (1, 0))  # entry 0, in case there is no grasp
+    return grasps[jnp.argmax(grasps != 0)]
 
 
 def _can_move(task: State, way: jax.Array) -> jax.Array:

@@ -23,7 +23,7 @@ from agents.profiles.measure import (
     success_table,
 )
 from agents.profiles.subgoals import Cells
-from agents.profiles.tasks import first_pulls, first_pushes, plan_lengths
+from agents.profiles.tasks import first_grasps, first_pushes, plan_lengths
 from trap_tube_jax.controls import food_outside, trap_turned
 from trap_tube_jax.objects import EXIT, NUM_OBJECTS, TRAP
 from trap_tube_jax.scoring.tasks import fixed_tasks
@@ -42,7 +42,7 @@ def batch_of_one(state):
 
 @pytest.fixture(scope="module")
 def measured(policy):
-    parts = ("structural", "kind", "plan-length", "first-push-p", "first-pull-psy", "control")
+    parts = ("structural", "kind", "plan-length", "first-push-p", "first-grasp-psy", "control")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tasks, "with_every_start", batch_of_one)  # solving all starts takes long
         return profile({"mine": policy}, parts, (0.0, 1.0), 6)
@@ -132,16 +132,16 @@ def test_a_push_against_the_planned_direction_is_not_direct():
     assert is_direct(cells, 0 * planned).tolist() == [False, False, True]
 
 
-def test_episodes_are_grouped_by_plan_length_first_push_and_first_pull():
+def test_episodes_are_grouped_by_plan_length_first_push_and_first_grasp():
     table = pd.DataFrame(
-        {"plan": [11.0, 9.0, 10.0], "choice": [0, -1, 1], "pull": [-1, 0, 1]},
+        {"plan": [11.0, 9.0, 10.0], "choice": [0, -1, 1], "grasp": [-1, 0, 1]},
     )
     lengths = plan_lengths(table)
     pushes = first_pushes(table)
     assert list(lengths) == ["10-14", "5-9", "10-14"]
     assert list(lengths.categories) == ["5-9", "10-14"]
     assert list(pushes) == ["no choice", "away from it", "to the exit"]
-    assert list(first_pulls(table)) == ["another object", "no pull", "the tool"]
+    assert list(first_grasps(table)) == ["another object", "no grasp", "the tool"]
 
 
 def test_policies_that_see_different_features_are_refused(policy):
@@ -169,13 +169,13 @@ def test_tables_have_a_column_for_each_policy_and_subgoal():
     assert failure_table(table)["none"].tolist() == [5, 1]
 
 
-def test_knowledge_is_the_share_of_first_pushes_and_pulls_that_were_right():
+def test_knowledge_is_the_share_of_first_pushes_and_grasps_that_were_right():
     counts = {
         ("first-push-p", "to the exit"): (110, 109),
         ("first-push-p", "away from it"): (123, 100),
         ("first-push-p", "no choice"): (767, 700),
-        ("first-pull-psy", "the tool"): (2, 2),
-        ("first-pull-psy", "another object"): (6, 3),
+        ("first-grasp-psy", "the tool"): (2, 2),
+        ("first-grasp-psy", "another object"): (6, 3),
     }
     rows = [
         {"policy": "a", "part": part, "level": level, "tasks": tasks, "solved": solved}

@@ -38,7 +38,7 @@ def test_transfers_change_layout_or_colours_and_draw_alike_in_all_parts():
     for part in ("kind", "plan-length", "first-push-p"):
         assert same(PARTS[part](SAMPLING).tasks, perceptual, *LAYOUT, "palette")
     assert same(PARTS["first-push-pst"](SAMPLING).tasks, both, *LAYOUT, "palette")
-    for part, tasks in {"first-pull-psy": perceptual, "first-pull-pstsy": both}.items():
+    for part, tasks in {"first-grasp-psy": perceptual, "first-grasp-pstsy": both}.items():
         swapped = PARTS[part](SAMPLING).tasks
         assert not same(swapped, tasks, *LAYOUT)
         assert np.array_equal(observe(swapped), observe(tasks))

@@ -6,6 +6,7 @@ import itertools
 import shutil
 from types import SimpleNamespace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,7 @@ import agents
 import trap_tube_jax as tt
 from agents import Policy
 from agents.arrays import read_arrays, write_arrays
+from agents.networks.agent import PARTS
 from agents.runs import checkpoint, history, program, progress, session
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
@@ -355,6 +357,19 @@ def test_fine_tuning_reads_the_agent_once_and_starts_from_its_network(tmp_path, 
     assert found.iteration == ITERATIONS
     steps = jax.tree.map(lambda x, y: x - y, found.params, policy.params)
     assert all(np.allclose(leaf, ITERATIONS, atol=1e-4) for leaf in jax.tree.leaves(steps))
+
+
+def test_fine_tuning_with_the_same_seed_draws_other_tasks(tmp_path):
+    run = small_run()
+    shared = program.Program(run.config, PLAIN)
+    first = shared.init(run)
+    path = tmp_path / "old.safetensors"
+    agents.save(path, Policy("old", run.config, first.params, 0))
+    second = shared.init(dataclasses.replace(run, finetune=path))
+    chex.assert_trees_all_equal(
+        *({part: state.params[part] for part in PARTS} for state in (first, second))
+    )
+    assert not np.array_equal(*(jax.random.key_data(state.key) for state in (first, second)))
 
 
 def test_an_agent_of_another_network_is_not_fine_tuned(tmp_path):

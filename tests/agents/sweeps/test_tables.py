@@ -132,18 +132,38 @@ def test_differences_are_from_the_first_algorithm_and_corrected_for_their_number
         ([0.5, 0.02], [0.5, 0.04]),
         ([0.0, 0.0, 0.1], [0.0, 0.0, 0.1]),
         ([0.2], [0.2]),
+        ([0.03, np.nan, 0.02], [0.04, np.nan, 0.04]),  # without a test
+        ([np.nan], [np.nan]),
     ],
 )
 def test_holms_factors_never_let_a_larger_p_pass_a_smaller_one(p, corrected):
     np.testing.assert_allclose(tables.holm_factors(np.array(p)) * p, corrected)
 
 
-def test_seeds_that_all_solve_as_much_differ_for_certain_or_not_at_all():
-    tested = pd.DataFrame(rows("a", [5, 5]) + rows("b", [5, 5]) + rows("c", [6, 6]))
-    found = tables.differences(tables.reported(tested)).set_index(["task_set", "algorithm"])
+def test_seeds_that_do_not_vary_have_no_test():
+    given = {"a": [3] * 5, "b": [3] * 10, "c": [4] * 5, "d": [3, 3, 3, 3, 4]}
+    results = pd.DataFrame([row for name in given for row in rows(name, given[name])])
+    found = tables.differences(tables.reported(results)).set_index(["task_set", "algorithm"])
     columns = ["difference", "low", "high", "p"]
-    np.testing.assert_allclose(found.loc[("p", "b"), columns].tolist(), [0, 0, 0, 1])
-    np.testing.assert_allclose(found.loc[("p", "c"), columns].tolist(), [10, 10, 10, 0])
+    for name, difference in {"b": 0, "c": 10}.items():
+        np.testing.assert_allclose(
+            found.loc[("p", name), columns].tolist(), [difference, *3 * [np.nan]]
+        )
+    assert found.loc[("p", "d"), "p"] == pytest.approx(0.3739, abs=1e-4)  # t = 1 at 4
+    shown = tables.tables(results, curves(), ABOUT)["Difference from a, points"]
+    assert shown.loc["{P}"].tolist() == ["+0.0", "+10.0", "+2.0 [-3.6, 7.6]"]
+    figures.draw_differences(found.reset_index(), ABOUT)
+
+
+def test_an_algorithm_that_lacks_a_set_leaves_its_differences_to_others():
+    given = [row for name in "abc" for row in rows(name, [5, 6, 7], task_set="st")]
+    results = pd.DataFrame(given + rows("a", [5, 6, 7]) + rows("b", [1, 2, 3]))
+    tested = tables.reported(results)
+    shown = tables.tables(results, curves(), ABOUT)["Difference from a, points"]
+    assert shown.loc["{P}"].tolist() == ["-40.0 [-62.7, -17.3]*", "–"]
+    assert "–" in tables.markdown(shown)
+    figure = figures.draw_differences(tables.differences(tested), ABOUT)
+    assert [axis.get_title() for axis in figure.axes] == ["{P}", "{St}", tables.MEAN]
 
 
 def test_a_grid_tested_on_base_alone_has_no_mean_without_base():

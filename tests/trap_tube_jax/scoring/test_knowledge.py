@@ -1,11 +1,11 @@
-"""First pushes and first pulls on hand-made boards."""
+"""First pushes and first grasps on hand-made boards."""
 
 import jax
 import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from trap_tube_jax.scoring.knowledge import choice_of_exit, first_pull, first_push
+from trap_tube_jax.scoring.knowledge import choice_of_exit, first_grasp, first_push
 
 UP, DOWN, LEFT, RIGHT = range(4)
 # The tool is above the food's column. The agent is above the tool and carries it by grasping down.
@@ -76,14 +76,14 @@ TOOL_ABOVE = {"agent": (4, 5), "tool": (3, 3)}  # the tool is 1 x 4, the agent b
 
 
 @pytest.mark.parametrize(
-    ("where", "actions", "pull"),
+    ("where", "actions", "grasp"),
     [
         (TOOL_ABOVE, [(UP, LEFT)], 1),
         (TOOL_ABOVE, [(DOWN, LEFT)], -1),  # of the tube
-        (TOOL_ABOVE, [(DOWN, LEFT), (UP, LEFT)], -1),  # later pulls do not count
-        (TOOL_ABOVE, [(LEFT, LEFT), (UP, LEFT)], 1),  # grasping ground is no pull
-        (TOOL_ABOVE, [(DOWN, DOWN)], 0),  # the tube stops the agent
-        (TOOL_ABOVE, [(DOWN, UP), (UP, RIGHT)], 1),  # the tool stops it
+        (TOOL_ABOVE, [(DOWN, LEFT), (UP, LEFT)], -1),  # later grasps do not count
+        (TOOL_ABOVE, [(LEFT, LEFT), (UP, LEFT)], 1),  # grasps at ground do not count
+        (TOOL_ABOVE, [(DOWN, DOWN), (UP, RIGHT)], -1),  # even if the tube stops the agent
+        (TOOL_ABOVE, [(UP, UP)], 1),  # a push
         (TOOL_ABOVE, [], 0),
         ({"agent": (4, 0), "tool": (0, 8)}, [(LEFT, UP)], 0),  # grasps beyond the board
         ({"agent": (6, 1), "tool": (0, 8)}, [(RIGHT, UP)], -1),  # the trap
@@ -92,9 +92,11 @@ TOOL_ABOVE = {"agent": (4, 5), "tool": (3, 3)}  # the tool is 1 x 4, the agent b
         ({"agent": (6, 10), "tool": (0, 8)}, [(LEFT, DOWN)], -1),  # the exit
     ],
 )
-def test_whether_the_first_pull_held_the_tool(where, actions, pull):
+def test_whether_the_first_grasp_held_the_tool(where, actions, grasp):
     state = task("..x......e..").replace(
         **{name: np.array(cell, np.int32) for name, cell in where.items()},
         tool_extent=np.array((1, 4), np.int32),
     )
-    assert first_pull(state, np.array(actions, np.int32).reshape(-1, 2)) == pull
+    actions = np.array(actions, np.int32).reshape(-1, 2)
+    assert first_grasp(state, actions) == grasp
+    assert first_grasp(state.replace(terminated=np.array(True)), actions) == 0
