@@ -208,7 +208,7 @@ def agents_that_know_colors() -> list[str]:
     rows = [f"| best-pstsy, without colours | {known} |"]
     for policy in rows_of("colors", "first_pushes")["policy"].unique():
         pushes = first_pushes("colors/first_pushes.csv", policy)
-        if policy == "colors-p+psy+pstsy":  # chosen on the first tasks
+        if policy in ("seed 202", "colors-p+psy+pstsy"):  # chosen on the first tasks
             pushes -= first_pushes("colors/development.csv", policy)
         known = knowledge(pushes, percent_of("colors/confirmation.csv", policy))
         rows.append(f"{policy} | {known} |")
@@ -292,8 +292,9 @@ def test_stated_results_are_those_of_the_records():
     rnd = -rnd[["difference", "high", "low"]]
     rows[CURIOSITIES].append("by {:.1f} points on {{P}} [{:.1f}, {:.1f}]".format(*rnd))
     for page, expected in rows.items():
+        text = " ".join(text_of(page).split())
         for row in expected:
-            assert row in text_of(page), (page, row)
+            assert row in text, (page, row)
 
 
 def test_pages_stay_short():

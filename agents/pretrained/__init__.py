@@ -1,6 +1,6 @@
 """Trained agents that are shipped with the code, as files of safetensors.
 
-fast-base           the preset `fast` on base: the median of ten seeds
+fast-base           the preset `fast` on base: seed 7 of ten
 icm-base            the preset `paper` on base, PPO + ICM
 best-pstsy          the preset `best` on {P, St, Sy}: the median of five seeds
 colors-finetuned    `best` with `object_colors` and less replay on {P} (twice), {P, St} and
