@@ -217,7 +217,8 @@ def agents_that_know_colors() -> list[str]:
         for name in ("last iteration", "fine-tuned", "fine-tuned as a control")
     )
     before, chosen, control = (100 * x.iloc[0] / x.sum() for x in (before, chosen, control))
-    rows += [f"from {before:.1f} to {chosen:.1f} %", f"without them, it has {control:.1f} %"]
+    rows.append(f"from {before:.1f} to {chosen:.1f} %")
+    rows.append(f"without limit and discount, it ends at {control:.1f} %")
     return rows
 
 
