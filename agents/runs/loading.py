@@ -76,7 +76,7 @@ def load(
 
 
 def short_name(source: str | Path) -> str:
-    """Returns a name for files: that of the run, the file or the shipped agent."""
+    """Returns the name of the run, file or shipped agent, without folder and suffix."""
     path = expand(source).resolve()  # a source may be "."
     run = run_of(path)
     return (run.path if run else path).name.removesuffix(SUFFIX)

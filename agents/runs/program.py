@@ -74,7 +74,7 @@ class Program:
         key = jax.random.key(run.seed)
         if run.finetune is None:
             return self.learner.init(key)
-        # Other tasks than those of the first training, even with the same seed.
+        # Even with the same seed, fine-tuning draws other tasks than the first training.
         state = self.learner.init(jax.random.fold_in(key, 1))
         arrays = to_arrays(load(run.finetune).params)
         try:

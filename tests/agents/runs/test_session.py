@@ -6,8 +6,6 @@ import itertools
 import shutil
 from types import SimpleNamespace
 
-import chex
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -16,9 +14,7 @@ from rich.console import Console
 
 import agents
 import trap_tube_jax as tt
-from agents import Policy
 from agents.arrays import read_arrays, write_arrays
-from agents.networks.agent import PARTS
 from agents.runs import checkpoint, history, program, progress, session
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
@@ -28,7 +24,6 @@ from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run
 from helpers.small_runs import final_state, small_config, untimed
-from helpers.tiny_policy import random_params
 from helpers.training import (
     ITERATIONS,
     PLAIN,
@@ -341,42 +336,6 @@ def test_a_run_on_a_mixture_is_scored_on_it_and_goes_on(tmp_path, monkeypatch):
     assert len(untimed(tmp_path / "x")) == 2
     assert set(results(tmp_path)["task_set"]) == {"base+p"}
     assert agents.load(tmp_path / "x").config.env_id == "TrapTube-v0+PerceptualTrapTube-v0"
-
-
-def test_fine_tuning_reads_the_agent_once_and_starts_from_its_network(tmp_path, monkeypatch):
-    replace_training(monkeypatch, count_up)
-    path = tmp_path / "old.safetensors"
-    run = small_run(finetune=path)
-    policy = Policy("old", run.config, random_params(run.config), 9)
-    agents.save(path, policy)
-    with pytest.raises(Stopped):
-        train_run(tmp_path / "x", run, PLAIN, stop=lambda: True)
-    path.unlink()
-    train_run(tmp_path / "x", run, PLAIN)
-    found = agents.load(tmp_path / "x")
-    assert found.iteration == ITERATIONS
-    steps = jax.tree.map(lambda x, y: x - y, found.params, policy.params)
-    assert all(np.allclose(leaf, ITERATIONS, atol=1e-4) for leaf in jax.tree.leaves(steps))
-
-
-def test_fine_tuning_with_the_same_seed_draws_other_tasks(tmp_path):
-    run = small_run()
-    shared = program.Program(run.config, PLAIN)
-    first = shared.init(run)
-    path = tmp_path / "old.safetensors"
-    agents.save(path, Policy("old", run.config, first.params, 0))
-    second = shared.init(dataclasses.replace(run, finetune=path))
-    chex.assert_trees_all_equal(
-        *({part: state.params[part] for part in PARTS} for state in (first, second))
-    )
-    assert (jax.random.key_data(first.key) != jax.random.key_data(second.key)).any()
-
-
-def test_an_agent_of_another_network_is_not_fine_tuned(tmp_path):
-    run = small_run(finetune="fast-base")
-    with pytest.raises(ValueError, match=r"fast-base has another network .* core/.* is float32"):
-        train_run(tmp_path / "x", run, PLAIN)
-    assert not RunFolder(tmp_path / "x").config.exists()
 
 
 def test_a_path_may_begin_at_home(tmp_path, monkeypatch):

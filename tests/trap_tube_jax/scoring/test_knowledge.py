@@ -100,3 +100,11 @@ def test_whether_the_first_grasp_held_the_tool(where, actions, grasp):
     actions = np.array(actions, np.int32).reshape(-1, 2)
     assert first_grasp(state, actions) == grasp
     assert first_grasp(state.replace(terminated=np.array(True)), actions) == 0
+
+
+def test_a_fifth_of_the_first_grasps_of_random_actions_hold_the_tool():
+    """As protocol.md says, 20 to 21 %; the standard error is 1 %."""
+    tasks = tt.evaluation_tasks("psy", 2000)
+    actions = jax.random.randint(jax.random.key(0), (2000, 50, 2), 0, 4)
+    grasps = np.asarray(jax.jit(jax.vmap(first_grasp))(tasks, actions))
+    assert (grasps == 1).sum() / (grasps != 0).sum() == pytest.approx(0.205, abs=0.03)

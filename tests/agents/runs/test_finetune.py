@@ -1,0 +1,54 @@
+"""Runs that start from the network of another agent."""
+
+import dataclasses
+
+import chex
+import jax
+import numpy as np
+import pytest
+
+import agents
+from agents import Policy
+from agents.networks.agent import PARTS
+from agents.runs import program
+from agents.runs.folder import RunFolder
+from agents.runs.session import train_run
+from helpers.tiny_policy import random_params
+from helpers.training import ITERATIONS, PLAIN, count_up, replace_training, small_run
+from trap_tube_jax.interruptions import Stopped
+
+
+def test_fine_tuning_reads_the_agent_once_and_starts_from_its_network(tmp_path, monkeypatch):
+    replace_training(monkeypatch, count_up)
+    path = tmp_path / "old.safetensors"
+    run = small_run(finetune=path)
+    policy = Policy("old", run.config, random_params(run.config), 9)
+    agents.save(path, policy)
+    with pytest.raises(Stopped):
+        train_run(tmp_path / "x", run, PLAIN, stop=lambda: True)
+    path.unlink()
+    train_run(tmp_path / "x", run, PLAIN)
+    found = agents.load(tmp_path / "x")
+    assert found.iteration == ITERATIONS
+    steps = jax.tree.map(lambda x, y: x - y, found.params, policy.params)
+    assert all(np.allclose(leaf, ITERATIONS, atol=1e-4) for leaf in jax.tree.leaves(steps))
+
+
+def test_fine_tuning_with_the_same_seed_draws_other_tasks(tmp_path):
+    run = small_run()
+    shared = program.Program(run.config, PLAIN)
+    first = shared.init(run)
+    path = tmp_path / "old.safetensors"
+    agents.save(path, Policy("old", run.config, first.params, 0))
+    second = shared.init(dataclasses.replace(run, finetune=path))
+    chex.assert_trees_all_equal(
+        *({part: state.params[part] for part in PARTS} for state in (first, second))
+    )
+    assert (jax.random.key_data(first.key) != jax.random.key_data(second.key)).any()
+
+
+def test_an_agent_of_another_network_is_not_fine_tuned(tmp_path):
+    run = small_run(finetune="fast-base")
+    with pytest.raises(ValueError, match=r"fast-base has another network .* core/.* is float32"):
+        train_run(tmp_path / "x", run, PLAIN)
+    assert not RunFolder(tmp_path / "x").config.exists()
