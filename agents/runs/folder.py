@@ -39,6 +39,7 @@ class RunFolder:
         self.provenance = path / "provenance.json"  # machines, versions and commits that trained it
         self.metrics = path / "metrics.csv"  # a row per iteration
         self.evaluations = path / "evaluations.csv"  # a row per evaluated iteration and task set
+        self.start = path / "start.safetensors"  # the agent that a fine-tuned run started from
         self.best = path / "best.safetensors"  # the best evaluation's, with `evaluate_every`
         self.checkpoints = path / "checkpoints"  # files named by their iteration
         self.tensorboard = path / "tensorboard"

@@ -57,7 +57,7 @@ def load(
     if is_file(folder.config):
         return _load_run(folder, iteration, imports).replace(greedy=greedy)
     path = folder.path
-    if (run := run_of(path)) and path != run.best:
+    if (run := run_of(path)) and path not in (run.start, run.best):
         number = f", and iteration {path.stem}" if path.parent == run.checkpoints else ""
         raise ValueError(f"{source} is in the run {run.path}; give the run{number}")
     if not path.is_file():

@@ -10,14 +10,14 @@ import numpy as np
 
 import trap_tube_jax as tt
 from agents.acting.evaluation import evaluate
+from agents.acting.policy import Policy
 from agents.arrays import from_arrays, to_arrays
 from agents.config import Config
 from agents.networks.agent import PARTS
 from agents.parallel.devices import Placement
 from agents.ppo.learner import Learner, TrainState, make_learner
 from agents.runs.evaluator import Evaluator, default_sets
-from agents.runs.loading import load
-from agents.runs.run import Run, RunOptions
+from agents.runs.run import RunOptions
 
 Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
 Metrics = dict[str, np.ndarray]
@@ -65,23 +65,24 @@ class Program:
         """Trained numbers."""
         return sum(leaf.size for leaf in jax.tree.leaves(self.state_shapes.params))
 
-    def init(self, run: Run) -> TrainState:
-        """Returns the first state of a run.
+    def init(self, seed: int, start: Policy | None = None) -> TrainState:
+        """Returns the first state of a run, with the parameters of `start` if it is fine-tuned.
 
         Raises:
-          ValueError: the agent to fine-tune does not exist, or its network has other shapes.
+          ValueError: the network of `start` has other shapes.
         """
-        key = jax.random.key(run.seed)
-        if run.finetune is None:
+        key = jax.random.key(seed)
+        if start is None:
             return self.learner.init(key)
         # Even with the same seed, fine-tuning draws other tasks than the first training.
         state = self.learner.init(jax.random.fold_in(key, 1))
-        arrays = to_arrays(load(run.finetune).params)
         try:
-            params = from_arrays(arrays, {part: state.params[part] for part in PARTS})
+            params = from_arrays(
+                to_arrays(start.params), {part: state.params[part] for part in PARTS}
+            )
         except ValueError as error:
             raise ValueError(
-                f"{run.finetune} has another network than these settings: {error}"
+                f"{start.name} has another network than these settings: {error}"
             ) from error
         return state._replace(params={**state.params, **params})
 

@@ -22,7 +22,7 @@ from agents.runs.history import (
     restore,
     validation_rows,
 )
-from agents.runs.loading import read_policy, save
+from agents.runs.loading import load, read_policy, save
 from agents.runs.loggers import open_loggers
 from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read_rows, rewind_rows
 from agents.runs.program import Metrics, Program
@@ -36,6 +36,7 @@ class Progress:
     Attributes:
       state: returns the current training state. Training replaces the function.
       last: the newest row of metrics; None before the first iteration.
+      start: the agent to fine-tune, of a new run; else None.
     """
 
     def __init__(
@@ -70,7 +71,10 @@ class Progress:
         self._check_evaluations()
         if program.validation:
             check_best(stored, done, program.sets)
-        first = program.init(run) if restored is None else restored
+        self.start: Policy | None = None
+        if restored is None and run.finetune is not None:
+            self.start = load(run.finetune).replace(name=str(run.finetune))
+        first = program.init(run.seed, self.start) if restored is None else restored
         self.state: Callable[[], TrainState] = lambda: first
 
     @property
@@ -84,11 +88,13 @@ class Progress:
         return self.last is not None and is_last(self.last, self.run.config)
 
     def begin(self) -> None:
-        """Writes config.json and, for a new run, the first checkpoint.
+        """Writes config.json and, for a new run, the agent to fine-tune and the first checkpoint.
 
         Removes rows after the newest checkpoint.
         """
         self.folder.write_config(self.run, self.program.options)
+        if self.start is not None:
+            save(self.folder.start, self.start)
         if self.last is None:
             self.save()  # from now on, rows without a checkpoint mean that files were removed
         for rows in (self.folder.metrics, self.folder.evaluations):

@@ -1,7 +1,5 @@
 """Runs that start from the network of another agent."""
 
-import dataclasses
-
 import chex
 import jax
 import numpy as np
@@ -18,7 +16,7 @@ from helpers.training import ITERATIONS, PLAIN, count_up, replace_training, smal
 from trap_tube_jax.interruptions import Stopped
 
 
-def test_fine_tuning_reads_the_agent_once_and_starts_from_its_network(tmp_path, monkeypatch):
+def test_fine_tuning_reads_and_keeps_the_agent_and_starts_from_its_network(tmp_path, monkeypatch):
     replace_training(monkeypatch, count_up)
     path = tmp_path / "old.safetensors"
     run = small_run(finetune=path)
@@ -26,6 +24,9 @@ def test_fine_tuning_reads_the_agent_once_and_starts_from_its_network(tmp_path, 
     agents.save(path, policy)
     with pytest.raises(Stopped):
         train_run(tmp_path / "x", run, PLAIN, stop=lambda: True)
+    start = agents.load(RunFolder(tmp_path / "x").start)
+    chex.assert_trees_all_equal(start.params, policy.params)
+    assert (start.iteration, start.config) == (9, run.config)
     path.unlink()
     train_run(tmp_path / "x", run, PLAIN)
     found = agents.load(tmp_path / "x")
@@ -34,16 +35,13 @@ def test_fine_tuning_reads_the_agent_once_and_starts_from_its_network(tmp_path, 
     assert all(np.allclose(leaf, ITERATIONS, atol=1e-4) for leaf in jax.tree.leaves(steps))
 
 
-def test_fine_tuning_with_the_same_seed_draws_other_tasks(tmp_path):
+def test_fine_tuning_with_the_same_seed_draws_other_tasks():
     run = small_run()
     shared = program.Program(run.config, PLAIN)
-    first = shared.init(run)
-    path = tmp_path / "old.safetensors"
-    agents.save(path, Policy("old", run.config, first.params, 0))
-    second = shared.init(dataclasses.replace(run, finetune=path))
-    chex.assert_trees_all_equal(
-        *({part: state.params[part] for part in PARTS} for state in (first, second))
-    )
+    first = shared.init(run.seed)
+    params = {part: first.params[part] for part in PARTS}
+    second = shared.init(run.seed, Policy("old", run.config, params, 0))
+    chex.assert_trees_all_equal({part: second.params[part] for part in PARTS}, params)
     assert (jax.random.key_data(first.key) != jax.random.key_data(second.key)).any()
 
 
