@@ -41,7 +41,7 @@ class Options:
       out: the folder of all grids.
       processes: programs at a time, by default one per core, or one on a GPU or TPU.
       seeds_per_program: seeds of a point that one program trains, by default all on a GPU or TPU
-        unless the network convolves, else one.
+        if the encoder is `objects`, else one.
       cluster: address of a Dask scheduler whose workers train the runs, as in tcp://HOST:8786.
     """
 
