@@ -53,7 +53,7 @@ def write_arrays(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
     write_bytes(path, safetensors.numpy.save(arrays, {"json": json.dumps(about)}))
 
 
-def read_arrays(path: Path, kind: Any = dict[str, Any]) -> tuple[Arrays, Any]:
+def read_arrays(path: Path, kind: Any) -> tuple[Arrays, Any]:
     """Inverts `write_arrays`.
 
     Args:

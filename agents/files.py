@@ -173,13 +173,15 @@ def lock_folder(path: Path, wait: float = 1) -> Iterator[None]:
     for entry in path.iterdir():
         if entry.is_symlink():  # writing would change a file elsewhere
             raise ValueError(f"{entry} is a link; replace it by a copy of what it names")
-    try:
-        with filelock.FileLock(path / ".lock", timeout=wait):
-            yield
-    except filelock.Timeout:
-        raise BusyError(f"{path} is being written by another process; wait for its end") from None
-    except NotImplementedError as error:
-        raise OSError(f"{path} cannot be locked: {error}") from error
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(filelock.FileLock(path / ".lock", timeout=wait))
+        except filelock.Timeout:
+            reason = f"{path} is being written by another process; wait for its end"
+            raise BusyError(reason) from None
+        except NotImplementedError as error:
+            raise OSError(f"{path} cannot be locked: {error}") from error
+        yield
 
 
 @contextlib.contextmanager

@@ -88,7 +88,7 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
     return Speed(
         options.preset,
         config.env_id,
-        learner.path,
+        learner.encoding.name,
         seeds,
         sum(steps[1:]) / options.repeats / timing.median_s,
         timing.median_s / options.iterations,

@@ -47,10 +47,13 @@ def same_cell(cell: jax.Array, other: jax.Array) -> jax.Array:
     return (cell[0] == other[0]) & (cell[1] == other[1])
 
 
-def bar_covers(corner: jax.Array, extent: jax.Array, cell: jax.Array) -> jax.Array:
-    """Tests whether a cell i32[2] is in the bar at `corner` i32[2] of size `extent` i32[2]."""
+def bar_covers(corner: Any, extent: Any, cell: Any) -> Any:
+    """Tests whether cells i32[..., 2] are in bars at `corner` of size `extent`, i32[..., 2] each.
+
+    NumPy arrays give NumPy arrays.
+    """
     inside = (cell >= corner) & (cell < corner + extent)
-    return inside[0] & inside[1]
+    return inside[..., 0] & inside[..., 1]
 
 
 def bar_cells(corner: jax.Array, extent: jax.Array) -> jax.Array:

@@ -91,14 +91,18 @@ def deferring(
     the main thread receives signals.
     """
     block = _DeferredSignal(on_first)
-    _process.blocks.append(block)
+    is_main = threading.current_thread() is threading.main_thread()
+    receives = is_main or _process.is_command
     before = {}
+    if receives:
+        _process.blocks.append(block)
     if not _process.is_command:
         before = _install_handlers(lambda number, _: handle_signal(number))
     try:
         yield lambda: block.received
     finally:
-        _process.blocks.pop()
+        if receives:
+            _process.blocks.remove(block)
         for number, handler in before.items():
             signal.signal(number, handler)
 

@@ -29,9 +29,9 @@ class Experience(NamedTuple):
 
     episodes: Episodes
     features: jax.Array
-    hidden: Any = None
-    next_hidden: Any = None
-    action_embedding: Any = None
+    hidden: jax.Array
+    next_hidden: jax.Array | None
+    action_embedding: jax.Array
 
 
 class Curiosity:

@@ -43,11 +43,12 @@ class Agent:
         board = jnp.zeros((1, BOARD_SIZE, BOARD_SIZE, self.config.num_features), jnp.uint8)
         with contract("encoder", self.config.encoder):
             # Only Flax's own layers, in a registered encoder, use the folded key; see `draw`.
-            features, encoder = self.encoder.init_with_output(jax.random.fold_in(key, 0), board)
+            encoder = self.encoder.init(jax.random.fold_in(key, 0), board)
+            assert_only_params(encoder)
+            features = self.encoder.apply(encoder, board)
             chex.assert_shape(features, (1, None))  # [M, F]
             chex.assert_axis_dimension_gt(features, 1, 0)
             chex.assert_type(features, jnp.float32)
-            assert_only_params(encoder)
         state = jnp.zeros((1, self.config.hidden), jnp.float32)
         action = jnp.zeros((1, 2), jnp.int32)
         reward = jnp.zeros(1, jnp.float32)

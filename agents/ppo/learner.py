@@ -113,11 +113,6 @@ class Learner:
     optimizer: optax.GradientTransformation
     axis: EpisodeAxis = ONE_DEVICE
 
-    @property
-    def path(self) -> str:
-        """Returns how observations are encoded: `plain`, or `fast` on a CPU."""
-        return self.encoding.name
-
     def init(self, key: jax.Array) -> TrainState:
         """Returns the first state; draws the parameters with `key`, one PRNG key."""
         return jax.jit(self._init)(key)  # compiled as a whole in a fraction of the time
@@ -341,6 +336,8 @@ def make_learner(
     if env is None:
         env = tt.make(config.env_id, num_features=config.num_features, max_steps=config.max_steps)
     config.validate(env)
+    agent = machine.make_agent(config)
+    jax.eval_shape(agent.init, jax.random.key(0))  # names an encoder that the curiosity uses, too
     curiosity = make_curiosity(config, env)
     memory = jax.tree.leaves(jax.eval_shape(curiosity.memory))
     if axis.size > 1 and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in memory):
@@ -348,6 +345,5 @@ def make_learner(
             f"curiosity {config.curiosity!r} cannot train on several devices: they average its "
             "memory, so its arrays must be floats"
         )
-    agent = machine.make_agent(config)
     encoding = machine.make_encoding(agent, curiosity.encode)
     return Learner(config, env, agent, encoding, curiosity, make_optimizer(config), axis)

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 import trap_tube_jax as tt
 from trap_tube_jax import dynamics
+from trap_tube_jax.geometry import bar_covers
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
 
 # In the order of a plan. Tool touched: the agent has grasped the tool. Tool moved and food moved:
@@ -52,8 +53,8 @@ def last_subgoals(tasks: tt.State, actions: np.ndarray, cells: Cells) -> np.ndar
     """
     agent, tool, food = cells
     extent = np.asarray(tasks.tool_extent)[:, None]
-    at_hand = _covers(tool[:, :-1], extent, agent[:, :-1] + DIRECTIONS[actions[..., 0]])
-    is_inside = _covers(tool[:, :-1], extent, agent[:, :-1])
+    at_hand = bar_covers(tool[:, :-1], extent, agent[:, :-1] + DIRECTIONS[actions[..., 0]])
+    is_inside = bar_covers(tool[:, :-1], extent, agent[:, :-1])
     reached = [
         np.ones(len(agent), bool),
         (at_hand & ~is_inside).any(axis=1),
@@ -72,14 +73,9 @@ def _walks_to_food(board: np.ndarray, extent: np.ndarray, *cells: np.ndarray) ->
     """
     cell = np.moveaxis(np.indices((BOARD_SIZE, BOARD_SIZE)), 0, -1)
     agent, tool, food = (x[:, :, None, None] for x in cells)
-    is_tool = _covers(tool, extent[:, :, None, None], cell)
+    is_tool = bar_covers(tool, extent[:, :, None, None], cell)
     is_food = (cell == food).all(axis=-1) & ~is_tool
     is_free = ((board == GROUND)[:, None] & ~is_tool) | is_food
     start = (cell == agent).all(axis=-1)
     steps = ndimage.generate_binary_structure(2, 1)[None, None]
     return (ndimage.binary_propagation(start, steps, mask=is_free) & is_food).any(axis=(2, 3))
-
-
-def _covers(corner: np.ndarray, extent: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Tests whether the tool at `corner` covers `cell`, bool[...]."""
-    return np.all((cell >= corner) & (cell < corner + extent), axis=-1)

@@ -21,7 +21,7 @@ class CommandConsole(Console):
         super().__init__(force_terminal=is_terminal, **options)
 
     def on_broken_pipe(self) -> None:
-        """Is called instead of an error."""
+        """Ends the command; rich calls this when stdout is closed."""
         self.quiet = True
         interruptions.close_stdout()
         interruptions.handle_signal(signal.SIGPIPE)

@@ -1,4 +1,4 @@
-"""Pictures of results, which never cost the results."""
+"""Draws pictures of results; a picture that fails is a warning, never an error."""
 
 import contextlib
 import io

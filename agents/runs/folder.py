@@ -128,7 +128,7 @@ def run_of(path: Path) -> RunFolder | None:
 
 
 def runs_near(path: Path) -> str:
-    """Says which runs a path that is none may have meant, for messages."""
+    """Returns a hint, for messages, that names the runs near a path that holds none."""
     if inside := _runs_in(path):
         return f"give one of its runs: {_listed(inside)}"
     known = [*_runs_in(path.parent), *_runs_in(RUNS)]

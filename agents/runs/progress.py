@@ -120,7 +120,7 @@ class Progress:
         self.console.out(
             f"{self.folder.path}: {train_set}, curiosity {config.curiosity}, "
             f"seed {self.run.seed}, {self.program.num_parameters:,} parameters{origin}\n"
-            f"On {self.program.placement}, {self.program.learner.path} path{together}. "
+            f"On {self.program.placement}, {self.program.learner.encoding.name} path{together}. "
             "Compiling, which takes up to a minute ..."
         )
 
@@ -157,7 +157,7 @@ class Progress:
     def finish(self) -> tt.Scores | None:
         """Plays the test tasks with the final policy, or the best one; writes the results.
 
-        Returns the scores; None if they are in the files, and so is the report of all training.
+        Returns the scores, or None if the files already hold the scores and the report.
         """
         options = self.program.options
         policy = self._policy()

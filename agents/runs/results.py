@@ -45,7 +45,7 @@ def results(paths: Paths) -> pd.DataFrame:
         commit = machines[-1]["commit"] if machines else None
         stored = folder.stored()
         origin = stored.get("finetune") or ""
-        table = _table(folder, folder.evaluations, finetune=origin, commit=commit)
+        table = _table(folder, folder.evaluations, stored, finetune=origin, commit=commit)
         settings = stored["config"].items()
         tables.append(table.assign(**{k: str(v) if type(v) is list else v for k, v in settings}))
     return _join(tables)
@@ -57,7 +57,7 @@ def metrics(paths: Paths) -> pd.DataFrame:
     Columns: run, algorithm, seed, and the columns of `metrics.csv`. Arguments and errors as in
     `results`.
     """
-    return _join([_table(folder, folder.metrics) for folder in find_runs(paths)])
+    return _join([_table(run, run.metrics, run.stored()) for run in find_runs(paths)])
 
 
 def find_runs(paths: Paths) -> list[RunFolder]:
@@ -95,11 +95,10 @@ def _runs_below(path: Path, seen: set[str]) -> Iterable[Path]:
             yield from _runs_below(entry, seen)
 
 
-def _table(folder: RunFolder, path: Path, **about: Any) -> pd.DataFrame:
-    run = folder.stored()
+def _table(folder: RunFolder, path: Path, stored: dict[str, Any], **about: Any) -> pd.DataFrame:
     rows = read_rows(path)
     names = ("algorithm", "seed")
-    first = {"run": str(folder.path), **{name: run[name] for name in names}, **about}
+    first = {"run": str(folder.path), **{name: stored[name] for name in names}, **about}
     return rows.assign(**first)[[*first, *rows]]
 
 

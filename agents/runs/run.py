@@ -23,8 +23,8 @@ class Run:
     Attributes:
       config: the settings.
       seed: seed of all draws.
-      algorithm: name in tables, by default `ppo+<curiosity>`, of a fine-tuned agent followed by
-        `, fine-tuned`; see `check_algorithm`.
+      algorithm: name in tables, by default `ppo+<curiosity>`, with `, fine-tuned` appended for a
+        fine-tuned agent; see `check_algorithm`.
       imports: modules that registered names of the settings. They are recorded, and imported
         again only at the caller's request.
       finetune: agent whose parameters training starts from: a run's folder, a file of parameters

@@ -40,7 +40,8 @@ def train_run(
 ) -> tt.Scores | None:
     """Trains a run to its end from its newest checkpoint, evaluates it and writes its files.
 
-    A finished run is left unchanged. Only one process at a time may call `train_run` for a folder.
+    A finished run is not trained again: its options become `options`, and missing scores and a
+    missing report are added. Only one process at a time may call `train_run` for a folder.
 
     Args:
       path: the run's folder, made if missing; `~` is the home folder.

@@ -151,11 +151,14 @@ class Noisy(nn.Module):
         (None, "must be a flax.linen.Module, got NoneType"),
     ],
 )
-def test_an_encoder_that_breaks_its_contract_is_refused_in_one_line(module, message, monkeypatch):
+@pytest.mark.parametrize("curiosity", ["icm", "rnd"])  # the second uses encoders of its own
+def test_an_encoder_that_breaks_its_contract_is_refused_in_one_line(
+    module, message, curiosity, monkeypatch
+):
     monkeypatch.setitem(encoders, "mine", lambda config: module)
 
     def train() -> None:
-        made = make_learner(Config(encoder="mine"))
+        made = make_learner(Config(encoder="mine", curiosity=curiosity))
         jax.eval_shape(made.iterate, made.init(jax.random.key(0)))
 
     with pytest.raises(ValueError, match=message) as error:

@@ -113,3 +113,27 @@ except KeyboardInterrupt:
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
     assert done.stdout == b"goes on\n"
+
+
+def test_outside_a_command_the_main_thread_alone_receives_signals():
+    program = """
+import signal, threading
+from trap_tube_jax.interruptions import deferring
+begun, end = threading.Event(), threading.Event()
+def work():
+    with deferring() as request:
+        begun.set()
+        end.wait()
+        assert request() is None
+thread = threading.Thread(target=work)
+with deferring() as request:
+    thread.start()
+    begun.wait()
+    signal.raise_signal(signal.SIGINT)
+    end.set()
+    thread.join()
+    assert request() == signal.SIGINT
+    print("received")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert done.stdout == b"received\n"

@@ -32,7 +32,7 @@ def reward_of(name: str, features: Any, column: Any) -> np.ndarray:
     cells = jnp.zeros((*column.shape, 3, 2), jnp.uint8).at[:, :, 0, 1].set(column)
     layout = jax.tree.map(lambda x: jnp.stack([x] * len(column)), tt.base_state())
     episodes = Episodes(layout, cells, *[nothing] * 4)
-    experience = Experience(episodes, jnp.array(features, jnp.float32))
+    experience = Experience(episodes, jnp.array(features, jnp.float32), *[nothing] * 3)
     return np.asarray(make(name).reward({}, (), experience)[0])
 
 
@@ -79,9 +79,11 @@ def test_rnd_trains_the_predictor_alone():
     params = jax.jit(curiosity.init)(jax.random.key(1), board)
     encode = jax.jit(curiosity.encode)
 
+    nothing: Any = None
+
     def loss(params):
         features = encode(params, board)[None]
-        experience = Experience(None, features)  # pyright: ignore
+        experience = Experience(nothing, features, *[nothing] * 3)
         return jnp.sum(curiosity.losses(params, experience)["forward_loss"])
 
     features = encode(params, board)[1:]

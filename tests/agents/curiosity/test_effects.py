@@ -1,5 +1,7 @@
 """Effects: changes and grasps that are new to their episode, outside the agent's body."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,7 +114,8 @@ def test_food_and_tool_that_return_are_no_new_effect(by_hand):
 
 def test_an_effect_pays_the_inverse_of_its_kinds_rate(by_hand):
     curiosity = Effects(Config(reward_ema_decay=0.75))
-    experience = Experience(by_hand, jnp.zeros((2, 5, 0)))
+    nothing: Any = None
+    experience = Experience(by_hand, jnp.zeros((2, 5, 0)), *[nothing] * 3)
     pay, memory = curiosity.reward({}, curiosity.memory(), experience)
     np.testing.assert_allclose(memory, [2 / 6, 3 / 6, 0], rtol=1e-6)
     np.testing.assert_allclose(pay, [[2, 0, 3, 2], [0, 5, 0, 0]], rtol=1e-6)

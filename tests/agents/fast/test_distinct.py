@@ -59,7 +59,7 @@ def test_both_paths_play_the_same_episodes_and_have_the_same_loss_and_gradient(c
 
 def test_a_cpu_takes_the_fast_path():
     learner = make_learner(small_config())
-    assert (learner.path, learner.agent.core.scan_unroll) == ("fast", 1)
+    assert (learner.encoding.name, learner.agent.core.scan_unroll) == ("fast", 1)
 
 
 def test_several_seeds_in_one_program_are_encoded_as_alone():

@@ -329,7 +329,7 @@ def test_an_intrinsic_reward_is_zero_after_the_end_of_an_episode():
 def test_an_accelerator_takes_the_plain_path(backend, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     made = make_learner(PLAIN)
-    assert made.path == "plain"
+    assert made.encoding.name == "plain"
     assert made.agent.core.scan_unroll > 1
 
 
