@@ -6,9 +6,12 @@ written as soon as it is measured.
 """
 
 import dataclasses
+import os
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks import harness
@@ -63,32 +66,34 @@ def main(options: Options) -> list[str]:
         if name not in measurements:
             raise ValueError(f"no measurement {name!r}; allowed: {', '.join(measurements)}")
     names = options.only or tuple(measurements)
-    failed = [name for name in names if not run(name, measurements[name].split(), options)]
+    with tempfile.TemporaryDirectory() as cache:  # empty, as a first start needs it
+        succeeded = {x: run(x, measurements[x].split(), options, cache) for x in names}
+    failed = [name for name, success in succeeded.items() if not success]
     print(f"failed: {', '.join(failed) or 'none'}")
     return failed
 
 
-def run(name: str, words: list[str], options: Options) -> bool:
-    """Runs one benchmark; returns whether it succeeded."""
+def run(name: str, words: list[str], options: Options, cache: str) -> bool:
+    """Runs one benchmark, with a cache folder for compiled programs; returns if it succeeded."""
     command = [sys.executable, "-m", f"benchmarks.{words[0]}", *words[1:]]
     if options.output is not None:
         command += ["--output", str(options.output / f"{name}.json")]
     print(f"== {name}: {' '.join(command[1:])}", flush=True)
     start = time.perf_counter()
-    code = call(command, options.limit)
+    code = call(command, options.limit, {**os.environ, "XDG_CACHE_HOME": cache})
     outcome = "stopped" if code is None else f"exit code {code}"
     print(f"== {name}: {outcome} after {time.perf_counter() - start:.0f} s", flush=True)
     return code == 0
 
 
-def call(command: list[str], limit: float) -> int | None:
+def call(command: list[str], limit: float, environ: Mapping[str, str]) -> int | None:
     """Runs a command; returns its exit code, None if it takes more than `limit` seconds.
 
     Raises:
       Stopped: on a signal, after the command has ended.
     """
     code = None
-    with subprocess.Popen(command) as process, deferring(process.terminate) as request:
+    with subprocess.Popen(command, env=environ) as process, deferring(process.terminate) as request:
         try:
             code = process.wait(limit)
         except subprocess.TimeoutExpired:

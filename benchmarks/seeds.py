@@ -15,6 +15,7 @@ import trap_tube_jax as tt
 from agents import Config, TrainState, make_learner
 from agents.runs import compilation
 from benchmarks import harness
+from trap_tube_jax.checks import check_integer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +36,13 @@ class Options(harness.Options):
     seeds: tuple[int, ...] = (1, 8)
     iterations: int = 5
     cache: bool = False
+
+    def check(self) -> None:
+        """Checks the options before anything is measured."""
+        super().check()
+        for name, values in (("iterations", (self.iterations,)), ("seeds", self.seeds)):
+            for value in values:
+                check_integer(name, value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -73,7 +73,8 @@ class Progress:
             check_best(stored, done, program.sets)
         self.start: Policy | None = None
         if restored is None and run.finetune is not None:
-            self.start = load(run.finetune).replace(name=str(run.finetune))
+            source = stored.start if stored.start.is_file() else run.finetune
+            self.start = load(source).replace(name=str(run.finetune))
         first = program.init(run.seed, self.start) if restored is None else restored
         self.state: Callable[[], TrainState] = lambda: first
 

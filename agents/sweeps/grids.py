@@ -83,12 +83,19 @@ class Grid:
         for limit in ("processes", "seeds_per_program"):
             if getattr(options, limit) is not None:
                 check_integer(limit, getattr(options, limit))
-        configs = self.configs(options)
-        short = tt.task_set(next(iter(configs.values())).env_id).short
+        points = self.configs(options)
+        env_ids = {config.env_id for config in points.values()}
+        short = tt.task_set(env_ids.pop()).short if len(env_ids) == 1 else "sets"
         if (options.preset, short) != (self.options.preset, self.options.env):
             name = f"{name}-{options.preset}-{short}"
         name = name if options.name is None else options.name
         check_name(name)
+        for point in options.only:
+            if point not in points:
+                raise ValueError(f"no point {point!r}; allowed: {', '.join(points)}")
+        configs = {point: points[point] for point in options.only or points}
+        for config in configs.values():
+            make_learner(config)  # refuses what cannot be trained with
         root = options.out / name
         runs = {}
         for seed in range(options.seed, options.seed + options.seeds):
@@ -104,7 +111,7 @@ class Grid:
         return runs
 
     def configs(self, options: Options) -> dict[str, Config]:
-        """Returns the settings of every point by its name."""
+        """Returns the settings of every point by its name, whatever `options.only` chooses."""
         given = dict(map(_parse, options.settings))
         if len(given) < len(options.settings):
             raise ValueError(f"give a setting only once, got {' '.join(options.settings)}")
@@ -125,13 +132,7 @@ class Grid:
             point = ",".join(filter(None, [name, *labels])) or options.preset
             settings = {**common, **chosen, **self.points[name]}
             configs[point] = Config.preset(options.preset, **settings)
-        for name in options.only:
-            if name not in configs:
-                raise ValueError(f"no point {name!r}; allowed: {', '.join(configs)}")
-        chosen = {name: configs[name] for name in options.only or configs}
-        for config in chosen.values():
-            make_learner(config)  # refuses what cannot be trained with
-        return chosen
+        return configs
 
 
 def _parse(text: str) -> tuple[str, dict[str, Any]]:

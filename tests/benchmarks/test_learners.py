@@ -2,7 +2,9 @@
 
 import dataclasses
 import importlib
+import os
 import sys
+from collections.abc import Mapping
 
 import pytest
 
@@ -58,7 +60,8 @@ def test_an_accelerators_measurements_are_commands_that_exist(scale, monkeypatch
     commands = []
     codes = iter([1, *[0] * 9])
 
-    def call(command: list[str], limit: float) -> int:
+    def call(command: list[str], limit: float, environ: Mapping[str, str]) -> int:
+        assert not os.listdir(environ["XDG_CACHE_HOME"])
         commands.append(command)
         return next(codes)
 
@@ -75,11 +78,11 @@ def test_an_accelerators_measurements_are_commands_that_exist(scale, monkeypatch
 
 def test_a_measurement_ends_with_its_exit_code_its_limit_or_the_signal():
     python = [sys.executable, "-c"]
-    assert accelerator.call([*python, "raise SystemExit(3)"], limit=60) == 3
-    assert accelerator.call([*python, "input()"], limit=0) is None
+    assert accelerator.call([*python, "raise SystemExit(3)"], 60, os.environ) == 3
+    assert accelerator.call([*python, "input()"], 0, os.environ) is None
     parent = "import os, signal; os.kill(os.getppid(), signal.SIGTERM); signal.pause()"
     with pytest.raises(Stopped):
-        accelerator.call([*python, parent], limit=60)
+        accelerator.call([*python, parent], 60, os.environ)
 
 
 def test_an_unknown_measurement_is_refused():

@@ -1,5 +1,7 @@
 """Runs that start from the network of another agent."""
 
+import shutil
+
 import chex
 import jax
 import numpy as np
@@ -24,12 +26,15 @@ def test_fine_tuning_reads_and_keeps_the_agent_and_starts_from_its_network(tmp_p
     agents.save(path, policy)
     with pytest.raises(Stopped):
         train_run(tmp_path / "x", run, PLAIN, stop=lambda: True)
-    start = agents.load(RunFolder(tmp_path / "x").start)
+    folder = RunFolder(tmp_path / "x")
+    start = agents.load(folder.start)
     chex.assert_trees_all_equal(start.params, policy.params)
     assert (start.iteration, start.config) == (9, run.config)
     path.unlink()
-    train_run(tmp_path / "x", run, PLAIN)
-    found = agents.load(tmp_path / "x")
+    folder.metrics.unlink()  # as if killed before the first checkpoint
+    shutil.rmtree(folder.checkpoints)
+    train_run(folder.path, run, PLAIN)
+    found = agents.load(folder.path)
     assert found.iteration == ITERATIONS
     steps = jax.tree.map(lambda x, y: x - y, found.params, policy.params)
     assert all(np.allclose(leaf, ITERATIONS, atol=1e-4) for leaf in jax.tree.leaves(steps))

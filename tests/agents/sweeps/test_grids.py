@@ -60,6 +60,16 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, fresh_task_set
     assert run.config.env_id == "NearFood-v0"
 
 
+def test_a_grid_of_training_sets_has_one_folder(tmp_path):
+    """Whatever their order, and whichever are chosen."""
+    paths = set()
+    for value, only in (("base,p", ()), ("p,base", ()), ("base,p,st", ("env_id=p",))):
+        given = Options((f"env_id={value}",), only=only, out=tmp_path)
+        paths |= set(Grid().make_runs("sweep", given))
+    folder = tmp_path / "sweep-fast-sets"
+    assert paths == {folder / f"env_id={name}-seed0" for name in ("base", "p")}
+
+
 @pytest.mark.parametrize(
     ("name", "short", "iterations"), [("exp1", "base", 250), ("exp2", "pstsy", 500)]
 )
@@ -77,8 +87,9 @@ def test_a_named_grid_keeps_its_settings_unless_given():
     grid = GRIDS["curiosities"]
     for settings, iterations in ((("filters=[32,64]",), 312), (("iterations=20",), 20)):
         given = dataclasses.replace(grid.options, settings=settings, only=("ppo+effects",))
-        ((name, config),) = grid.configs(given).items()
-        assert (name, config.curiosity, config.iterations) == ("ppo+effects", "effects", iterations)
+        run = next(iter(grid.make_runs("curiosities", given).values()))
+        assert (run.algorithm, run.config.curiosity) == ("ppo+effects", "effects")
+        assert run.config.iterations == iterations
     assert next(iter(grid.make_runs("curiosities", grid.options))).parent.name == "curiosities"
     other = dataclasses.replace(grid.options, preset="fast")
     assert next(iter(grid.make_runs("curiosities", other))).parent.name == "curiosities-fast-pstsy"
