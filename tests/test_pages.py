@@ -234,6 +234,27 @@ def first_grasps() -> list[str]:
     return [text.format(*ends) for text, ends in zip(texts, low_high, strict=True)]
 
 
+def without_memory() -> list[str]:
+    """Returns the success in {P, Sy} after right and wrong first grasps, by memory."""
+    rows = rows_of("memory", "profile").query("part == 'first-grasp-psy'")
+    percent = 100 * rows["solved"] / rows["tasks"]
+    right, wrong = (
+        percent[rows["level"] == level].set_axis(rows["policy"].unique())
+        for level in ("the tool", "another object")
+    )
+    return [
+        "solves {:.1f} % of {{P, Sy}} after a right first grasp and {:.1f} % after a wrong one, "
+        "instead of {:.1f} and {:.1f} %; without `repeat_penalty`, which remembers, too, "
+        "{:.1f} and {:.1f} %".format(
+            *(
+                percent[policy]
+                for policy in ("no-memory", "best-pstsy", "no-memory-plain")
+                for percent in (right, wrong)
+            )
+        )
+    ]
+
+
 def steps_with_colors(*policies: str) -> int:
     """Returns the environment steps of trainings in which agents learned colours."""
     curves = rows_of("colors", "curves").groupby("policy")["transitions"]
@@ -274,7 +295,7 @@ def test_stated_results_are_those_of_the_records():
     ):
         solved = cells(percent_of("colors/test.csv", policies[0]))
         rows[PROTOCOL].append(f"| {sets} | {solved} | {steps_with_colors(*policies):,.0f} |")
-    rows[PROFILES] += agents_that_know_colors() + first_grasps()
+    rows[PROFILES] += agents_that_know_colors() + first_grasps() + without_memory()
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])
