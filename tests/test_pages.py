@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -206,12 +207,27 @@ def agents_that_know_colors() -> list[str]:
     pushes = first_pushes("profiles/profile.csv", "best-pstsy")
     known = knowledge(pushes, percent_of("leaderboard/confirmation.csv"))
     rows = [f"| best-pstsy, without colours | {known} |"]
+    right, solved = {}, {}
     for policy in rows_of("colors", "first_pushes")["policy"].unique():
         pushes = first_pushes("colors/first_pushes.csv", policy)
         if policy in ("seed 202", "colors-p+psy+pstsy"):  # chosen on the first tasks
             pushes -= first_pushes("colors/development.csv", policy)
-        known = knowledge(pushes, percent_of("colors/confirmation.csv", policy))
-        rows.append(f"{policy} | {known} |")
+        right[policy] = 100 * pushes.iloc[0] / pushes.sum()
+        solved[policy] = percent_of("colors/confirmation.csv", policy)
+        if not policy.startswith(("seed 2", "seed 300", "seed 301")):
+            rows.append(f"{policy} | {knowledge(pushes, solved[policy])} |")
+    earlier = [right[f"seed {number}"] for number in (202, 300, 301)]
+    rows.append("have {:.1f}, {:.1f} and {:.1f} % right first pushes".format(*earlier))
+    five = [f"seed {number}" for number in range(330, 335)]
+    mean = tables.mean_text(np.array([right[policy] for policy in five]), ".1f", high=100)
+    percent = pd.DataFrame(solved)[five].mean(axis=1)[["p", "pst", "psy", "pstsy"]]
+    rows.append(f"| mean of these five | {mean} | {cells(percent)} |")
+    kinds = rows_of("colors", "kinds").query("level == 'towards, along'").set_index("policy")
+    shares = 100 * kinds["solved"] / kinds["tasks"]
+    stuck = {f"{shares[name]:.1f} %" for name in ("seed 332", "seed 333")}
+    stuck.add(f"{shares['seed 333, strong curiosity again']:.1f} %")
+    rows.append(f"332 and 333 solve {stuck.pop()} each")
+    assert not stuck  # "333 still does"
     before, chosen, control = (
         first_pushes("colors/development.csv", f"seed 300, {name}")
         for name in ("last iteration", "fine-tuned", "fine-tuned as a control")
