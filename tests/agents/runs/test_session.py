@@ -5,6 +5,7 @@ import io
 import itertools
 import shutil
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ import trap_tube_jax as tt
 from agents.arrays import read_arrays, write_arrays
 from agents.runs import checkpoint, history, program, progress, session
 from agents.runs.folder import RunFolder
-from agents.runs.loading import StoredPolicy, read_policy
+from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
 from agents.runs.progress import Progress
 from agents.runs.results import metrics, results
@@ -236,7 +237,7 @@ def forget(key):
     """Returns a function that removes one of the plain values of a file of arrays."""
 
     def damage(path):
-        arrays, about = read_arrays(path, StoredPolicy)
+        arrays, about = read_arrays(path, dict[str, Any])
         del about[key]
         write_arrays(path, arrays, about)
 
