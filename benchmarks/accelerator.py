@@ -59,13 +59,15 @@ def main(options: Options) -> list[str]:
     """Runs the benchmarks; returns the names of those that failed.
 
     Raises:
-      ValueError: a name is unknown.
+      ValueError: a name is unknown, or a second start is asked for without the first.
     """
     measurements = SMALL if options.small else MEASUREMENTS
     for name in options.only:
         if name not in measurements:
             raise ValueError(f"no measurement {name!r}; allowed: {', '.join(measurements)}")
     names = options.only or tuple(measurements)
+    if "gpu_best_second_start" in names and "gpu_best_first_start" not in names:
+        raise ValueError("gpu_best_second_start needs gpu_best_first_start in --only, too")
     with tempfile.TemporaryDirectory() as cache:  # empty, as a first start needs it
         succeeded = {x: run(x, measurements[x].split(), options, cache) for x in names}
     failed = [name for name, success in succeeded.items() if not success]

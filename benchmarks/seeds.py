@@ -40,9 +40,9 @@ class Options(harness.Options):
     def check(self) -> None:
         """Checks the options before anything is measured."""
         super().check()
-        for name, values in (("iterations", (self.iterations,)), ("seeds", self.seeds)):
-            for value in values:
-                check_integer(name, value)
+        check_integer("iterations", self.iterations)
+        for number in self.seeds:
+            check_integer("seeds", number)
 
 
 @dataclasses.dataclass(frozen=True)

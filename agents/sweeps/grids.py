@@ -84,8 +84,8 @@ class Grid:
             if getattr(options, limit) is not None:
                 check_integer(limit, getattr(options, limit))
         points = self.configs(options)
-        env_ids = {config.env_id for config in points.values()}
-        short = tt.task_set(env_ids.pop()).short if len(env_ids) == 1 else "sets"
+        names = {tt.task_set(config.env_id).short for config in points.values()}
+        short = names.pop() if len(names) == 1 else "sets"
         if (options.preset, short) != (self.options.preset, self.options.env):
             name = f"{name}-{options.preset}-{short}"
         name = name if options.name is None else options.name

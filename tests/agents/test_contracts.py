@@ -151,7 +151,7 @@ class Noisy(nn.Module):
         (None, "must be a flax.linen.Module, got NoneType"),
     ],
 )
-@pytest.mark.parametrize("curiosity", ["icm", "rnd"])  # the second uses encoders of its own
+@pytest.mark.parametrize("curiosity", ["icm", "rnd"])  # rnd makes two further encoders
 def test_an_encoder_that_breaks_its_contract_is_refused_in_one_line(
     module, message, curiosity, monkeypatch
 ):

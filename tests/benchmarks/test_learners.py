@@ -88,3 +88,5 @@ def test_a_measurement_ends_with_its_exit_code_its_limit_or_the_signal():
 def test_an_unknown_measurement_is_refused():
     with pytest.raises(ValueError, match=r"no measurement 'gpu'; allowed: gpu_paper"):
         accelerator.main(accelerator.Options(only=("gpu",)))
+    with pytest.raises(ValueError, match="gpu_best_second_start needs gpu_best_first_start"):
+        accelerator.main(accelerator.Options(only=("gpu_best_second_start",)))

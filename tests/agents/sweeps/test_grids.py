@@ -60,8 +60,7 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, fresh_task_set
     assert run.config.env_id == "NearFood-v0"
 
 
-def test_a_grid_of_training_sets_has_one_folder(tmp_path):
-    """Whatever their order, and whichever are chosen."""
+def test_a_grid_of_sets_has_one_folder_in_any_order_and_for_any_choice(tmp_path):
     paths = set()
     for value, only in (("base,p", ()), ("p,base", ()), ("base,p,st", ("env_id=p",))):
         given = Options((f"env_id={value}",), only=only, out=tmp_path)
