@@ -1,6 +1,7 @@
 """Pages for users: Python blocks run and print what they state; links and commands exist."""
 
 import contextlib
+import dataclasses
 import doctest
 import functools
 import importlib.util
@@ -17,6 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from agents.config import Config
 from agents.sweeps import tables
 from helpers.jax_settings import HAS_DEFAULT_DRAWS
 from helpers.paths import ROOT
@@ -227,7 +229,7 @@ def agents_that_know_colors() -> list[str]:
     stuck = {f"{shares[name]:.1f} %" for name in ("seed 332", "seed 333")}
     stuck.add(f"{shares['seed 333, strong curiosity again']:.1f} %")
     rows.append(f"332 and 333 solve {stuck.pop()} each")
-    assert not stuck  # "333 still does"
+    assert not stuck  # "333 still solves 6.4 %"
     before, chosen, control = (
         first_pushes("colors/development.csv", f"seed 300, {name}")
         for name in ("last iteration", "fine-tuned", "fine-tuned as a control")
@@ -333,6 +335,17 @@ def test_stated_results_are_those_of_the_records():
         text = " ".join(text_of(page).split())
         for row in expected:
             assert row in text, (page, row)
+
+
+def test_agent_md_states_every_setting_that_a_preset_changes():
+    table = text_of("agents/agent.md").split("| setting | `paper` | `fast` | `best` |\n")[1]
+    stated = re.findall(r"^\| `(\w+)`[^|]*\| (.+) \| (.+) \| (.+) \|$", table, re.MULTILINE)
+    presets = [Config.preset(name) for name in ("paper", "fast", "best")]
+    values = [
+        (field.name, *(str(getattr(preset, field.name)) for preset in presets))
+        for field in dataclasses.fields(Config)
+    ]
+    assert stated == [row for row in values if len(set(row[1:])) > 1]
 
 
 def test_pages_stay_short():

@@ -7,12 +7,12 @@ standard deviation, and estimates the advantages of the sum:
 
 `separate` estimates the advantages of each reward, normalises them and adds them. In a sum of
 rewards the one of higher variance dominates: once easy tasks pay, the intrinsic reward vanishes in
-their variance (Burda et al., 2019b). The extrinsic reward, at most 1 per episode, is not scaled.
+their variance (Burda et al., 2019). The extrinsic reward, at most 1 per episode, is not scaled.
 The intrinsic reward is scaled so that its returns have the standard deviation
 `INTRINSIC_RETURN_STD`. Intrinsic returns are non-episodic: the next episode follows an episode's
 end and is worth the mean of v_0. So finishing a task early forgoes no novelty.
 
-Source: Schulman et al. (2016); Burda et al. (2019b), "Combining intrinsic and extrinsic returns";
+Source: Schulman et al. (2016); Burda et al. (2019), "Combining intrinsic and extrinsic returns";
 agents/agent.md, "PPO".
 """
 
