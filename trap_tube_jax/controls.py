@@ -23,7 +23,7 @@ FIRST_ROW = 4  # of the base task's tube
 
 
 def trap_turned() -> tuple[State, ...]:
-    """The trap is in the wall, out of the food's way, and both ends are exits.
+    """Builds a tube whose trap is in the wall, out of the food's way, and whose ends are exits.
 
     The short way goes past the trap. An agent that avoids the trap takes the long way.
     Source: Visalberghi and Limongelli (1994), Reaux and Povinelli (2000): the inverted tube.
@@ -32,7 +32,7 @@ def trap_turned() -> tuple[State, ...]:
 
 
 def trap_exchanged() -> tuple[State, ...]:
-    """Trap and exit have changed places: the food must go the other way.
+    """Exchanges trap and exit: the food must go the other way.
 
     Source: Limongelli, Boysen and Visalberghi (1995): the food in the middle of the tube, the trap
     left of it or right.
@@ -41,7 +41,7 @@ def trap_exchanged() -> tuple[State, ...]:
 
 
 def no_trap() -> tuple[State, ...]:
-    """No trap: its end of the tube is closed, or is a second exit.
+    """Removes the trap: its end of the tube is closed, or is a second exit.
 
     Source: Visalberghi and Trinca (1989): the plain tube.
     """
@@ -52,7 +52,7 @@ def no_trap() -> tuple[State, ...]:
 
 
 def two_traps() -> tuple[State, ...]:
-    """A second trap is in the wall on the way to the exit. The food can pass this one only.
+    """Adds a trap in the wall on the way to the exit. The food can pass this one only.
 
     The exit is on the base task's side, or on the other one.
     Source: Seed et al. (2006): tubes with two traps, of which one does nothing.
@@ -64,7 +64,7 @@ def two_traps() -> tuple[State, ...]:
 
 
 def far_exit() -> tuple[State, ...]:
-    """The tube is three cells longer on the side of the exit.
+    """Lengthens the tube by three cells on the side of the exit.
 
     Source: after Limongelli, Boysen and Visalberghi (1995), who moved the trap off the middle, so
     that the distance to the ends no longer tells the side of the trap.
@@ -73,7 +73,7 @@ def far_exit() -> tuple[State, ...]:
 
 
 def short_tool() -> tuple[State, ...]:
-    """The tool is two cells long and reaches the food from the nearer wall only.
+    """Shortens the tool to two cells: it reaches the food from the nearer wall only.
 
     Source: after Visalberghi and Trinca (1989): sticks that are of use only in a certain way.
     """
@@ -81,7 +81,7 @@ def short_tool() -> tuple[State, ...]:
 
 
 def too_short_tool() -> tuple[State, ...]:
-    """The tool is one cell long and reaches the food from nowhere. No plan solves this.
+    """Shortens the tool to one cell: it reaches the food from nowhere. No plan solves this.
 
     Source: Mulcahy, Call and Dunbar (2005): tools too short to reach the food.
     """
@@ -89,7 +89,7 @@ def too_short_tool() -> tuple[State, ...]:
 
 
 def tool_in_tube() -> tuple[State, ...]:
-    """The tool is in the tube already, on the wrong side of the food, and must come out first.
+    """Puts the tool into the tube, on the wrong side of the food; it must come out first.
 
     Source: after Seed et al. (2006), where the stick is in the tube before the trial.
     """
@@ -97,7 +97,7 @@ def tool_in_tube() -> tuple[State, ...]:
 
 
 def tool_at_food() -> tuple[State, ...]:
-    """The tool touches the food already, on the right side of it.
+    """Puts the tool next to the food, on the right side of it.
 
     Source: Bates, Carlson-Luden and Bretherton (1980): tool and goal in contact.
     """
@@ -105,7 +105,7 @@ def tool_at_food() -> tuple[State, ...]:
 
 
 def food_outside() -> tuple[State, ...]:
-    """The food is outside the tube, beyond it or near the agent: no tool is needed.
+    """Puts the food outside the tube, beyond it or near the agent: no tool is needed.
 
     Source: after Köhler (1925): a tool is fetched because the goal is out of reach.
     """

@@ -62,6 +62,25 @@ def step(state: State, action: jax.Array) -> State:
     )
 
 
+def replay(state: State, actions: jax.typing.ArrayLike) -> State:
+    """Returns the T + 1 states of an episode, the first included, along a new first axis.
+
+    Unbatched; vmap it.
+
+    Args:
+      state: the first state.
+      actions: integer[T, 2], (grasp, move). Actions after a solution change nothing.
+    """
+
+    def body(state: State, action: jax.Array) -> tuple[State, State]:
+        state = step(state, action)
+        return state, state
+
+    first = jax.tree.map(jnp.asarray, state)
+    _, later = jax.lax.scan(body, first, jnp.asarray(actions))
+    return jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first, later)
+
+
 def holds_tool(state: State, direction: jax.Array | int) -> jax.Array:
     """Tests whether a grasp holds the tool: the next cell is the tool's, the agent's is not."""
     on_tool = functools.partial(bar_covers, state.tool, state.tool_extent)

@@ -16,9 +16,6 @@ from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
 # tool.
 SUBGOALS = ("none", "tool touched", "tool moved", "food moved", "food out")
 
-_step = jax.jit(jax.vmap(dynamics.step))
-
-
 class Cells(NamedTuple):
     """Cells of agent, tool and food in B episodes, i32[B, T + 1, 2] each."""
 
@@ -34,11 +31,14 @@ def replay(tasks: tt.State, actions: np.ndarray) -> Cells:
       tasks: B states at time 0.
       actions: i32[B, T, 2], (grasp, move). Actions after a solution change nothing.
     """
-    states = [tasks]
-    for action in np.moveaxis(actions, 1, 0):
-        states.append(_step(states[-1], action))
-    cells = [np.stack([state.agent, state.tool, state.food]) for state in states]
-    return Cells(*np.stack(cells, axis=2))
+    return jax.device_get(_replay(tasks, actions))
+
+
+@jax.jit
+@jax.vmap
+def _replay(task: tt.State, actions: jax.Array) -> Cells:
+    states = dynamics.replay(task, actions)
+    return Cells(states.agent, states.tool, states.food)
 
 
 def tool_moves(cells: Cells) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 import trap_tube_jax as tt
 from helpers.trees import rows
 from trap_tube_jax.controls import CONTROLS, LayoutDraw, food_outside, with_every_start
-from trap_tube_jax.solver.search import replay
+from trap_tube_jax.dynamics import replay
 
 PAGE = pathlib.Path(tt.__file__).parent / "controls.md"
 DIRECTIONS = {(0, 1): "right", (0, -1): "left", (1, 0): "down", (-1, 0): "up"}
@@ -29,7 +29,7 @@ def table() -> dict[str, list[tuple[str, str]]]:
 def oracle(state: tt.State) -> tuple[str, str]:
     """Returns a layout's entries of the table: plan length and direction of the push."""
     plan = tt.solve(state)
-    foods = [np.asarray(at.food) for at in replay(state, plan)]
+    foods = np.asarray(replay(state, plan.actions).food)
     moves = [tuple((b - a).tolist()) for a, b in itertools.pairwise(foods)]
     pushes = [DIRECTIONS[move] for move in moves if any(move)]
     return str(plan.length) if plan.solvable else "none", pushes[0] if pushes else "none"

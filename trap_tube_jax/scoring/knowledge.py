@@ -6,11 +6,10 @@ Source: protocol.md, "Knowledge of the trap" and "Search for the tool".
 import jax
 import jax.numpy as jnp
 
-from trap_tube_jax import dynamics
-from trap_tube_jax.dynamics import holds_tool, static_object
+from trap_tube_jax.dynamics import holds_tool, replay, static_object
 from trap_tube_jax.geometry import bar_covers, unit_vector
 from trap_tube_jax.objects import BOARD_SIZE, EXIT, GROUND
-from trap_tube_jax.state import State
+from trap_tube_jax.state import State, take
 
 
 def first_push(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
@@ -22,19 +21,13 @@ def first_push(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
       task: the state at time 0.
       actions: integer[T, 2], (grasp, move). Actions after a solution change nothing.
     """
-
-    def step(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-        state = dynamics.step(state, action)
-        return state, state.food - task.food
-
-    start = jax.tree.map(jnp.asarray, task)
-    _, displacement = jax.lax.scan(step, start, jnp.asarray(actions))
-    displacement = jnp.pad(displacement, ((1, 0), (0, 0)))  # row 0, in case there is no push
+    food = replay(task, actions).food
+    displacement = food - food[:1]
     return displacement[jnp.argmax(jnp.any(displacement != 0, axis=-1))]
 
 
 def choice_of_exit(task: State, push: jax.typing.ArrayLike) -> jax.Array:
-    """Tests whether a first push chose the exit, where the food could have gone the other way.
+    """Classifies a first push: whether it chose the exit, where the food could have gone the other way.
 
     A push is a choice if static objects let the food move one cell forward and one cell backward,
     and exactly one of these ways leads straight to an exit. Unbatched; vmap it.
@@ -55,7 +48,7 @@ def choice_of_exit(task: State, push: jax.typing.ArrayLike) -> jax.Array:
 
 
 def first_grasp(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
-    """Tests whether the first grasp of an episode held the tool.
+    """Classifies the first grasp of an episode: whether it held the tool.
 
     Grasps that point at neither tool, trap, exit nor tube do not count. Unbatched; vmap it.
 
@@ -66,18 +59,19 @@ def first_grasp(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
     Returns:
       i32[]: 1 if the first grasp held the tool, -1 if it did not, and 0 without a grasp.
     """
-
-    def step(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-        cell = state.agent + unit_vector(action[0])
-        is_hidden = bar_covers(state.tool, state.tool_extent, cell)
-        misses = (static_object(state.board, cell) > GROUND) & ~is_hidden
-        grasp = holds_tool(state, action[0]).astype(jnp.int32) - misses
-        return dynamics.step(state, action), jnp.where(state.done, 0, grasp)
-
-    start = jax.tree.map(jnp.asarray, task)
-    _, grasps = jax.lax.scan(step, start, jnp.asarray(actions))
+    actions = jnp.asarray(actions)
+    states = take(replay(task, actions), slice(len(actions)))
+    grasps = jax.vmap(_grasp)(states, actions[:, 0])
     grasps = jnp.pad(grasps, (1, 0))  # entry 0, in case there is no grasp
     return grasps[jnp.argmax(grasps != 0)]
+
+
+def _grasp(state: State, direction: jax.Array) -> jax.Array:
+    """Classifies a grasp as `first_grasp` does."""
+    cell = state.agent + unit_vector(direction)
+    is_hidden = bar_covers(state.tool, state.tool_extent, cell)
+    misses = (static_object(state.board, cell) > GROUND) & ~is_hidden
+    return jnp.where(state.done, 0, holds_tool(state, direction).astype(jnp.int32) - misses)
 
 
 def _can_move(task: State, way: jax.Array) -> jax.Array:

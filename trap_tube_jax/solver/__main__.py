@@ -11,6 +11,7 @@ import numpy as np
 
 from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed, expand
 from trap_tube_jax.command_line import add_import_option, announce, plain_errors
+from trap_tube_jax.dynamics import replay
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.objects import DIRECTION_NAMES
@@ -18,8 +19,8 @@ from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, task_set
 from trap_tube_jax.rendering import episode_frames, save_gif
 from trap_tube_jax.solver.distance import distances
-from trap_tube_jax.solver.search import Plan, replay, solve, solve_batch
-from trap_tube_jax.state import State
+from trap_tube_jax.solver.search import Plan, solve, solve_batch
+from trap_tube_jax.state import State, take
 from trap_tube_jax.tables import markdown_table
 
 DESCRIPTION = """Finds exact shortest plans of the trap-tube tasks. Without --show and --distances,
@@ -99,8 +100,9 @@ def row_of_lengths(label: str, length: np.ndarray) -> list[str]:
 def _show(options: argparse.Namespace) -> None:
     state = _task(options.show, options.seed)
     plan = solve(state)
-    for time, at in enumerate(replay(state, plan)):
-        print(f"{_caption(plan, time)}\n{render_ascii(at)}\n")
+    states = replay(state, plan.actions)
+    for time in range(len(states.time)):
+        print(f"{_caption(plan, time)}\n{render_ascii(take(states, time))}\n")
     with _drawing(options, "plan.gif") as path:
         save_gif(episode_frames(state, plan.actions, cell_size=32), path, fps=4)
 

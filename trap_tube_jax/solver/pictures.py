@@ -3,15 +3,17 @@
 import os
 from collections.abc import Mapping
 
+import jax
 import numpy as np
 
+from trap_tube_jax.dynamics import replay
 from trap_tube_jax.figures import default_style
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.rendering import render
 from trap_tube_jax.solver.distance import Distances
-from trap_tube_jax.solver.search import Plan, replay
-from trap_tube_jax.state import State
+from trap_tube_jax.solver.search import Plan
+from trap_tube_jax.state import State, take
 
 with needs_extra("pictures"):
     from matplotlib.axes import Axes
@@ -38,10 +40,10 @@ def save_distances(
       distances: the task's distances.
       path: the file to write.
     """
-    states = replay(state, plan)
+    states = jax.device_get(replay(state, plan.actions))
     last = max(len(plan.actions) - 1, 0)
     times = np.unique(np.linspace(0, last, MOMENTS).round().astype(int))
-    boards = [distances.to_goal[(*states[time].food, *states[time].tool)] for time in times]
+    boards = [distances.to_goal[(*states.food[time], *states.tool[time])] for time in times]
     scale = Normalize(0, max(np.max(boards), 1))
     rows = -(-len(times) // 2)
     columns = min(len(times), 2)
@@ -50,7 +52,7 @@ def save_distances(
     for axis in axes:
         axis.set_axis_off()
     for axis, time, steps in zip(axes, times, boards, strict=False):
-        _draw_distances(axis, states[time], steps, scale)
+        _draw_distances(axis, take(states, time), steps, scale)
         left = f"steps left: {len(plan.actions) - time}"
         axis.set_title(left if plan.solvable else "unsolvable")
     figure.colorbar(axes[0].images[-1], ax=list(axes), label="steps to the goal", shrink=0.6)

@@ -126,17 +126,6 @@ def solve_batch(states: State) -> Plan:
     return Plan(actions, length, length >= 0)
 
 
-def replay(state: State, plan: Plan) -> list[State]:
-    """Returns the L + 1 states of a plan, the first included."""
-    states = [state]
-    for action in plan.actions:
-        states.append(_step(states[-1], jnp.asarray(action)))
-    return states
-
-
-_step = jax.jit(dynamics.step)
-
-
 def validate_on_host(state: State) -> State:
     """Returns a valid state as NumPy arrays; raises the errors of `solve`."""
     return validate(_to_host(state))

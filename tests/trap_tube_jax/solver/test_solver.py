@@ -9,10 +9,11 @@ import trap_tube_jax as tt
 from helpers import brute_force
 from helpers.paths import ROOT
 from helpers.refusal import assert_refused
+from trap_tube_jax.dynamics import replay
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.solver import pictures
-from trap_tube_jax.solver.search import levels, replay, validate_on_host
+from trap_tube_jax.solver.search import levels, validate_on_host
 from trap_tube_jax.state import take
 from trap_tube_jax.transfers import swap_with_tool
 
@@ -242,10 +243,10 @@ def test_distances_equal_brute_forces_and_count_down_along_the_plan(workshop, wo
     np.testing.assert_array_equal(found.to_goal[tuple(index)], to_goal)
     assert np.count_nonzero(found.to_goal >= 0) == np.count_nonzero(to_goal >= 0)
     plan = tt.solve(workshop)
-    states = replay(workshop, plan)
+    states = replay(workshop, plan.actions)
     left = list(range(plan.length, -1, -1))
-    assert [int(found.lookup(state)) for state in states] == left
-    assert found.lookup(jax.tree.map(lambda *x: np.stack(x), *states)).tolist() == left
+    assert [int(found.lookup(take(states, time))) for time in range(len(left))] == left
+    assert found.lookup(states).tolist() == left
 
 
 def test_finished_and_invalid_states_are_refused():
