@@ -18,8 +18,6 @@ from trap_tube_jax.command_line import one_line
 
 Plain = bool | int | float | str | None
 
-MAX_TEXT_BYTES = 2**26  # bytes of a text file
-
 
 def is_file(path: Path) -> bool:
     """Returns whether a path names a regular file; False if it names nothing.
@@ -62,15 +60,12 @@ def read_text(path: Path) -> str:
     """Reads a file of UTF-8.
 
     Raises:
-      ValueError: the file is not regular, not UTF-8 or larger than `MAX_TEXT_BYTES`.
+      ValueError: the file is not regular or not UTF-8.
       OSError: the file is missing or cannot be opened.
     """
     check_file(path)
-    with naming_file(path), path.open("rb") as file:
-        content = file.read(MAX_TEXT_BYTES + 1)
-        if len(content) > MAX_TEXT_BYTES:
-            raise ValueError(f"more than {MAX_TEXT_BYTES:,} bytes")
-        return content.decode()
+    with naming_file(path):
+        return path.read_bytes().decode()
 
 
 def read_json(path: Path, kind: Any = Any) -> Any:
@@ -221,7 +216,7 @@ def append_text(path: Path, text: str, head: str) -> None:
     is_file(path)
     with path.open("a+", encoding="utf-8", newline="") as file:
         file.seek(0)
-        first = file.readline(MAX_TEXT_BYTES)
+        first = file.readline()
         if first and first != head:
             raise ValueError(
                 f"{path} has other columns than this version writes, {head.strip()}; continue "

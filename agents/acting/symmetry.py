@@ -41,7 +41,7 @@ class Symmetry(NamedTuple):
         The food is then at most as far to the right as below. Finds both in u8[12, 12, N] by their
         colours; the identity if one is not visible.
         """
-        palette = tt.base_state(observation.shape[-1]).palette
+        palette = tt.base_palette(observation.shape[-1])
         agent, food = (_first_cell(observation, palette[thing]) for thing in (AGENT, FOOD))
         offset = jnp.where(jnp.all(agent >= 0) & jnp.all(food >= 0), food - agent, 0)
         transposed = jnp.abs(offset[1]) > jnp.abs(offset[0])

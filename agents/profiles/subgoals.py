@@ -16,6 +16,7 @@ from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS, GROUND
 # tool.
 SUBGOALS = ("none", "tool touched", "tool moved", "food moved", "food out")
 
+
 class Cells(NamedTuple):
     """Cells of agent, tool and food in B episodes, i32[B, T + 1, 2] each."""
 

@@ -52,7 +52,8 @@ class Program:
         if options.evaluate_every:
             tasks = config.eval_episodes
             self.validation = Evaluator.of_sets(config, self.sets, tasks, "validation")
-        self.state_shapes = jax.eval_shape(self.learner.init, jax.random.key(0))
+        self._init = jax.jit(self.learner.init)  # compiled once for all seeds
+        self.state_shapes = jax.eval_shape(self._init, jax.random.key(0))
 
     @functools.cached_property
     def test(self) -> Evaluator:
@@ -62,7 +63,7 @@ class Program:
 
     @property
     def num_parameters(self) -> int:
-        """Trained numbers."""
+        """Number of parameters, those of fixed networks included."""
         return sum(leaf.size for leaf in jax.tree.leaves(self.state_shapes.params))
 
     def init(self, seed: int, start: Policy | None = None) -> TrainState:
@@ -73,9 +74,9 @@ class Program:
         """
         key = jax.random.key(seed)
         if start is None:
-            return self.learner.init(key)
+            return self._init(key)
         # Even with the same seed, fine-tuning draws other tasks than the first training.
-        state = self.learner.init(jax.random.fold_in(key, 1))
+        state = self._init(jax.random.fold_in(key, 1))
         try:
             params = from_arrays(
                 to_arrays(start.params), {part: state.params[part] for part in PARTS}

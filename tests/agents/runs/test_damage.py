@@ -14,7 +14,6 @@ import pytest
 import safetensors.numpy
 
 from agents.arrays import to_arrays
-from agents.files import MAX_TEXT_BYTES
 from agents.runs import checkpoint
 from agents.runs.folder import RunFolder
 from agents.runs.loading import load, save
@@ -112,11 +111,6 @@ def eights(name: str = "x", dtype: str = "F8_E4M3", **about: Any) -> bytes:
     return raw_file({name: array, "__metadata__": {"json": json.dumps(about)}}, bytes(4))
 
 
-def sparse(path: Path) -> None:
-    with path.open("wb") as file:
-        file.truncate(MAX_TEXT_BYTES + 1)
-
-
 def csv_file(row: dict[str, Any], **changes: Any) -> bytes:
     changed = {**row, **changes}
     return f"{','.join(changed)}\n{','.join(map(str, changed.values()))}\n".encode()
@@ -139,7 +133,6 @@ NO_JSON = {
     "deep": b"[" * 100_000,
     "long number": b"1" * 10_000,
     "nested": b"[[{}]]",
-    "large": sparse,
 }
 # Values that a key of config.json cannot have.
 WRONG = {
@@ -247,7 +240,6 @@ def csv_damages() -> Damages:
             found[name, kind] = csv_file(row) + content
         for key in SCHEMAS[name].columns:
             found[name, f"no {key}"] = csv_file(without(row, key))
-        found[name, "large"] = sparse
         found[name, "other columns"] = b"x,y\n"
         found[name, "names twice"] = b"iteration,iteration\n1,1\n"
     return found
