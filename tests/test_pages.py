@@ -224,12 +224,17 @@ def agents_that_know_colors() -> list[str]:
     mean = tables.mean_text(np.array([right[policy] for policy in five]), ".1f", high=100)
     percent = pd.DataFrame(solved)[five].mean(axis=1)[["p", "pst", "psy", "pstsy"]]
     rows.append(f"| mean of these five | {mean} | {cells(percent)} |")
-    kinds = rows_of("colors", "kinds").query("level == 'towards, along'").set_index("policy")
-    shares = 100 * kinds["solved"] / kinds["tasks"]
-    stuck = {f"{shares[name]:.1f} %" for name in ("seed 332", "seed 333")}
-    stuck.add(f"{shares['seed 333, strong curiosity again']:.1f} %")
-    rows.append(f"332 and 333 solve {stuck.pop()} each")
-    assert not stuck  # "333 still solves 6.4 %"
+    kinds = rows_of("colors", "kinds").set_index(["level", "policy"])
+    shares = (100 * kinds["solved"] / kinds["tasks"]).map("{:.1f}".format)
+    towards, sideways = (shares[f"{direction}, along"] for direction in ("towards", "sideways"))
+    slower = "seed 332, slower decay"
+    rows += [
+        f"332 and 333 solve {towards['seed 332']} % each",
+        f"333 still solves {towards['seed 333, strong curiosity again']} %",
+        f"332 solves {towards[slower]} % of these tasks, but {sideways[slower]} instead of "
+        f"{sideways['seed 332']} %",
+    ]
+    assert towards["seed 332"] == towards["seed 333"]
     before, chosen, control = (
         first_pushes("colors/development.csv", f"seed 300, {name}")
         for name in ("last iteration", "fine-tuned", "fine-tuned as a control")

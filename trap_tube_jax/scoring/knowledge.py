@@ -27,7 +27,7 @@ def first_push(task: State, actions: jax.typing.ArrayLike) -> jax.Array:
 
 
 def choice_of_exit(task: State, push: jax.typing.ArrayLike) -> jax.Array:
-    """Classifies a first push: whether it chose the exit, where the food could have gone the other way.
+    """Classifies a first push: towards the exit, away from it, or without a choice.
 
     A push is a choice if static objects let the food move one cell forward and one cell backward,
     and exactly one of these ways leads straight to an exit. Unbatched; vmap it.
