@@ -209,17 +209,24 @@ def write_json(path: Path, values: Any) -> None:
 def append_text(path: Path, text: str, head: str) -> None:
     """Appends lines to a text file; begins a new file with the line `head`.
 
+    Appends all lines or, if the disk is full, none.
+
     Raises:
       ValueError: the file is not regular, or begins with another line.
       OSError: the file cannot be written.
     """
-    is_file(path)
-    with path.open("a+", encoding="utf-8", newline="") as file:
-        file.seek(0)
-        first = file.readline()
-        if first and first != head:
-            raise ValueError(
-                f"{path} has other columns than this version writes, {head.strip()}; continue "
-                "with the version that began the file"
-            )
-        file.write(text if first else head + text)
+    size = path.stat().st_size if is_file(path) else 0
+    try:
+        with path.open("a+", encoding="utf-8", newline="") as file:
+            file.seek(0)
+            first = file.readline()
+            if first and first != head:
+                raise ValueError(
+                    f"{path} has other columns than this version writes, {head.strip()}; continue "
+                    "with the version that began the file"
+                )
+            file.write(text if first else head + text)
+    except OSError:
+        with contextlib.suppress(OSError):  # the file may not have been opened
+            os.truncate(path, size)
+        raise

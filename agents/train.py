@@ -23,6 +23,7 @@ from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.interruptions import exit_when_stopped, run_command
 
 PROGRAM = "python -m agents.train"
+DEFAULT_PRESET = "fast"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Options:
     Ctrl-C saves and stops; --resume continues to the same result.
 
     Attributes:
-      preset: initial settings (fast, best or paper).
+      preset: initial settings (fast, best or paper), by default fast.
       finetune: agent to fine-tune, with its settings. A run's folder, a file of parameters or a
         shipped agent; schedules begin anew.
       seed: seed of all draws. agents.sweep trains several.
@@ -45,7 +46,7 @@ class Options:
         job at HOST:PORT PROCESSES NUMBER.
     """
 
-    preset: str = option("fast", "run")
+    preset: str | None = option(None, "run")
     finetune: str | None = option(None, "run")
     seed: int = option(0, "run")
     name: str | None = option(None, "run")
@@ -80,9 +81,9 @@ def parse(first: Options, arguments: Sequence[str] | None) -> tuple[Options, Run
     """Reads a command line; preset, agent to fine-tune or stored run have the defaults."""
     new = Options()
     if first.resume is None:
-        config = Config.preset(first.preset)
+        config = Config.preset(first.preset or DEFAULT_PRESET)
         if first.finetune is not None:
-            if first.preset != new.preset:
+            if first.preset is not None:
                 raise ValueError("--finetune begins with the agent's settings; leave out --preset")
             config = load(first.finetune, imports=first.imports).config
         run = Run(config, finetune=first.finetune)
@@ -130,7 +131,7 @@ def run_path(options: Options, run: Run) -> Path:
     if options.resume is not None:
         return options.resume
     short = tt.task_set(run.config.env_id).short
-    origin = options.preset
+    origin = options.preset or DEFAULT_PRESET
     if run.finetune is not None:
         origin = short_name(run.finetune)
     name = f"{origin}-{short}-{run.seed}" if options.name is None else options.name

@@ -91,7 +91,7 @@ def describe_board(observation: jax.Array) -> Board:
     At most 6 objects besides agent and food are described; any further ones are left out.
     """
     color = hash_rows(observation)
-    base_colors = hash_rows(tt.base_palette(observation.shape[-1]))
+    base_colors = hash_rows(jnp.asarray(tt.base_palette(observation.shape[-1])))
     anchors = [color == base_colors[code] for code in (AGENT, FOOD)]
     lines, object_colors = _objects(color, left=~(anchors[0] | anchors[1]))
     rows, columns = _project(lines)

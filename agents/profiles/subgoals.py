@@ -32,14 +32,14 @@ def replay(tasks: tt.State, actions: np.ndarray) -> Cells:
       tasks: B states at time 0.
       actions: i32[B, T, 2], (grasp, move). Actions after a solution change nothing.
     """
-    return jax.device_get(_replay(tasks, actions))
+    return Cells(*jax.device_get(_replay(tasks, actions)))
 
 
 @jax.jit
 @jax.vmap
-def _replay(task: tt.State, actions: jax.Array) -> Cells:
+def _replay(task: tt.State, actions: jax.Array) -> tuple[jax.Array, ...]:
     states = dynamics.replay(task, actions)
-    return Cells(states.agent, states.tool, states.food)
+    return states.agent, states.tool, states.food
 
 
 def tool_moves(cells: Cells) -> np.ndarray:

@@ -69,7 +69,10 @@ class Run:
         return cls(**{**values, "config": config, "imports": tuple(values["imports"])})
 
     def check_continues(self, before: "Run") -> None:
-        """Raises ValueError unless resuming `before` gives the result of an uninterrupted run."""
+        """Raises ValueError unless resuming `before` gives the result of an uninterrupted run.
+
+        Only the evaluation at its end may differ: it counts for the choice of the best policy.
+        """
         old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
         scheduled = {"iterations"} if before.config.has_schedule else set()
         free = {*EXTENDABLE, "config", "imports"} - scheduled

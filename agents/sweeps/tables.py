@@ -35,6 +35,7 @@ NOTE = (
     "none where scores do not vary; * marks p < 0.05."
 )
 MEAN = "mean without base"  # over the task sets of all algorithms, each counting the same
+ROUNDING = 1e-9  # percent, a spread of means that rounding explains
 NOTHING = "–"
 
 
@@ -181,7 +182,7 @@ def welch(a: Any, b: Any) -> tuple[float, float, float, float]:
     Returns mean(a) - mean(b), its standard error, the degrees of freedom, and p; NaN for the last
     three if neither sample varies.
     """
-    if np.ptp(a) == np.ptp(b) == 0:
+    if max(np.ptp(a), np.ptp(b)) < ROUNDING:
         return a[0] - b[0], np.nan, np.nan, np.nan
     parts = np.array([x.var(ddof=1) / len(x) for x in (a, b)])
     difference = a.mean() - b.mean()
@@ -214,8 +215,8 @@ def holm_factors(p: Any) -> Any:
 def difference_table(compared: Table) -> Table:
     """Formats `differences`: a row per set, a column per algorithm; * marks p < 0.05."""
     shown = [
-        f"{row.difference:+.1f}"
-        + ("" if np.isnan(row.p) else f" [{row.low:.1f}, {row.high:.1f}]")
+        f"{row.difference:+z.1f}"
+        + ("" if np.isnan(row.p) else f" [{row.low:z.1f}, {row.high:z.1f}]")
         + ("*" if row.p < 0.05 else "")
         for row in compared.itertuples()
     ]

@@ -185,6 +185,11 @@ def test_a_folder_of_other_files_is_not_written_to(capsys, tmp_path):
     (tmp_path / "x" / "metrics.csv").write_text("mine")
     assert "exists, but holds no run" in refused(capsys, main, "--out", tmp_path, "--name", "x")
     assert (tmp_path / "x" / "metrics.csv").read_text() == "mine"
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    for name in (".lock", ".config.json.4242"):
+        (killed / name).touch()
+    RunFolder(killed).check_free()
 
 
 def test_a_run_is_not_overwritten(capsys, whole):
@@ -285,7 +290,9 @@ def test_an_agent_to_fine_tune_has_the_initial_settings(tmp_path, capsys):
     folder.write_config(Run(Config()), RunOptions())
     of_a_run = dataclasses.replace(wanted, finetune=folder.best)
     assert str(run_path(found, of_a_run)) == "runs/x-sy-0"
-    assert "leave out --preset" in refused(capsys, main, *arguments.split(), "--preset", "best")
+    for preset in PRESETS:
+        message = refused(capsys, main, *arguments.split(), "--preset", preset)
+        assert "leave out --preset" in message
     message = refused(capsys, main, "--resume", tmp_path, *arguments.split())
     assert "leave out --name, --out, --preset and --finetune" in message
 

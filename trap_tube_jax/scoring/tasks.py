@@ -28,6 +28,7 @@ PROTOCOL = 1
 ALL_SETS = tuple(entry.short for entry in PAPER_TASK_SETS)
 FEW_LAYOUTS = 5  # a set with at most this many layouts, colours aside, has few
 SETS_OF_FEW = tuple(x.short for x in PAPER_TASK_SETS if perceptual not in x.transfers)
+SETS_OF_MANY = frozenset(ALL_SETS).difference(SETS_OF_FEW)
 
 # "trap", and the first letters of "tube", "validation" and "confirmation". The first word of
 # `jax.random.key(seed)` is 0 for every seed from 0 to 2**32 - 1, so no seed of training leads here.
@@ -107,13 +108,14 @@ def layout_numbers(name: str, tasks: State) -> np.ndarray | None:
     """Numbers the layouts of tasks from 0, i32[B]; returns None unless the set has few.
 
     A layout is a state without its colours. A set other than the paper's has few if these tasks
-    have at most `FEW_LAYOUTS` layouts, and a layout occurs twice or there is only one task.
+    have at most `FEW_LAYOUTS` layouts, and a layout occurs twice or there is only one task. A
+    mixture with a set of the paper that has many has many.
 
     Args:
-      name: the set's short name.
+      name: the short name of a set or mixture.
       tasks: B states at time 0.
     """
-    if name in ALL_SETS and name not in SETS_OF_FEW:
+    if not SETS_OF_MANY.isdisjoint(name.split("+")):
         return None
     rows = np.asarray(colorless_rows(tasks))
     found, layout = np.unique(rows, axis=0, return_inverse=True)

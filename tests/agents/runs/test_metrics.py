@@ -1,5 +1,6 @@
 """Rows of numbers on disk, and what follows from them."""
 
+import resource
 from types import SimpleNamespace
 from typing import Any
 
@@ -32,6 +33,24 @@ def test_rows_after_the_checkpoint_and_torn_ones_are_dropped(tmp_path):
     assert read_rows(path).empty
     append_rows(path, [row(1)])
     assert read_rows(path).to_dict("records") == [row(1)], "begun again with its header"
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_full_disk_leaves_no_part_of_a_row(begun, tmp_path):
+    path = tmp_path / "metrics.csv"
+    if begun:
+        append_rows(path, [row(1)])
+    before = path.read_bytes() if begun else b""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 8, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            append_rows(path, [row(2)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before
+    append_rows(path, [row(2)])
+    assert list(read_rows(path)["iteration"]) == [1, 2][not begun :]
 
 
 def test_a_complete_last_row_counts_without_its_newline(tmp_path):

@@ -155,6 +155,23 @@ def test_seeds_that_do_not_vary_have_no_test():
     figures.draw_differences(found.reset_index(), ABOUT)
 
 
+def test_means_that_differ_by_rounding_alone_do_not_vary():
+    solved = {"a": [(1, 3, 2), (2, 2, 1), (3, 1, 3)], "b": [(1, 4, 2), (2, 2, 4), (4, 1, 1)]}
+    results = pd.DataFrame(
+        [
+            row
+            for name, counts in solved.items()
+            for task_set, of_seeds in zip(("p", "pst", "psy"), counts, strict=True)
+            for row in rows(name, of_seeds, task_set=task_set, tasks=1000)
+        ]
+    )
+    found = tables.differences(tables.reported(results)).set_index("task_set")
+    assert found.loc[tables.MEAN, "difference"] == pytest.approx(1 / 30)
+    assert np.isnan(found.loc[tables.MEAN, "p"])
+    shown = tables.difference_table(found.reset_index())
+    assert shown.loc[tables.MEAN].tolist() == ["+0.0"]
+
+
 def test_an_algorithm_that_lacks_a_set_leaves_its_differences_to_others():
     given = [row for name in "abc" for row in rows(name, [5, 6, 7], task_set="st")]
     results = pd.DataFrame(given + rows("a", [5, 6, 7]) + rows("b", [1, 2, 3]))

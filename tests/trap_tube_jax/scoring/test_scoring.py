@@ -142,6 +142,9 @@ def test_a_policy_is_scored_on_the_fixed_tasks(scores):
         ("own", [0, 1, 2, 3, 4, 4], [0, 1, 2, 3, 4, 4]),
         ("own", [0, 1, 2, 3, 4, 5, 5], None),
         ("p", [1, 1], None),
+        ("p+st", [1, 1], None),
+        ("own+p", [1, 1], None),
+        ("st+sy", [1, 1], [0, 0]),
         ("sy", [0, 1, 2], [0, 1, 2]),
     ],
 )
