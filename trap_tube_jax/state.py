@@ -3,6 +3,8 @@
 Source: environment.md, "Board and objects" and "Base task".
 """
 
+import contextlib
+import operator
 from collections.abc import Iterable, Sequence
 from typing import Any, Self, TypeVar
 
@@ -289,10 +291,17 @@ def validate(state: State) -> State:
     return state
 
 
+BATCH_HINT = "this is a batch of states: take one, or use jax.vmap (for plans, solve_batch)"
+
+
 def check_is_state(state: Any) -> None:
     """Raises ValueError unless `state` is a `State`."""
     if not isinstance(state, State):
         hint = "; reset and step return (state, timestep)" if isinstance(state, tuple) else ""
+        for path in ("inner", "episodes.inner"):  # of `AutoReset` and `VectorEnvironment`
+            with contextlib.suppress(AttributeError):
+                if isinstance(operator.attrgetter(path)(state), State):
+                    hint = f"; take its `{path}`"
         raise ValueError(f"expected a trap_tube_jax.State, got {type(state).__name__}{hint}")
 
 
@@ -316,7 +325,7 @@ def check_state(state: Any) -> None:
             raise ValueError(
                 f"state.{name} must be {np.dtype(dtype).name}{_written(shape)}, got "
                 + describe_array(field)
-                + ("; this is a batch of states: use jax.vmap, or take one" if is_batch else "")
+                + (f"; {BATCH_HINT}" if is_batch else "")
             )
 
 

@@ -14,6 +14,7 @@ from agents.profiles.subgoals import SUBGOALS, Cells, last_subgoals, replay, too
 from agents.profiles.tasks import FIRST_TRIES, PARTS, STRENGTHS, Part, Sampling
 from agents.runs.evaluator import Evaluator
 from agents.runs.metrics import Table
+from trap_tube_jax.checks import MAX_TASKS, check_integer
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
 from trap_tube_jax.scoring.knowledge import choice_of_exit, first_grasp, first_push
@@ -60,6 +61,7 @@ def profile(
     unknown = [part for part in parts if part not in PARTS]
     if unknown or not parts:
         raise ValueError(f"unknown parts {unknown}; allowed: one or more of {', '.join(PARTS)}")
+    check_integer("tasks", num_tasks, maximum=MAX_TASKS)
     if not strengths:
         raise ValueError(f"no strengths; allowed: one or more from 0 to 1, as in {STRENGTHS}")
     channels = {policy.config.num_features for policy in policies.values()}

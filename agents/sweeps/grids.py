@@ -30,7 +30,8 @@ class Options:
     the command resumes them. Adding seeds or values of a setting extends the grid.
 
     Attributes:
-      settings: settings of all runs as NAME=VALUE, or of a grid as NAME=VALUE,VALUE.
+      settings: settings of all runs as NAME=VALUE, or of a grid as NAME=VALUE,VALUE; a list is
+        [VALUE,VALUE].
       imports: modules to import first, which register curiosities, encoders or task sets.
       preset: named settings to start from.
       env: task set to train on, by id or short name, by default the preset's.

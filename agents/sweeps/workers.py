@@ -10,6 +10,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Self
 from uuid import uuid4
@@ -40,6 +41,7 @@ class ProcessPerCall(ThreadPoolExecutor):
     """
 
     def __init__(self, processes: int):
+        resource_tracker.ensure_running()  # which unblocks signals in the thread that starts it
         super().__init__(processes, initializer=block_signals)
         self.processes = processes
 

@@ -206,3 +206,13 @@ def test_functions_of_one_state_refuse_a_batch_and_other_things(function):
     assert_refused(["expected a trap_tube_jax.State, got str"], function, "TrapTube-v0")
     words = ["expected a trap_tube_jax.State, got tuple", "return (state, timestep)"]
     assert_refused(words, function, (tt.base_state(), None))
+
+
+@pytest.mark.parametrize(
+    ("make", "path"), [(tt.AutoReset, "inner"), (tt.VectorEnvironment, "episodes.inner")]
+)
+def test_a_state_that_holds_another_is_refused_with_the_path_to_it(make, path):
+    key = jax.random.key(0)
+    keys = key if make is tt.AutoReset else jax.random.split(key, 1)
+    state, _ = make(tt.make("base")).reset(keys)
+    assert_refused([f"got {type(state).__name__}; take its `{path}`"], tt.render, state)

@@ -109,7 +109,8 @@ def score(
         if not callable(getattr(policy, name, None)):
             raise ValueError(
                 f"a policy has initial(batch) and act(observation, carry, key); "
-                f"{type(policy).__name__} has no {name}"
+                f"{type(policy).__name__} has no {name}; an agent in plain Python is for "
+                "score_gymnasium"
             )
     seed = check_seed(seed)
     program = jax.jit(functools.partial(_play, policy), static_argnums=0)

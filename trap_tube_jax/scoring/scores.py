@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from trap_tube_jax.registry import task_set
 from trap_tube_jax.tables import markdown_table
 
 
@@ -154,11 +155,15 @@ class Scores:
     sets: tuple[Score, ...]
 
     def __getitem__(self, name: str) -> Score:
-        """Returns the score of the set with this short name, or raises ValueError."""
+        """Returns the score of a set by any of its names, or raises ValueError."""
         by_name = {score.set: score for score in self.sets}
-        if name not in by_name:
+        try:
+            short = task_set(name).short
+        except ValueError:  # the set is not registered here
+            short = name
+        if short not in by_name:
             raise ValueError(f"no score of {name!r}; allowed: {', '.join(by_name)}")
-        return by_name[name]
+        return by_name[short]
 
     def __iter__(self) -> Iterator[str]:
         """Iterates over the short names of the sets."""

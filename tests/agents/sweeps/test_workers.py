@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+from multiprocessing import resource_tracker
 
 import pytest
 
@@ -23,6 +24,7 @@ def test_a_killed_process_costs_one_call():
 
 def test_signals_do_not_reach_the_processes():
     """Neither while they start: a terminal sends Ctrl-C to all."""
+    resource_tracker._resource_tracker._stop()  # pyright: ignore  # as in a new process
     with workers.make_executor(1, None) as executor:
         executor.submit(signal.raise_signal, signal.SIGINT).result()
         executor.submit(signal.raise_signal, signal.SIGTERM).result()

@@ -251,6 +251,7 @@ def test_scores_are_records(scores):
     assert lines[-1] == f"Protocol {PROTOCOL}, trap-tube-jax {tt.__version__}."
     assert list(scores) == ["near", "base"]
     assert "near" in scores
+    assert scores["TrapTube-v0"] is scores["base"]
     with pytest.raises(ValueError, match="no score of 'p'; allowed: near, base"):
         scores["p"]
 
@@ -328,7 +329,9 @@ def test_an_agent_that_cannot_be_scored_is_refused(near):
     words = ["num_features=5", "has 3"]  # before base, which an agent without action cannot play
     assert_refused(words, tt.score, Rightward(), ["near"], num_features=5)
     assert_refused(words, tt.score_gymnasium, Single(None), ["base", "near"], num_features=5)
-    assert_refused(["initial(batch)", "object has no initial"], tt.score, object())
+    assert_refused(
+        ["initial(batch)", "object has no initial", "score_gymnasium"], tt.score, object()
+    )
     assert_refused(["predict(observation)", "neither"], tt.score_gymnasium, object())
     words = ["predict(observation)", "missing a required argument: 'carry'", "use tt.score"]
     assert_refused(words, tt.score_gymnasium, Rightward(), ["near"])
