@@ -77,7 +77,7 @@ def test_a_profile_inside_a_file_is_refused_before_it_plays(tmp_path, capsys):
     [
         ([], "the following arguments are required: RUNS"),
         (["fast-base", "--import", "no.such"], "no.such"),
-        (["fast-base", "--tasks", "0"], "evaluation tasks must be"),
+        (["fast-base", "--tasks", "0"], "tasks must be an integer"),
         (["fast-base", "--parts", "swaps"], "allowed: one or more of structural, perceptual"),
         (["fast-base", "--parts"], "expected at least one argument"),
         (["fast-base", "--strengths", "1.5"], "strength must be a number from 0 to 1"),
