@@ -2,8 +2,8 @@
 
 Reward and curiosity reveal little about which of several objects is the tool. The motion of every
 step reveals more, and predicting this motion trains the GRU and the encoder. Two consecutive
-observations show the motion, unless the tool has the colour of what it moves over. So the loss
-uses nothing else that is hidden from the agent.
+observations show the motion, unless the tool has the colour of what it moves over. All other
+targets of the loss are visible to the agent.
 
 Source: this project; auxiliary losses of reinforcement learning, after Jaderberg et al. (2017).
 """

@@ -59,7 +59,8 @@ class RunFolder:
             again = f"continue it with --resume {self.path}, or give another --name"
             raise ValueError(f"{self.path} holds a run; {again}")
         # A killed process may have left its lock, and a draft of config.json.
-        if any(not name.startswith((".lock", f".{CONFIG_FILE}.")) for name in names):
+        drafts = {name for name in names if name.startswith(f".{CONFIG_FILE}.")}
+        if names - drafts - {".lock"}:
             raise ValueError(f"{self.path} exists, but holds no run; give another --name")
 
     def write_config(self, run: Run, options: RunOptions | None = None) -> None:
