@@ -213,6 +213,11 @@ def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
 
 
 def _check_strength(strength: Any) -> float:
+    if isinstance(strength, jax.core.Tracer):
+        raise ValueError(
+            "strength must be a number from 0 to 1, got a traced array; make the transfer outside "
+            "of jit and vmap"
+        )
     number = np.asarray(strength)
     if number.ndim or number.dtype.kind not in "iuf" or not 0 <= number <= 1:
         raise ValueError(f"strength must be a number from 0 to 1, got {strength!r}")

@@ -223,6 +223,12 @@ def test_other_strengths_are_refused(factory, strength):
     assert_refused(["strength", "from 0 to 1", repr(strength)], factory, strength)
 
 
+@pytest.mark.parametrize("factory", [tt.graded_perceptual, tt.graded_structural])
+def test_a_traced_strength_is_refused(factory):
+    words = ["strength", "traced array", "outside of jit"]
+    assert_refused(words, jax.jit(lambda x: factory(x).strength), 0.5)
+
+
 def test_a_strength_may_be_a_scalar_of_any_kind():
     half = tt.graded_perceptual(0.5)
     scalars: list[Any] = [np.float32(0.5), jnp.array(0.5)]
