@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from agents.config import Config
 from agents.sweeps import tables
@@ -31,9 +32,11 @@ for folder in ("trap_tube_jax", "agents", "benchmarks", "tests"):
 NAMES = sorted(str(page.relative_to(ROOT)) for page in PAGES)
 PROTOCOL = "trap_tube_jax/protocol.md"
 RESULTS = ROOT / "benchmarks" / "results"
-BEST, CURIOSITIES, PAPER, PROFILES, TABLE_2 = (
-    f"benchmarks/results/{name}.md"
-    for name in ("best_preset", "curiosities", "paper_preset", "profiles", "table_2")
+RESULT_PAGES = (
+    *("best_preset", "curiosities", "motion", "paper_preset", "profiles", "repeats", "table_2"),
+)
+BEST, CURIOSITIES, MOTION, PAPER, PROFILES, REPEATS, TABLE_2 = (
+    f"benchmarks/results/{name}.md" for name in RESULT_PAGES
 )
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -163,9 +166,12 @@ def percent_solved(record: str) -> Any:
     return tables.by_set(tables.reported(rows_of(record, "results")))
 
 
-def steps(record: str) -> Any:
+def steps(record: str, algorithm: str | None = None) -> Any:
     """Returns the environment steps of a record's seeds."""
-    return rows_of(record, "curves").groupby("seed")["transitions"].max()
+    rows = rows_of(record, "curves")
+    if algorithm:
+        rows = rows.query("algorithm == @algorithm")
+    return rows.groupby("seed")["transitions"].max()
 
 
 def cells(values: Any) -> str:
@@ -180,6 +186,17 @@ def means(percent: Any) -> str:
         for name, own in percent.items()
     ]
     return " | ".join(texts)
+
+
+def one_decimal(value: float) -> str:
+    return f"{value:.1f}".replace("-", "−")
+
+
+def mean_interval(values: Any) -> list[str]:
+    """Returns the mean, and the ends of its 95 % interval of Student's t."""
+    mean = np.mean(values)
+    ends = stats.t.interval(0.95, len(values) - 1, mean, stats.sem(values))
+    return list(map(one_decimal, (mean, *ends)))
 
 
 def percent_of(file: str, policy: str | None = None) -> Any:
@@ -206,7 +223,7 @@ def knowledge(pushes: Any, percent: Any) -> str:
 
 def agents_that_know_colors() -> list[str]:
     """Returns the rows of their table, and what the development tasks showed."""
-    pushes = first_pushes("profiles/profile.csv", "best-pstsy")
+    pushes = first_pushes("memory/profile.csv", "best-pstsy")
     known = knowledge(pushes, percent_of("leaderboard/confirmation.csv"))
     rows = [f"| best-pstsy, without colours | {known} |"]
     right, solved = {}, {}
@@ -235,6 +252,15 @@ def agents_that_know_colors() -> list[str]:
         f"{sideways['seed 332']} %",
     ]
     assert towards["seed 332"] == towards["seed 333"]
+    gains = [
+        right[policy] - right[policy.removesuffix(", fine-tuned")]
+        for policy in right
+        if policy.endswith(", fine-tuned")
+    ]
+    assert len(gains) == 6
+    assert sum(round(gain) in range(6, 11) for gain in gains) == 4
+    mean, low, high = mean_interval(gains)
+    rows.append(f"on average of six agents by {mean} points [{low}, {high}]: four gain 6 to 10")
     before, chosen, control = (
         first_pushes("colors/development.csv", f"seed 300, {name}")
         for name in ("last iteration", "fine-tuned", "fine-tuned as a control")
@@ -278,6 +304,42 @@ def without_memory() -> list[str]:
     ]
 
 
+def predicted_motion() -> list[str]:
+    """Returns the rows of the table of `motion.md`, and the interval of their difference."""
+    found = [percent_solved(name)["p"] for name in ("exp2_without_motion", "exp2_motion")]
+    rows = [
+        f"| {{P}}, {name} | {cells([*own, own.mean()])} |"
+        for name, own in zip(("without", "with"), found, strict=True)
+    ]
+    test: Any = stats.ttest_ind(*reversed(found), equal_var=False)
+    ends = (found[1].mean() - found[0].mean(), *test.confidence_interval())
+    difference, low, high = map(one_decimal, ends)
+    rows.append(
+        f"The difference, {difference} points [{low}, {high}], may be chance (Welch's t-test, "
+        f"p = {test.pvalue:.2f})"
+    )
+    return rows
+
+
+def avoided_repeats() -> list[str]:
+    """Returns the rows of the table of `repeats.md`, and the gains within policies."""
+    found = rows_of("repeats", "results").assign(avoids=lambda x: x["repeat_penalty"] > 0)
+    found["percent"] = 100 * found["solved"] / found["tasks"]
+    percent = found.pivot_table(index=["task_set", "avoids"], columns="seed", values="percent")
+    rows = []
+    for name in ("p", "pstsy"):
+        for avoids, text in ((False, "without"), (True, "with")):
+            own = percent.loc[(name, avoids)]
+            rows.append(f"| {label(name)}, {text} | {cells([*own, own.mean()])} |")
+    gains = [percent.loc[(name, True)] - percent.loc[(name, False)] for name in ("p", "pstsy")]
+    (mean, low, high), (mean_all, low_all, high_all) = map(mean_interval, gains)
+    rows.append(
+        f"gains {mean} points on {{P}} (95 % interval over five policies {low} to {high}) and "
+        f"{mean_all} on {{P, St, Sy}} ({low_all} to {high_all})"
+    )
+    return rows
+
+
 def steps_with_colors(*policies: str) -> int:
     """Returns the environment steps of trainings in which agents learned colours."""
     curves = rows_of("colors", "curves").groupby("policy")["transitions"]
@@ -292,7 +354,7 @@ def random_actions() -> list[float]:
 def test_stated_results_are_those_of_the_records():
     """Each number of a table of solved tasks that has a record."""
     best, fast = (percent_solved(name) for name in ("exp2_best", "fast_base"))
-    pages = ("README.md", PROTOCOL, BEST, CURIOSITIES, PAPER, PROFILES, TABLE_2)
+    pages = ("README.md", PROTOCOL, BEST, CURIOSITIES, MOTION, PAPER, PROFILES, REPEATS, TABLE_2)
     rows: dict[str, list[str]] = {page: [] for page in pages}
     rows["README.md"].append(f"| preset `best` | {means(best[list(ALL_SETS[1:])])} |")
     for name, (paper, _) in tables.PAPER_SUCCESS.items():
@@ -301,6 +363,10 @@ def test_stated_results_are_those_of_the_records():
     ours = percent_solved("exp2_paper").droplevel(1)
     own = ours.loc["ppo+icm", list(ALL_SETS[1:])]
     rows["README.md"].append(f"| preset `paper` | {cells(own)} |")
+    all_sets = cells(ours.loc["ppo+icm", list(ALL_SETS)])
+    rows[PROTOCOL].append(f"{all_sets} | {steps('exp2_paper', 'ppo+icm')[0]:,} |")
+    rows[MOTION] += predicted_motion()
+    rows[REPEATS] += avoided_repeats()
     for name in ALL_SETS[1:]:
         rows[TABLE_2].append(f"| {label(name)} | {cells(ours.loc[['ppo+icm', 'ppo'], name])} |")
     for folder, own in (("exp2_best", best), ("fast_base", fast)):

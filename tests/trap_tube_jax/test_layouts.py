@@ -41,6 +41,11 @@ def test_number_of_layouts(layouts):
     np.testing.assert_allclose(np.sum(chance * count), 1)
 
 
+def most_tasks(config: Config, iterations: int) -> int:
+    """Returns an upper bound: the new tasks, and those that fill the lists of failed ones."""
+    return config.num_new * iterations + config.replay_capacity * len(config.replay_fractions)
+
+
 def test_the_share_of_layouts_that_training_meets_is_the_documented_one(layouts):
     """The chance that a layout of {P} has been drawn before is what protocol.md says."""
     chance, count = layouts
@@ -49,16 +54,18 @@ def test_the_share_of_layouts_that_training_meets_is_the_documented_one(layouts)
         return 100 * np.sum(chance * count * (1 - (1 - share * chance) ** tasks))
 
     best = Config.preset("best")
-    few = best.num_new * best.iterations
+    few = most_tasks(best, best.iterations)
     many = Config.preset("paper").num_new * 500
     bar = 1 / len(SYMBOLIC_OBJECTS)
     finetuned = agents.load("colors-finetuned")
-    with_colors = finetuned.config.num_new * (best.iterations + finetuned.iteration)
+    with_colors = sum(
+        most_tasks(finetuned.config, count) for count in (best.iterations, finetuned.iteration)
+    )
     page = " ".join((ROOT / "trap_tube_jax" / "protocol.md").read_text().split())
     assert (
-        f"The {few:,} new tasks of a `best` run include {met(few, 1):.1f} % of the scored {{P}} "
-        f"layouts in other colours, {met(few, bar):.1f} % with the bar as the tool; the {many:,} "
-        f"of a run of `exp2`, {met(many, 1):.0f} and {met(many, bar):.0f} %; the "
-        f"{with_colors:,} of `colors-finetuned`, {met(with_colors, 1 / 2):.0f} % of the scored "
-        "{P} tasks themselves"
+        f"The tasks of a `best` run, at most {few:,}, include up to {met(few, 1):.1f} % of the "
+        f"scored {{P}} layouts in other colours, {met(few, bar):.1f} % with the bar as the tool; "
+        f"the {many:,} of a run of `exp2`, {met(many, 1):.0f} and {met(many, bar):.0f} %; those "
+        f"of `colors-finetuned`, at most {with_colors:,}, up to {met(with_colors, 1 / 2):.0f} % "
+        "of the scored {P} tasks themselves"
     ) in page
