@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from trap_tube_jax.checks import did_you_mean, expand
+from trap_tube_jax.checks import did_you_mean
+from trap_tube_jax.command_line import path_argument
 from trap_tube_jax.imports import import_modules
 
 Options = TypeVar("Options")
@@ -151,7 +152,7 @@ def _values(kind: Any) -> dict[str, Any]:
     if kind is bool:
         return {"action": argparse.BooleanOptionalAction}
     if kind is Path:
-        return {"type": expand, "metavar": "PATH"}
+        return {"type": path_argument, "metavar": "PATH"}
     return {"type": kind, "metavar": {int: "N", float: "X", str: "NAME"}[kind]}
 
 

@@ -14,6 +14,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import filelock
 
+from trap_tube_jax.checks import is_printable
 from trap_tube_jax.command_line import one_line
 
 Plain = bool | int | float | str | None
@@ -137,7 +138,7 @@ def _check_union(value: Any, kinds: tuple[Any, ...], name: str) -> None:
 def _check_is(value: Any, kind: type, name: str) -> None:
     if type(value) not in ((int, float) if kind is float else (kind,)):
         raise ValueError(f"{name} must be {kind.__name__}, got {reprlib.repr(value)}")
-    if kind is str and not value.isprintable():
+    if kind is str and not is_printable(value):
         raise ValueError(f"{name} must be printable, got {reprlib.repr(value)}")
 
 

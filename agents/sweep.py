@@ -41,7 +41,7 @@ def main(
         with exit_when_stopped(lambda: "The same command continues."):
             workers = make_executor(options.processes, options.cluster)
             with workers as executor, lock_folder(root):
-                records.check(root)
+                records.check(root, runs)
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 failed = launch(runs, run_options, executor, console, options.seeds_per_program)
                 if any(len(read_rows(RunFolder(path).metrics)) for path in runs):

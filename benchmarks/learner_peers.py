@@ -258,6 +258,10 @@ def main(options: Options) -> list[Speed]:
     ]
     for case in cases:
         options.config(*case)  # checks the settings
+        network = case[1]
+        if not set(options.programs) & set(PROGRAMS[network]):
+            allowed = ", ".join(PROGRAMS[network])
+            raise ValueError(f"no program of --programs has network {network}; allowed: {allowed}")
     console = harness.begin(options)
     results = []
     columns = ("set", "network", "program", "s/iteration", "steps/s", "ratio", "compile, s")

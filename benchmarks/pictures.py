@@ -14,8 +14,7 @@ import agents
 import trap_tube_jax as tt
 from agents.runs.drawing import COLORS, make_panels
 from agents.sweeps import tables
-from trap_tube_jax.checks import expand
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import path_argument, plain_errors
 from trap_tube_jax.figures import default_style
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import run_command
@@ -212,7 +211,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks.pictures",
         description="Draws the pictures of README.md and other pages.",
     )
-    parser.add_argument("--output", type=expand, default=FIGURES, help="folder of the pictures")
+    parser.add_argument(
+        "--output", type=path_argument, default=FIGURES, help="folder of the pictures"
+    )
     options = parser.parse_args(arguments)
     with plain_errors(), default_style():
         options.output.mkdir(parents=True, exist_ok=True)

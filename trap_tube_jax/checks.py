@@ -6,6 +6,7 @@ import inspect
 import os
 import re
 import reprlib
+import unicodedata
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -19,6 +20,7 @@ Result = TypeVar("Result")
 
 MAX_SEED = 2**32 - 1  # `jax.random.key` keeps the low 32 bits only
 MAX_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
+JOINERS = "\u200c\u200d"  # within words of some scripts, and within emoji
 
 
 def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None = None) -> int:
@@ -51,8 +53,18 @@ def expand(path: str | os.PathLike[str]) -> Path:
 
 def check_printable(path: str | os.PathLike[str]) -> None:
     """Raises ValueError for a path that a terminal would take for a command."""
-    if not str(path).isprintable():
+    if not is_printable(str(path)):
         raise ValueError(f"paths must be printable, got {str(path)!r}; rename it")
+
+
+def is_printable(text: str) -> bool:
+    """Returns whether a terminal shows a text as it is, on one line.
+
+    Unlike `str.isprintable`, allows every kind of space, and joiners.
+    """
+    return all(
+        char.isprintable() or char in JOINERS or unicodedata.category(char) == "Zs" for char in text
+    )
 
 
 def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:

@@ -5,7 +5,9 @@ import contextlib
 import io
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
+from trap_tube_jax.checks import expand, is_printable
 from trap_tube_jax.interruptions import close_stdout
 
 CLOSED_PIPE = 128 + 13  # as by SIGPIPE, which Windows lacks
@@ -21,7 +23,7 @@ def prepare_terminal() -> None:
 def one_line(error: Exception) -> str:
     """Returns the message of an error as one line that any terminal can show."""
     text = " ".join(str(error).split())
-    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
+    return "".join(char if is_printable(char) else ascii(char)[1:-1] for char in text)
 
 
 def announce(work: str) -> None:
@@ -46,6 +48,18 @@ def plain_errors() -> Iterator[None]:
     except (ValueError, ImportError, OSError) as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
         raise SystemExit(1 if isinstance(error, OSError) else 2) from error
+
+
+def path_argument(text: str) -> Path:
+    """Returns a path, for `add_argument(type=...)`; see `expand`.
+
+    Raises:
+      ArgumentTypeError: with the message of `expand`, which argparse would hide.
+    """
+    try:
+        return expand(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def add_import_option(parser: argparse.ArgumentParser) -> None:

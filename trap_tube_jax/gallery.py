@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from trap_tube_jax.checks import check_integer, check_seed, expand
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import path_argument, plain_errors
 from trap_tube_jax.figures import default_style
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import run_command
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description="Draws tasks of the eight task sets.",
     )
     add = parser.add_argument
-    add("--output", type=expand, default=".", help="folder of gallery.png [%(default)s]")
+    add("--output", type=path_argument, default=".", help="folder of gallery.png [%(default)s]")
     add("--tasks", type=int, default=4, help="distinct tasks per set, 2 to 64 [%(default)s]")
     add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1 [%(default)s]")
     options = parser.parse_args(arguments)

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from trap_tube_jax.layouts import (
     NUM_OUTLINES,
@@ -213,7 +214,7 @@ def _is_near(distance: np.ndarray, strength: float) -> np.ndarray:
 
 
 def _check_strength(strength: Any) -> float:
-    if isinstance(strength, jax.core.Tracer):
+    if isinstance(strength, Tracer):
         raise ValueError(
             "strength must be a number from 0 to 1, got a traced array; make the transfer outside "
             "of jit and vmap"

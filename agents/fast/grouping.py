@@ -1,9 +1,7 @@
 """Groups of equal elements or rows."""
 
-import functools
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,19 +26,13 @@ class Groups(NamedTuple):
 
 
 def group(*keys: jax.Array) -> Groups:
-    """Groups M elements that agree in all their keys, integer[M] each."""
-    chex.assert_rank(keys, 1)
-    chex.assert_equal_shape(keys)
-    size = keys[0].size
-    *ordered, element = jax.lax.sort((*keys, jnp.arange(size, dtype=jnp.int32)), num_keys=len(keys))
-    differs = [jnp.concatenate([jnp.ones(1, bool), key[1:] != key[:-1]]) for key in ordered]
-    group_id = jnp.cumsum(functools.reduce(jnp.logical_or, differs), dtype=jnp.int32) - 1
-    zeros = jnp.zeros(size, jnp.int32)
-    return Groups(
-        group_id=zeros.at[element].set(group_id, unique_indices=True),
-        representative=zeros.at[group_id].max(element),
-        total=group_id[-1] + 1,
+    """Groups M elements that agree in all their keys, i32[M] each, and orders groups by keys."""
+    rows = jnp.stack(keys, axis=1)
+    _, first, group_id = jnp.unique(
+        rows, axis=0, return_index=True, return_inverse=True, size=len(rows)
     )
+    group_id = group_id.astype(jnp.int32)
+    return Groups(group_id, first.astype(jnp.int32), jnp.max(group_id) + 1)
 
 
 def group_rows(content: jax.Array) -> Groups:

@@ -41,31 +41,22 @@ def iterations(folder: Path) -> list[int]:
 def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, Any]]:
     """Reads the arrays of a checkpoint, the newest if `iteration` is None, and its record.
 
-    A writer may delete a checkpoint meanwhile; the next newest is then read.
-
     Raises:
       ValueError: there is no such checkpoint, or it is damaged.
       OSError: the file cannot be read.
     """
-    while known := iterations(folder):
-        chosen = known[-1] if iteration is None else iteration
-        if chosen not in known:
-            allowed = ", ".join(map(str, known))
-            raise ValueError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
-        try:
-            return _read(folder, chosen)
-        except FileNotFoundError:
-            if iteration is not None:
-                raise
-    raise ValueError(f"{folder} holds no checkpoint")
-
-
-def _read(folder: Path, iteration: int) -> tuple[Arrays, dict[str, Any]]:
-    path = _file(folder, iteration)
+    known = iterations(folder)
+    if not known:
+        raise ValueError(f"{folder} holds no checkpoint")
+    chosen = known[-1] if iteration is None else iteration
+    if chosen not in known:
+        allowed = ", ".join(map(str, known))
+        raise ValueError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
+    path = _file(folder, chosen)
     try:
         arrays, record = read_arrays(path, dict[str, Plain])
         with naming_file(path):
-            if record.get("iteration") != iteration:
+            if record.get("iteration") != chosen:
                 raise ValueError(f"its iteration is {record.get('iteration')!r}")
     except ValueError as error:
         raise ValueError(f"{error}; delete it to use the checkpoint before it") from error

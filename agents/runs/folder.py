@@ -8,7 +8,7 @@ from typing import Any, NotRequired, TypedDict
 from agents.files import Plain, check_folder, is_file, naming_file, read_json, write_json
 from agents.runs.run import DeviceOptions, Run, RunOptions, check_algorithm
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import check_seed, check_stored_name, expand
+from trap_tube_jax.checks import check_seed, check_stored_name, expand, is_printable
 from trap_tube_jax.imports import import_modules
 
 CONFIG_FILE = "config.json"
@@ -142,7 +142,7 @@ def runs_near(path: Path) -> str:
 
 def _runs_in(path: Path) -> list[Path]:
     found = sorted(entry.parent for entry in path.glob(f"*/{CONFIG_FILE}"))
-    return [run for run in found if run.name.isprintable()]
+    return [run for run in found if is_printable(run.name)]
 
 
 def _listed(runs: list[Path]) -> str:
@@ -152,7 +152,7 @@ def _listed(runs: list[Path]) -> str:
 
 def check_name(name: str) -> None:
     """Raises ValueError unless a name is a plain folder name; tables and shells take it as text."""
-    if Path(name).name != name or name[:1] in ("", *".-=+@") or not name.isprintable():
+    if Path(name).name != name or name[:1] in ("", *".-=+@") or not is_printable(name):
         raise ValueError(
             f"name must be a folder's name without a path, got {name!r}; it cannot begin with any "
             "of .-=+@"

@@ -62,6 +62,7 @@ def write(folder: RunFolder, run: Run, suite: Suite, played: Played) -> None:
         write_bytes(folder.curves, curves)
     with drawing(folder.animation):
         train_set = tt.task_set(run.config.env_id).short
+        folder.animation.unlink(missing_ok=True)  # of an earlier policy
         save_first_solved(folder.animation, suite, played, train_set)
     with drawing(folder.page):
         write_bytes(folder.page, _page(folder, run, suite, played, curves).encode())

@@ -61,7 +61,9 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
     shown = set()
     for axis, rows in zip(axes, panels.values(), strict=True):
         for color, name in zip(COLORS, names, strict=False):
-            shown.add(_draw_seeds(axis, rows[rows["algorithm"] == name], color, name, has_ranges))
+            own = rows[rows["algorithm"] == name]
+            if len(own):
+                shown.add(_draw_seeds(axis, own, color, name, has_ranges))
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
         axis.set_xlabel(f"{UNITS[unit]}, millions")

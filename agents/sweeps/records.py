@@ -50,15 +50,20 @@ class About(TypedDict):
     note: NotRequired[str]
 
 
-def check(root: Path) -> None:
+def check(root: Path, launched: Mapping[Path, Run]) -> None:
     """Checks that `collect` can make the files of a grid again.
 
+    Args:
+      root: folder of the grid.
+      launched: the runs to train by folder, also those whose folders are gone.
+
     Raises:
-      ValueError: a file is damaged, or has rows of a run whose folder is gone.
+      ValueError: a file is damaged, or has rows of another run whose folder is gone.
     """
     _read_about(root)
     stored = [RunFolder(path.parent).stored() for path in root.rglob(CONFIG_FILE)]
     here = {(run["algorithm"], run["seed"]) for run in stored}
+    here |= {(run.algorithm, run.seed) for run in launched.values()}
     for path in (root / "results.csv", root / "curves.csv"):
         rows = read_rows(path)
         gone = set(zip(rows["algorithm"], rows["seed"], strict=True)) - here
@@ -157,6 +162,7 @@ def write_tables(root: Path) -> str:
     note = tables.unfinished_note(about)
     parts = [f"**{heading}**\n\n{tables.markdown(table)}" for heading, table in found.items()]
     parts += [*note, tables.NOTE]
+    parts += [tables.escape(about["note"])] if "note" in about else []
     parts += [f"    {command}" for command in about["commands"]]  # indented, a block of code
     parts += [
         tables.escape(

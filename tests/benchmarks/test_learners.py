@@ -11,6 +11,7 @@ import pytest
 from agents import Config
 from agents.command_line import parse
 from benchmarks import accelerator, learner_peers, seeds, train_throughput
+from helpers.refusal import assert_refused
 from trap_tube_jax.interruptions import Stopped
 
 TINY = {"filters": (2, 3), "hidden": 4, "embedding": 2}
@@ -56,21 +57,21 @@ def test_seeds_in_one_program_play_their_iterations(monkeypatch, timed):
 
 @pytest.mark.parametrize("scale", ["MEASUREMENTS", "SMALL"])
 def test_an_accelerators_measurements_are_commands_that_exist(scale, monkeypatch, capsys):
-    """A failed one is named, and the others run."""
+    """A failed one is named, and the others run; a second start fails with the first."""
     commands = []
-    codes = iter([1, *[0] * 9])
 
     def call(command: list[str], limit: float, environ: Mapping[str, str]) -> int:
         assert not os.listdir(environ["XDG_CACHE_HOME"])
         commands.append(command)
-        return next(codes)
+        return int(commands.index(command) in (0, 3))
 
     monkeypatch.setattr(accelerator, "call", call)
     small = scale == "SMALL"
     failed = accelerator.main(accelerator.Options(small=small))
     names = list(getattr(accelerator, scale))
-    assert failed == names[:1]
-    assert len(commands) == len(names)
+    skipped = [accelerator.SECOND_START] if scale == "MEASUREMENTS" else []
+    assert failed == [*names[:1], *names[3:4], *skipped]
+    assert len(commands) == len(names) - len(skipped)
     for _, _, module, *words in commands:
         options = importlib.import_module(module).Options
         parse(options, words, module)
@@ -83,6 +84,19 @@ def test_a_measurement_ends_with_its_exit_code_its_limit_or_the_signal():
     parent = "import os, signal; os.kill(os.getppid(), signal.SIGTERM); signal.pause()"
     with pytest.raises(Stopped):
         accelerator.call([*python, parent], 60, os.environ)
+
+
+def test_starts_are_measured_in_their_order(monkeypatch):
+    measured = []
+    monkeypatch.setattr(accelerator, "run", lambda name, *_: not measured.append(name))
+    starts = (accelerator.FIRST_START, accelerator.SECOND_START)
+    assert accelerator.main(accelerator.Options(only=(*reversed(starts), starts[0]))) == []
+    assert measured == list(starts)
+
+
+def test_networks_without_a_program_are_refused():
+    options = learner_peers.Options(networks=("feedforward",), programs=("plain",))
+    assert_refused(["network feedforward", "allowed: ours, rejax"], learner_peers.main, options)
 
 
 def test_an_unknown_measurement_is_refused():

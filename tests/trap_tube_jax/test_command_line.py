@@ -10,6 +10,7 @@ import pytest
 
 import trap_tube_jax as tt
 from trap_tube_jax import gallery
+from trap_tube_jax.checks import expand
 from trap_tube_jax.command_line import plain_errors
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.solver import __main__ as solver_command
@@ -40,6 +41,18 @@ def test_a_leading_tilde_is_the_home_folder(monkeypatch, tmp_path):
     tt.save_gif(np.zeros((1, 4, 4, 3), np.uint8), "~/black.gif")
     found = {path.name for path in (tmp_path / "home").iterdir()}
     assert found == {"gallery.png", "plans.png", "black.gif"}
+
+
+@pytest.mark.parametrize("command", [gallery.main, solver_command.main])
+def test_a_path_that_cannot_be_expanded_says_why(command, capsys):
+    with pytest.raises(SystemExit):
+        command(["--output=~nobody-of-this-name/x"])
+    assert "~nobody-of-this-name/x cannot be expanded: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["研究\u3000室", "a\u00a0b", "👩\u200d🔬", "می\u200cخواهم"])
+def test_folders_may_have_names_of_any_language(name, tmp_path):
+    assert expand(tmp_path / name).name == name
 
 
 def test_an_error_is_no_command_to_the_terminal(capsys):

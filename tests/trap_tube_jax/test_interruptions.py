@@ -115,6 +115,21 @@ except KeyboardInterrupt:
     assert done.stdout == b"goes on\n"
 
 
+def test_a_block_around_another_takes_its_own_signal():
+    program = """
+import signal
+from trap_tube_jax.interruptions import deferring
+with deferring() as outer:
+    with deferring() as inner:
+        pass
+    signal.raise_signal(signal.SIGINT)
+    assert (inner(), outer()) == (None, signal.SIGINT)
+print("received")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert done.stdout == b"received\n"
+
+
 def test_outside_a_command_the_main_thread_alone_receives_signals():
     program = """
 import signal, threading

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed, expand
-from trap_tube_jax.command_line import add_import_option, announce, plain_errors
+from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
+from trap_tube_jax.command_line import add_import_option, announce, path_argument, plain_errors
 from trap_tube_jax.dynamics import replay
 from trap_tube_jax.imports import import_modules
 from trap_tube_jax.interruptions import run_command
@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     modes.add_argument("--distances", metavar="SET", help="draw distances to the goal in one task")
     add(
         "--output",
-        type=expand,
+        type=path_argument,
         help="file to write, by default shortest_plans.png, plan.gif or distances.png",
     )
     add_import_option(parser)

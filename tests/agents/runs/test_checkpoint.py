@@ -56,16 +56,6 @@ def test_a_save_that_was_killed_is_passed_over_and_removed(folder):
     assert sorted(path.name for path in folder.iterdir()) == names
 
 
-def test_a_reader_goes_on_with_the_newest_where_the_writer_deletes(folder, monkeypatch):
-    """Between the reader's listing and its reading."""
-    save(folder, 5, 5)
-    (folder / "4.safetensors").unlink()
-    listed = iter([[3, 4]])
-    list_now = checkpoint.iterations
-    monkeypatch.setattr(checkpoint, "iterations", lambda path: next(listed, list_now(path)))
-    assert checkpoint.load(folder)[1]["note"] == "after 5"
-
-
 def test_a_save_that_fails_is_an_error_of_the_file_system(folder, monkeypatch):
     def fail(*args):
         raise OSError("No space left on device")

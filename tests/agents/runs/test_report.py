@@ -155,6 +155,10 @@ def test_a_solved_episode_becomes_a_gif(played, tmp_path):
         index = int(np.argmax(outcome["mine"].solved))
         assert getattr(picture, "n_frames", 1) == outcome["mine"].length[index] + 1
     unsolved = {"base": outcome["base"]}
+    folder = RunFolder(tmp_path)
+    append_rows(folder.metrics, [metrics_row(1)])
+    report.write(folder, Run(CONFIG), suite, unsolved)
+    assert not path.exists(), "it was of an earlier policy"
     assert report.save_first_solved(tmp_path / "x.gif", suite, unsolved, "base") is None
     assert not (tmp_path / "x.gif").exists()
 

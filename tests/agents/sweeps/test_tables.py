@@ -263,6 +263,18 @@ def test_curves_are_of_seeds_and_their_mean_only_where_all_end_together():
     assert len(single.axes[0].lines) == 1
 
 
+def test_an_algorithm_without_an_evaluation_has_no_line_there():
+    results = pd.DataFrame(
+        rows("ppo", [3, 4], purpose="validation", iteration=1)
+        + rows("ppo", [5, 8], purpose="validation")
+    )
+    each = ((0, 1), (0, 0.5))
+    both = pd.concat([curves("ppo", each), curves("diverged", each)])
+    figure = figures.draw_curves(results, both, ABOUT)
+    assert [len(axis.lines) for axis in figure.axes] == [2, 2, 1]
+    assert figure.get_supylabel() == "solved, %: mean and range of seeds"
+
+
 def test_many_algorithms_are_points_and_bars_but_not_lines(tmp_path):
     names = [f"a{i}" for i in range(8)]
     tested = pd.DataFrame([row for name in names for row in rows(name, [3, 4])])
@@ -355,16 +367,19 @@ def test_what_cannot_be_made_again_is_kept(tmp_path):
         folder.write_config(Run(small_config(), seed))
         done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, done.to_dict("records"))
-    records.check(tmp_path)
+    records.check(tmp_path, {})
     records.collect(tmp_path, "first", {})
     about = read_json(tmp_path / "grid.json")
     write_json(tmp_path / "grid.json", {**about, "note": "mine"})
     records.collect(tmp_path, "second", {})
     assert read_json(tmp_path / "grid.json")["note"] == "mine"
-    records.check(tmp_path)
+    records.write_tables(tmp_path)
+    assert "\n\nmine\n\n" in (tmp_path / "table.md").read_text()
+    records.check(tmp_path, {})
     shutil.rmtree(tmp_path / "seed1")
     words = ["curves.csv has rows of runs whose folders are gone: ppo+effects seed 1;"]
-    assert_refused(words, records.check, tmp_path)
+    assert_refused(words, records.check, tmp_path, {})
+    records.check(tmp_path, {tmp_path / "seed1": Run(small_config(), 1)})  # trains it again
 
 
 def test_a_figure_that_fails_costs_a_line(tmp_path, monkeypatch, capsys):
