@@ -68,6 +68,17 @@ def _compilation(request: pytest.FixtureRequest) -> Iterator[None]:
     jax.clear_caches()
 
 
+@pytest.fixture(scope="module")
+def plain_path() -> Iterator[None]:
+    """Trains without the fast path, which takes longer to compile than it saves in small runs."""
+    from agents.acting.encoding import Encoding  # noqa: PLC0415  after the settings above
+    from agents.ppo import machine  # noqa: PLC0415
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(machine, "make_encoding", Encoding)
+        yield
+
+
 @pytest.fixture
 def fresh_task_sets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Task sets that a test registers are gone after it, and so is the module of an example's."""

@@ -19,7 +19,7 @@ from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
 from trap_tube_jax.scoring.knowledge import choice_of_exit, first_grasp, first_push
 from trap_tube_jax.scoring.scores import wilson_interval
-from trap_tube_jax.state import concatenate_trees, take
+from trap_tube_jax.state import concatenate_trees
 
 LONG = 100  # steps, twice the paper's limit
 FAILED = [f"failed: {name}" for name in SUBGOALS]
@@ -72,11 +72,12 @@ def profile(
     drawn = {part: PARTS[part](sampling) for part in parts}
     count = sum(len(part.tasks.time) for part in drawn.values())
     report(f"Searching for the shortest plans of {count:,} tasks, up to a minute per 1,000")
-    plans = _solve({name: part.tasks for name, part in drawn.items()})
+    states = concatenate_trees(part.tasks for part in drawn.values())
+    plans = tt.solve_batch(states)
     played = []
     for name, policy in policies.items():
         report(f"Playing {count:,} tasks with {name}, a minute or two")
-        played.append(_play(policy, drawn, plans).assign(policy=name))
+        played.append(_play(policy, drawn, states, plans).assign(policy=name))
     groups: Any = pd.concat(played).groupby(["policy", "part", "level"], sort=False)
     counts = groups[COUNTS].sum(min_count=1)  # a sum without numbers is unknown, not 0
     return counts.join(groups[MEANS].mean()).reset_index()
@@ -185,29 +186,23 @@ def is_direct(cells: Cells, planned: np.ndarray) -> np.ndarray:
     return np.all(has_direction, axis=1) & (is_needed | ~tool_moves(cells))
 
 
-def _solve(tasks: Mapping[str, tt.State]) -> dict[str, tt.Plan]:
-    """Solves the tasks of all parts in one call, since parts share tasks."""
-    plans = tt.solve_batch(concatenate_trees(tasks.values()))
-    ends = np.cumsum([len(states.time) for states in tasks.values()])
-    return {
-        name: take(plans, slice(end - len(states.time), end))
-        for (name, states), end in zip(tasks.items(), ends, strict=True)
-    }
+def _play(policy: Policy, parts: Mapping[str, Part], states: tt.State, plans: tt.Plan) -> Table:
+    """Plays all parts with a policy; returns a row for each episode, level by level.
 
-
-def _play(policy: Policy, parts: Mapping[str, Part], plans: Mapping[str, tt.Plan]) -> Table:
-    """Plays all parts with a policy; returns a row for each episode, level by level."""
+    `states` and `plans` are of the tasks of all parts, one after the other.
+    """
     suite = Suite({name: part.tasks for name, part in parts.items()}, dict.fromkeys(parts, LONG))
-    evaluator = Evaluator(policy.config, suite)
+    played = Evaluator(policy.config, suite)(policy.params)
+    together = episodes(states, concatenate_trees(played.values()), plans)
+    counts = [len(part.tasks.time) for part in parts.values()]
     tables = []
-    for name, played in evaluator(policy.params).items():
-        tasks, levels = parts[name]
-        table = episodes(tasks, played, plans[name]).assign(part=name)
-        if name != "control":
-            table["direct"] = np.nan
+    for name, rows in together.groupby(np.repeat(list(parts), counts), sort=False):
+        levels = parts[str(name)].levels
+        table = rows.assign(part=name, direct=rows["direct"] if name == "control" else np.nan)
         if callable(levels):
             table = table.assign(level=levels(table)).sort_values("level", kind="stable")
-            tables.append(table.astype({"level": str}))
+            table = table.astype({"level": str})
         else:
-            tables.append(table.assign(level=levels))
+            table = table.assign(level=levels)
+        tables.append(table)
     return pd.concat(tables)

@@ -32,6 +32,7 @@ CONFIG = Config(
     lr_decay_fraction=0.7,
 )
 OPTIMISED = True  # they train for long
+pytestmark = pytest.mark.usefixtures("plain_path")
 Learner = Callable[..., tuple[jax.Array, Trajectory]]
 
 

@@ -1,6 +1,7 @@
 """Graded transfers against their exact distributions, enumerated from graded.md."""
 
 import functools
+import itertools
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from helpers.paths import ROOT
 from helpers.refusal import assert_refused
 from helpers.samples import BOARDS, OUTLINES, Layout, draw, read_layouts, tally
 from trap_tube_jax.graded import near_layouts, points_between
+from trap_tube_jax.layouts import LayoutTables, layout_tables
 
 DRAWS = 2**15
 STRENGTHS = (0.3, 0.7)
@@ -67,6 +69,18 @@ def placements(strength: float) -> np.ndarray:
     return table
 
 
+def allowed_choices(tables: LayoutTables) -> set[tuple[Any, ...]]:
+    """The outcomes of every choice, each with the choices before it."""
+    found: set[tuple[Any, ...]] = {("layout", *pair) for pair in tables.layout.tolist()}
+    for outline, num_tools in enumerate(tables.num_tools):
+        food = tables.food[outline, : tables.num_food[outline]]
+        found |= {("food", outline, cell) for cell in food.tolist()}
+        for index, corner in enumerate(tables.tool[outline, :num_tools].tolist()):
+            agents = tables.agent[outline, index, : tables.num_agents[outline, index]]
+            found |= {("agent", outline, corner, cell) for cell in agents.tolist()}
+    return found
+
+
 @functools.cache
 def layouts(strength: float) -> Layout:
     return read_layouts(draw(tt.graded_perceptual(strength), 1, tt.base_state(), DRAWS))
@@ -100,12 +114,10 @@ def test_tool_and_agent_have_the_specified_distribution(strength):
 
 
 def test_a_higher_strength_allows_all_draws_of_a_lower_one():
-    drawn = layouts(STRENGTHS[0])
-    for strength in (0.5, STRENGTHS[1], 1.0):
-        assert np.all(layout_chances(strength)[drawn.outline, drawn.variant, drawn.vertical] > 0)
-        where = (drawn.outline, drawn.vertical, drawn.tool, drawn.agent)
-        assert np.all(placements(strength)[where] > 0)
-    np.testing.assert_allclose(placements(1.0), spec.placements())
+    strengths = (0.0, STRENGTHS[0], 0.5, STRENGTHS[1], 1.0)
+    sets = [allowed_choices(near_layouts(strength)) for strength in strengths]
+    assert all(lower < higher for lower, higher in itertools.pairwise(sets))
+    assert sets[-1] == allowed_choices(layout_tables())
 
 
 @pytest.mark.parametrize("strength", [0, 0.25, 0.5, 1])

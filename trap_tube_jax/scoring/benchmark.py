@@ -12,21 +12,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax._version import __version__
 from trap_tube_jax.checks import check_integer, check_seed, describe_array, integer_array
 from trap_tube_jax.environment import Environment
 from trap_tube_jax.objects import NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
-from trap_tube_jax.registry import TaskSet, make, task_set
+from trap_tube_jax.registry import TaskSet, task_set
 from trap_tube_jax.scoring.python_agent import PythonAgent
 from trap_tube_jax.scoring.scores import Scores
-from trap_tube_jax.scoring.suite import play_blocks, score_of
-from trap_tube_jax.scoring.tasks import ALL_SETS, PROTOCOL, fixed_tasks
+from trap_tube_jax.scoring.suite import Suite, play_blocks
+from trap_tube_jax.scoring.tasks import ALL_SETS
 from trap_tube_jax.solver.search import solve_batch
 from trap_tube_jax.state import State, take
 
-# Maps a set and B of its tasks to solved bool[B] and the steps taken i32[B].
-Play = Callable[[TaskSet, State], tuple[np.ndarray, np.ndarray]]
+
+class _Ends(NamedTuple):
+    """The ends of B episodes; see `Outcome`."""
+
+    solved: np.ndarray
+    length: np.ndarray
+
+
+Play = Callable[[TaskSet, State], _Ends]  # plays B tasks of a set
 
 
 class Policy(Protocol):
@@ -115,7 +121,7 @@ def score(
     seed = check_seed(seed)
     program = jax.jit(functools.partial(_play, policy), static_argnums=0)
 
-    def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
+    def play(entry: TaskSet, states: State) -> _Ends:
         env = Environment(max_steps=entry.max_steps)  # states hold their tasks
         key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(entry.id.encode()))
 
@@ -133,7 +139,7 @@ def score(
                 f"the policy's act returned a carry with NaN on {entry.label}; check that its "
                 "parameters are finite"
             )
-        return np.asarray(solved), np.asarray(length)
+        return _Ends(np.asarray(solved), np.asarray(length))
 
     return _scores(play, sets, tasks, seed, optimality, num_features)
 
@@ -176,12 +182,12 @@ def score_gymnasium(
     """
     caller = PythonAgent(agent)
 
-    def play(entry: TaskSet, states: State) -> tuple[np.ndarray, np.ndarray]:
+    def play(entry: TaskSet, states: State) -> _Ends:
         step = _compiled_step(Environment(max_steps=entry.max_steps))
         states = jax.device_get(states)
         ends = [caller.play(step, take(states, index)) for index in range(len(states.time))]
         solved, length = zip(*ends, strict=True)
-        return np.array(solved), np.array(length, np.int32)
+        return _Ends(np.array(solved), np.array(length, np.int32))
 
     return _scores(play, sets, tasks, None, optimality, num_features)
 
@@ -198,16 +204,13 @@ def _scores(
     if isinstance(sets, str) or not sets:
         raise ValueError(f"sets must name task sets, such as {', '.join(ALL_SETS)}, got {sets!r}")
     check_integer("optimality", optimality, minimum=0)
-    entries = list(dict.fromkeys(map(task_set, sets)))
-    # Make all environments first, so that a bad argument fails before any play.
-    envs = [make(entry.short, num_features=num_features) for entry in entries]
-    made = []
-    for entry, env in zip(entries, envs, strict=True):
-        states = fixed_tasks(env, entry.id, tasks)
-        solved, length = play(entry, states)
-        shortest = solve_batch(take(states, slice(optimality))).length if optimality else None
-        made.append(score_of(entry.short, states, solved, length, entry.max_steps, shortest))
-    return Scores(PROTOCOL, __version__, seed, tuple(made))
+    suite = Suite.of_sets(sets, tasks, num_features=num_features)
+    ends = {name: play(task_set(name), states) for name, states in suite.tasks.items()}
+    shortest = None
+    if optimality:
+        first = {name: take(states, slice(optimality)) for name, states in suite.tasks.items()}
+        shortest = {name: solve_batch(states).length for name, states in first.items()}
+    return suite.scores(ends, shortest=shortest, seed=seed)
 
 
 def _play(

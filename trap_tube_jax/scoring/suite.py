@@ -125,9 +125,17 @@ class Suite:
         """
         made = []
         for name, outcome in outcomes.items():
-            ends = np.asarray(outcome.solved), np.asarray(outcome.length)
-            plans = None if shortest is None else shortest[name]
-            made.append(score_of(name, self.tasks[name], *ends, self.max_steps[name], plans))
+            solved, length = np.asarray(outcome.solved), np.asarray(outcome.length)
+            found = None
+            if shortest is not None:
+                part = slice(len(shortest[name]))
+                found = Optimality.of(
+                    solved[part], length[part], shortest[name], self.max_steps[name]
+                )
+            layout = layout_numbers(name, self.tasks[name])
+            made.append(
+                Score.of(name, label(name), solved, length, layout=layout, optimality=found)
+            )
         return Scores(PROTOCOL, __version__, seed, tuple(made))
 
 
@@ -152,26 +160,6 @@ def blocks(total: int) -> list[np.ndarray]:
     """
     size = min(BLOCK, total)
     return [np.arange(start, start + size) % total for start in range(0, total, size)]
-
-
-def score_of(
-    name: str,
-    states: State,
-    solved: np.ndarray,
-    length: np.ndarray,
-    max_steps: int,
-    shortest: np.ndarray | None = None,
-) -> Score:
-    """Computes the score of outcomes bool[B] and numbers of steps i32[B] on B tasks of a set.
-
-    `shortest` has the lengths of the first tasks' shortest plans, to compare with.
-    """
-    found = None
-    if shortest is not None:
-        part = slice(len(shortest))
-        found = Optimality.of(solved[part], length[part], shortest, max_steps)
-    layout = layout_numbers(name, states)
-    return Score.of(name, label(name), solved, length, layout=layout, optimality=found)
 
 
 def _limited(outcome: Played, max_steps: int) -> Played:

@@ -9,6 +9,8 @@ from agents import Config, make_learner
 from agents.examples import plain_ppo
 from agents.examples.near_food import NEAR_FOOD
 
+pytestmark = pytest.mark.usefixtures("plain_path")
+
 CONFIG = Config(
     env_id=NEAR_FOOD.id,
     episodes_per_iteration=32,

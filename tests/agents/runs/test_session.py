@@ -38,6 +38,8 @@ from trap_tube_jax.interruptions import Stopped
 from trap_tube_jax.scoring import suite
 from trap_tube_jax.scoring.tasks import ALL_SETS, evaluation_tasks
 
+pytestmark = pytest.mark.usefixtures("plain_path")
+
 ASKED: list[tuple[str, str]] = []  # sets and purposes of the tasks that `whole` has drawn
 
 
@@ -163,7 +165,9 @@ def test_a_best_policy_lost_by_a_kill_is_saved_on_resume(whole, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         train_run(tmp_path / "x", small_run(), TRACKED)
     monkeypatch.undo()
-    train_run(tmp_path / "x", small_run(iterations=2), dataclasses.replace(TRACKED, sets=("base",)))
+    monkeypatch.setattr(program, "make_advance", lambda *_: _raise(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train_run(tmp_path / "x", small_run(), TRACKED)
     assert read_policy(RunFolder(tmp_path / "x").best).iteration == 2
 
 
