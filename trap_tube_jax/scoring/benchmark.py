@@ -42,7 +42,7 @@ class Policy(Protocol):
         """Returns the memory of `batch` episodes before their first step, any pytree of arrays."""
 
     def act(self, observation: jax.Array, carry: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Chooses actions.
+        """Chooses actions; compiled once, so draws of NumPy would be the same at every step.
 
         Args:
           observation: u8[B, 12, 12, N].
