@@ -247,7 +247,6 @@ def agents_that_know_colors() -> list[str]:
     slower = "seed 332, slower decay"
     rows += [
         f"332 and 333 solve {towards['seed 332']} % each",
-        f"333 still solves {towards['seed 333, strong curiosity again']} %",
         f"332 solves {towards[slower]} % of these tasks, but {sideways[slower]} instead of "
         f"{sideways['seed 332']} %",
     ]
@@ -283,25 +282,38 @@ def first_grasps() -> list[str]:
     return [text.format(*ends) for text, ends in zip(texts, low_high, strict=True)]
 
 
-def without_memory() -> list[str]:
-    """Returns the success in {P, Sy} after right and wrong first grasps, by memory."""
-    rows = rows_of("memory", "profile").query("part == 'first-grasp-psy'")
-    percent = 100 * rows["solved"] / rows["tasks"]
-    right, wrong = (
-        percent[rows["level"] == level].set_axis(rows["policy"].unique())
-        for level in ("the tool", "another object")
-    )
-    return [
-        "solves {:.1f} % of {{P, Sy}} after a right first grasp and {:.1f} % after a wrong one, "
-        "instead of {:.1f} and {:.1f} %; without `repeat_penalty`, which remembers, too, "
-        "{:.1f} and {:.1f} %".format(
-            *(
-                percent[policy]
-                for policy in ("no-memory", "best-pstsy", "no-memory-plain")
-                for percent in (right, wrong)
-            )
+def memory() -> list[str]:
+    """Returns the table of success in {P, Sy} by memory, and what training without it costs."""
+    grasps = pd.concat([rows_of("memory", "profile"), rows_of("ingredients", "first_grasps")])
+    grasps = grasps.query("part == 'first-grasp-psy'")
+    percent = grasps.assign(percent=100 * grasps["solved"] / grasps["tasks"])
+    percent = percent.pivot_table(index="policy", columns="level", values="percent")
+    seeds = (10, 12, 13)
+    trained = {"three seeds": "best", "three seeds, `recurrent=False`": "no-memory"}
+    policies = {  # with and without `repeat_penalty`
+        "`best-pstsy`": (["best-pstsy"], ["plain"]),
+        "the same, GRU reset before every step": (["no-memory"], ["no-memory-plain"]),
+        **{
+            text: tuple([f"{name}-seed{seed}{end}" for seed in seeds] for end in ("", "-repeats"))
+            for text, name in trained.items()
+        },
+    }
+    levels = ["the tool", "another object"]
+    rows = []
+    for text, pair in policies.items():
+        found = np.concatenate([percent.loc[names, levels].mean() for names in pair])
+        rows.append(f"| {text} | {cells(found)} |")
+    tested = tables.reported(rows_of("ingredients", "results"))
+    means = tables.by_set(tested).groupby("algorithm").mean()
+    differences = tables.differences(tested).set_index("task_set")
+    for name in ("p", "psy"):
+        ends = -differences.loc[name, ["difference", "high", "low"]]
+        loss, low, high = map(one_decimal, ends)
+        rows.append(
+            f"{means.loc['no-memory', name]:.1f} instead of {means.loc['best', name]:.1f} % of "
+            f"{label(name)} (loss {loss} [{low}, {high}])"
         )
-    ]
+    return rows
 
 
 def predicted_motion() -> list[str]:
@@ -384,7 +396,7 @@ def test_stated_results_are_those_of_the_records():
     ):
         solved = cells(percent_of("colors/test.csv", policies[0]))
         rows[PROTOCOL].append(f"| {sets} | {solved} | {steps_with_colors(*policies):,.0f} |")
-    rows[PROFILES] += agents_that_know_colors() + first_grasps() + without_memory()
+    rows[PROFILES] += agents_that_know_colors() + first_grasps() + memory()
     for row in (percent_of("leaderboard/icm-base.csv"), random_actions()):
         rows[PROTOCOL].append(f"| {cells(row)} |")
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])

@@ -26,6 +26,7 @@ RECORDS = (
     "exp2_paper",
     "exp2_paper_encoder",
     "fast_base",
+    "ingredients",
 )
 ABOUT: records.About = {
     "title": "x", "commands": [], "train_set": "pstsy", "threshold": 1.0,
