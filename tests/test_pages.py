@@ -32,11 +32,17 @@ for folder in ("trap_tube_jax", "agents", "benchmarks", "tests"):
 NAMES = sorted(str(page.relative_to(ROOT)) for page in PAGES)
 PROTOCOL = "trap_tube_jax/protocol.md"
 RESULTS = ROOT / "benchmarks" / "results"
-RESULT_PAGES = (
-    *("best_preset", "curiosities", "motion", "paper_preset", "profiles", "repeats", "table_2"),
-)
 BEST, CURIOSITIES, MOTION, PAPER, PROFILES, REPEATS, TABLE_2 = (
-    f"benchmarks/results/{name}.md" for name in RESULT_PAGES
+    f"benchmarks/results/{name}.md"
+    for name in (
+        "best_preset",
+        "curiosities",
+        "motion",
+        "paper_preset",
+        "profiles",
+        "repeats",
+        "table_2",
+    )
 )
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -320,8 +326,8 @@ def predicted_motion() -> list[str]:
     """Returns the rows of the table of `motion.md`, and the interval of their difference."""
     found = [percent_solved(name)["p"] for name in ("exp2_without_motion", "exp2_motion")]
     rows = [
-        f"| {{P}}, {name} | {cells([*own, own.mean()])} |"
-        for name, own in zip(("without", "with"), found, strict=True)
+        f"| {{P}}, {name} | {cells([*seeds, seeds.mean()])} |"
+        for name, seeds in zip(("without", "with"), found, strict=True)
     ]
     test: Any = stats.ttest_ind(*reversed(found), equal_var=False)
     ends = (found[1].mean() - found[0].mean(), *test.confidence_interval())
@@ -339,10 +345,9 @@ def avoided_repeats() -> list[str]:
     found["percent"] = 100 * found["solved"] / found["tasks"]
     percent = found.pivot_table(index=["task_set", "avoids"], columns="seed", values="percent")
     rows = []
-    for name in ("p", "pstsy"):
-        for avoids, text in ((False, "without"), (True, "with")):
-            own = percent.loc[(name, avoids)]
-            rows.append(f"| {label(name)}, {text} | {cells([*own, own.mean()])} |")
+    for (name, avoids), seeds in percent.loc[["p", "pstsy"]].iterrows():
+        text = "with" if avoids else "without"
+        rows.append(f"| {label(name)}, {text} | {cells([*seeds, seeds.mean()])} |")
     gains = [percent.loc[(name, True)] - percent.loc[(name, False)] for name in ("p", "pstsy")]
     (mean, low, high), (mean_all, low_all, high_all) = map(mean_interval, gains)
     rows.append(

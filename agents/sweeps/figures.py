@@ -61,9 +61,9 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
     shown = set()
     for axis, rows in zip(axes, panels.values(), strict=True):
         for color, name in zip(COLORS, names, strict=False):
-            own = rows[rows["algorithm"] == name]
-            if len(own):
-                shown.add(_draw_seeds(axis, own, color, name, has_ranges))
+            curves_of_name = rows[rows["algorithm"] == name]
+            if len(curves_of_name):
+                shown.add(_draw_seeds(axis, curves_of_name, color, name, has_ranges))
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
         axis.set_xlabel(f"{UNITS[unit]}, millions")

@@ -269,8 +269,8 @@ def test_an_algorithm_without_an_evaluation_has_no_line_there():
         rows("ppo", [3, 4], purpose="validation", iteration=1)
         + rows("ppo", [5, 8], purpose="validation")
     )
-    each = ((0, 1), (0, 0.5))
-    both = pd.concat([curves("ppo", each), curves("diverged", each)])
+    evaluations = ((0, 1), (0, 0.5))
+    both = pd.concat([curves(name, evaluations) for name in ("ppo", "diverged")])
     figure = figures.draw_curves(results, both, ABOUT)
     assert [len(axis.lines) for axis in figure.axes] == [2, 2, 1]
     assert figure.get_supylabel() == "solved, %: mean and range of seeds"
