@@ -31,6 +31,7 @@ CONFIG = Config(
     iterations=ITERATIONS,
     lr_decay_fraction=0.7,
 )
+ERROR = 0.2  # seeds stray by up to 0.1; a value that is off by one step strays by half or more
 OPTIMISED = True  # they train for long
 pytestmark = pytest.mark.usefixtures("plain_path")
 Learner = Callable[..., tuple[jax.Array, Trajectory]]
@@ -69,15 +70,15 @@ def train_and_play(kind: jax.Array, key: jax.Array) -> tuple[jax.Array, Trajecto
 
 def test_the_value_of_a_certain_reward_is_the_reward(learn):
     reward, played = learn("value")
-    np.testing.assert_allclose(played.value[:, 0, 0], reward, rtol=0.1)
-    np.testing.assert_allclose(played.value[:, 1:-1, 0] / reward, 0.0, atol=0.1)
+    np.testing.assert_allclose(played.value[:, 0, 0], reward, rtol=ERROR)
+    np.testing.assert_allclose(played.value[:, 1:-1, 0] / reward, 0.0, atol=ERROR)
 
 
 def test_value_is_discounted(learn):
     reward, played = learn("discount")
     for time in range(probes.STEPS):
         expected = reward * DISCOUNT ** (probes.STEPS - 1 - time)
-        np.testing.assert_allclose(played.value[:, time, 0], expected, rtol=0.1)
+        np.testing.assert_allclose(played.value[:, time, 0], expected, rtol=ERROR)
 
 
 @pytest.mark.parametrize("kind", ["policy", "cue", "credit", "memory"])
