@@ -19,6 +19,7 @@ from agents.profiles.measure import (
 )
 from agents.profiles.tasks import FIRST_TRIES, PARTS, STRENGTHS
 from agents.runs import compilation
+from agents.runs.folder import PROVENANCE_FILE, check_kind
 from agents.runs.loading import load, short_name
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import announce, plain_errors
@@ -77,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (output / figure).unlink(missing_ok=True)
     table = found.to_csv(index=False, float_format="%.6g")
     write_bytes(output / "profile.csv", table.encode())
-    write_json(output / "provenance.json", origin)
+    write_json(output / PROVENANCE_FILE, origin)
     if set(options.parts) & set(plots.PANELS):
         plots.save_success(found, output / "success.png")
     if "control" in options.parts:
@@ -86,14 +87,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _check_free(folder: Path, iterations: dict[str, int]) -> None:
-    """Raises ValueError if a folder holds a run, the profile of other policies, or is a file."""
+    """Raises ValueError if a folder holds other results than a profile of these policies."""
     check_folder(folder)
-    origin = folder / "provenance.json"
+    check_kind(folder, "a profile", "--output")
+    origin = folder / PROVENANCE_FILE
     found = read_json(origin) if is_file(origin) else {"iterations": iterations}
     if not isinstance(found, dict) or found.get("iterations") != iterations:
-        raise ValueError(
-            f"{folder} holds a run, or the profile of other policies; give another --output"
-        )
+        raise ValueError(f"{folder} holds the profile of other policies; give another --output")
 
 
 def _print_tables(found: Table) -> None:

@@ -12,6 +12,13 @@ from trap_tube_jax.checks import check_seed, check_stored_name, expand, is_print
 from trap_tube_jax.imports import import_modules
 
 CONFIG_FILE = "config.json"
+PROVENANCE_FILE = "provenance.json"
+GRID_FILE = "grid.json"
+KINDS = {  # of results, by the file that every folder of the kind holds
+    CONFIG_FILE: "a run",  # first, since a run has provenance, too
+    GRID_FILE: "a grid",
+    PROVENANCE_FILE: "a profile",
+}
 RUNS = Path("runs")  # where agents.train puts them
 MAX_LISTED = 10
 
@@ -36,7 +43,7 @@ class RunFolder:
     def __init__(self, path: str | Path):
         self.path = path = expand(path)
         self.config = path / CONFIG_FILE  # settings and options
-        self.provenance = path / "provenance.json"  # machines, versions and commits that trained it
+        self.provenance = path / PROVENANCE_FILE  # machines, versions and commits that trained it
         self.metrics = path / "metrics.csv"  # a row per iteration
         self.evaluations = path / "evaluations.csv"  # a row per evaluated iteration and task set
         self.start = path / "start.safetensors"  # the agent that a fine-tuned run started from
@@ -112,12 +119,25 @@ class RunFolder:
             ) from error
 
 
+def check_kind(path: Path, kind: str, option: str) -> None:
+    """Raises ValueError, which names the option, if a folder holds another of `KINDS`."""
+    found = _kind_of(path)
+    if found not in (None, kind):
+        raise ValueError(f"{path} holds {found}; give another {option}")
+
+
+def _kind_of(path: Path) -> str | None:
+    return next((kind for name, kind in KINDS.items() if (path / name).is_file()), None)
+
+
 def check_output(path: Path) -> None:
-    """Raises ValueError if a file cannot be written, or would replace a run's file."""
-    is_file(path)
+    """Raises ValueError if a file cannot be written, or would replace one of other results."""
+    exists = is_file(path)
     check_folder(path.parent)
     if run := run_of(path):
         raise ValueError(f"{path} is a file of the run {run.path}; give another path")
+    if exists and (kind := _kind_of(path.parent)):
+        raise ValueError(f"{path} may be a file of {kind}; give another path")
 
 
 def run_of(path: Path) -> RunFolder | None:

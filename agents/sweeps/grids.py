@@ -13,7 +13,7 @@ import trap_tube_jax as tt
 from agents.command_line import option
 from agents.config import Config
 from agents.ppo.learner import make_learner
-from agents.runs.folder import RunFolder, check_name
+from agents.runs.folder import RunFolder, check_kind, check_name
 from agents.runs.run import Run, RunOptions
 from trap_tube_jax.checks import check_integer
 
@@ -98,6 +98,7 @@ class Grid:
         for config in configs.values():
             make_learner(config)  # refuses what cannot be trained with
         root = options.out / name
+        check_kind(root, "a grid", "--name")
         runs = {}
         for seed in range(options.seed, options.seed + options.seeds):
             for point, config in configs.items():

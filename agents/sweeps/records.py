@@ -13,7 +13,7 @@ from typing import NotRequired, TypedDict
 import agents
 import trap_tube_jax as tt
 from agents.files import is_file, read_json, write_bytes, write_json
-from agents.runs.folder import CONFIG_FILE, RunFolder, Settings, check_name
+from agents.runs.folder import CONFIG_FILE, GRID_FILE, RunFolder, Settings, check_name
 from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.provenance import Machine, read_provenance
@@ -101,12 +101,12 @@ def collect(root: Path, command: str, launched: Mapping[Path, Run]) -> None:
     results = agents.results(root)
     write_rows(root / "results.csv", results.assign(run=results["run"].map(lambda x: Path(x).name)))
     write_rows(root / "curves.csv", metrics(root)[CURVES])
-    write_json(root / "grid.json", about)
+    write_json(root / GRID_FILE, about)
 
 
 def _read_about(root: Path) -> About | None:
     """Reads grid.json; None if it is missing."""
-    path = root / "grid.json"
+    path = root / GRID_FILE
     return read_json(path, About) if is_file(path) else None
 
 
@@ -148,7 +148,7 @@ def read(root: Path) -> tuple[Table, Table, About]:
       ValueError: a file is damaged.
       OSError: a file cannot be opened.
     """
-    about = read_json(root / "grid.json", About)
+    about = read_json(root / GRID_FILE, About)
     return read_rows(root / "results.csv"), read_rows(root / "curves.csv"), about
 
 

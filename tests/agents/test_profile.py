@@ -62,11 +62,19 @@ def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monk
 @pytest.mark.parametrize(
     "origin", [[], {"iterations": {"fast-base": 7}}, {"iterations": {"icm-base": 19}}]
 )
-def test_neither_a_run_nor_a_profile_of_other_policies_is_replaced(origin, tmp_path, capsys):
+def test_a_profile_of_other_policies_is_not_replaced(origin, tmp_path, capsys):
     (tmp_path / "provenance.json").write_text(json.dumps(origin))
     message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
-    assert "holds a run, or the profile of other policies; give another --output" in message
+    assert "holds the profile of other policies; give another --output" in message
     assert [path.name for path in tmp_path.iterdir()] == ["provenance.json"]
+
+
+@pytest.mark.parametrize(("name", "kind"), [("config.json", "a run"), ("grid.json", "a grid")])
+def test_a_profile_does_not_mix_with_other_results(name, kind, tmp_path, capsys):
+    (tmp_path / name).touch()
+    message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
+    assert f"{tmp_path} holds {kind}; give another --output" in message
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_profile_inside_a_file_is_refused_before_it_plays(tmp_path, capsys):

@@ -246,6 +246,17 @@ def test_an_evaluation_replaces_no_file_of_a_run(option, name, capsys, whole):
     assert f"{name} is a file of the run {whole[0]}; give another path" in message
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"), [("grid.json", "a grid"), ("provenance.json", "a profile")]
+)
+def test_an_evaluation_replaces_no_file_of_other_results(name, kind, capsys, tmp_path):
+    for file in (name, "results.csv"):
+        (tmp_path / file).touch()
+    path = tmp_path / "results.csv"
+    message = refused(capsys, evaluate.main, "best-pstsy", "--output", path)
+    assert f"{path} may be a file of {kind}; give another path" in message
+
+
 @pytest.mark.parametrize("option", ["--output", "--gif"])
 def test_an_evaluation_refuses_to_write_to_a_folder_before_it_plays(option, capsys, tmp_path):
     message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path)
@@ -305,10 +316,10 @@ def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     found, *wanted = read(arguments)
     assert wanted == [stored, how]
     assert run_path(found, stored) == tmp_path / "x"
-    _, *wanted = read(f"{arguments} --iterations 999 --test-tasks 2")
+    _, *wanted = read(f"{arguments} --iterations 999 --checkpoint-every 2")
     expected = dataclasses.replace(stored.config, iterations=999)
     run = dataclasses.replace(stored, config=expected)
-    assert wanted == [run, dataclasses.replace(how, test_tasks=2)]
+    assert wanted == [run, dataclasses.replace(how, checkpoint_every=2)]
 
 
 def test_help_documents_every_setting(capsys, monkeypatch):

@@ -106,6 +106,16 @@ def test_a_stored_run_with_other_settings_is_refused(tmp_path):
     assert Grid().make_runs("sweep", longer)[path].config.iterations == 200
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"), [("config.json", "a run"), ("provenance.json", "a profile")]
+)
+def test_a_grid_does_not_mix_with_other_results(name, kind, tmp_path):
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / name).touch()
+    given = Options(name="x", out=tmp_path)
+    assert_refused([f"x holds {kind}; give another --name"], Grid().make_runs, "sweep", given)
+
+
 def test_the_arms_of_the_published_code_hold_the_papers_two():
     for number in ("1", "2"):
         paper, code = (GRIDS[name].points for name in (f"exp{number}", f"exp{number}-code"))
