@@ -39,8 +39,8 @@ class Options:
       seed: seed of all draws. agents.sweep trains several.
       name: the run's folder within --out, by default <preset or agent>-<task set>-<seed>.
       out: the folder of all runs.
-      resume: folder of a run to continue with its options. Of its settings only --iterations,
-        --max-transitions and --stop-when-solved may change.
+      resume: folder of a run to continue with its options. Of its settings and evaluation, only
+        --iterations, --max-transitions and --stop-when-solved may change.
       imports: module to import first. It may register curiosities, encoders and task sets.
       distributed: joins the processes of a Slurm, Open MPI, Kubernetes or Cloud TPU job, or of the
         job at HOST:PORT PROCESSES NUMBER.

@@ -1,7 +1,5 @@
 """The history of a run, as its files hold it: checkpoint, rows and best policy."""
 
-from collections.abc import Sequence
-
 from agents.arrays import from_arrays, read_arrays
 from agents.ppo.learner import TrainState
 from agents.runs import checkpoint
@@ -64,28 +62,22 @@ def has_ended(folder: RunFolder, run: Run) -> bool:
         return False
 
 
-def check_best(folder: RunFolder, iteration: int, sets: Sequence[str]) -> None:
-    """Raises ValueError unless a run's best policy can be compared with later ones on `sets`."""
+def check_best(folder: RunFolder, iteration: int) -> None:
+    """Raises ValueError unless a run's best policy can be compared with later ones."""
     rows = validation_rows(folder)
     best = best_iteration(folder)
     if best is None:
         if min(rows["iteration"], default=iteration) < iteration:
             raise ValueError(
                 f"{folder.best} is missing, although {folder.evaluations} has evaluations; restore "
-                "it, or continue with --evaluate-every 0"
+                "it, or train under another --name"
             )
         return
     read_policy(folder.best)  # or damage would be noticed only at the end
-    known = rows[rows["iteration"] == best]["task_set"]
-    if best <= iteration and not len(known):
+    if best <= iteration and best not in set(rows["iteration"]):
         raise ValueError(
             f"{folder.evaluations} lacks the evaluation of iteration {best}, whose policy is in "
-            f"{folder.best}; restore it, or continue with --evaluate-every 0"
-        )
-    if len(known) and not set(known) & set(sets):
-        raise ValueError(
-            f"--sets must include one of {', '.join(known)}, on which the best policy so far was "
-            f"evaluated; got {', '.join(sets)}"
+            f"{folder.best}; restore it, or train under another --name"
         )
 
 
@@ -104,15 +96,12 @@ def best_iteration(folder: RunFolder) -> int | None:
 def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:
     """Returns whether an evaluation is better than the best iteration's so far.
 
-    Compares the mean fractions of validation tasks solved, over the task sets that both have. Base,
-    a single task, counts only if it is the training set or the only set.
+    Compares the mean fractions of validation tasks solved, over the task sets. Base, a single task,
+    counts only if it is the training set or the only set.
     """
-    solved = rows.assign(share=rows["solved"] / rows["tasks"]).pivot_table(
-        index="task_set", columns="iteration", values="share", aggfunc="last"
-    )
-    if iteration not in solved or best not in solved or iteration == best:
-        return iteration in solved and iteration != best
-    both = solved[[best, iteration]].dropna()
-    ranked = both if train_set == "base" else both.drop(index="base", errors="ignore")
-    means = (ranked if len(ranked) else both).mean()
+    others = rows[rows["task_set"] != "base"]
+    ranked = others if len(others) and train_set != "base" else rows
+    means = (ranked["solved"] / ranked["tasks"]).groupby(ranked["iteration"]).mean()
+    if iteration not in means or best not in means:
+        return iteration in means
     return bool(means[iteration] > means[best])

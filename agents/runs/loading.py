@@ -83,9 +83,9 @@ def short_name(source: str | Path) -> str:
 
 
 def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]) -> Policy:
-    run, options = folder.read(imports)
+    run, _ = folder.read(imports)
     name = f"seed {run.seed}"
-    if iteration is None and options.evaluate_every and is_file(folder.best):
+    if iteration is None and is_file(folder.best):
         return read_policy(folder.best).replace(name=name)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)

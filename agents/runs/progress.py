@@ -62,15 +62,16 @@ class Progress:
         self.folder = folder
         self.has_trained = False
         if stored.config.is_file():
-            run.check_continues(stored.read()[0])
+            before, options = stored.read()
+            run.check_continues(before)
+            program.options.check_continues(options)
         restored, self.last = restore(stored, program.state_shapes)
         done = self.iteration
         if done > (limit := run.config.iterations):
             raise ValueError(f"iterations must be at least {done}, which are done, got {limit}")
         check_rows(stored, done)
-        self._check_evaluations()
         if program.validation:
-            check_best(stored, done, program.sets)
+            check_best(stored, done)
         self.start: Policy | None = None
         if restored is None and run.finetune is not None:
             source = stored.start if stored.start.is_file() else run.finetune
@@ -162,44 +163,27 @@ class Progress:
         """
         options = self.program.options
         policy = self._policy()
-        if self.program.validation and self.stored.best.is_file():
+        if self.stored.best.is_file():
             policy = read_policy(self.stored.best)
-        tested = read_rows(self.stored.evaluations).query("purpose == 'test'")
-        tested = set(tested[tested["iteration"] == policy.iteration]["task_set"])
+        tested = read_rows(self.stored.evaluations).query("purpose == 'test'")["iteration"]
+        is_tested = policy.iteration in set(tested)
         has_page = self.folder.page.exists() or not options.report
-        if tested.issuperset(self.program.sets) and has_page and not self.has_trained:
+        if is_tested and has_page and not self.has_trained:
             self.console.out("Already tested; to play other tasks, run python -m agents.evaluate.")
             return None
         self.console.out("Playing test tasks, which takes up to a minute ...")
         evaluator = self.program.test
         played = evaluator(policy.params)
         scores = evaluator.suite.scores(played)
-        rows = evaluation_rows(scores, policy, "test")
         if options.report:
             self.folder.page.unlink(missing_ok=True)  # from now on it shows other scores
-        append_rows(self.folder.evaluations, [row for row in rows if row["task_set"] not in tested])
+        if not is_tested:
+            append_rows(self.folder.evaluations, evaluation_rows(scores, policy, "test"))
         self.console.out(scores)
         if options.report:  # last, since a figure may fail
             self.console.out("Drawing the report, which takes up to half a minute ...")
             report.write(self.folder, self.run, evaluator.suite, played)
         return scores
-
-    def _check_evaluations(self) -> None:
-        """Raises ValueError if evaluations after the checkpoint would not be made again."""
-        every = self.program.options.evaluate_every
-        metrics = read_rows(self.stored.metrics).to_dict("records")
-        ends = {row["iteration"] for row in metrics if is_last(row, self.run.config)}
-        rows = read_rows(self.stored.evaluations)
-        for row in rows[rows["iteration"] > self.iteration].to_dict("records"):
-            done = row["iteration"]
-            is_due = every and (done % every == 0 or done in ends)
-            if row["task_set"] not in self.program.sets or not (row["purpose"] == "test" or is_due):
-                raise ValueError(
-                    f"{self.stored.evaluations} has the evaluation of iteration {done} on "
-                    f"{row['task_set']}, which is after the newest checkpoint and would not be "
-                    "made again; continue with the same --sets, --evaluate-every and length of "
-                    "training as before"
-                )
 
     def _row(self, metrics: Metrics, seconds: float) -> Row:
         """Returns a row of metrics.

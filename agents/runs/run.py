@@ -13,6 +13,7 @@ from trap_tube_jax.checks import MAX_TASKS, check_integer, check_printable, chec
 
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
+EVALUATION = ("evaluate_every", "sets", "test_tasks")  # options that a resumed run keeps
 MAX_DEVICES = 1024
 
 
@@ -71,7 +72,8 @@ class Run:
     def check_continues(self, before: "Run") -> None:
         """Raises ValueError unless resuming `before` gives the result of an uninterrupted run.
 
-        Only the evaluation at its end may differ: it counts for the choice of the best policy.
+        Only the evaluation at the end of `before` may differ: it counts for the choice of the best
+        policy.
         """
         old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
         scheduled = {"iterations"} if before.config.has_schedule else set()
@@ -123,7 +125,8 @@ class DeviceOptions:
 class RunOptions(DeviceOptions):
     """Options for carrying out a run; on one device, none of them changes what it learns.
 
-    `devices` share the run: by default one, or all if several processes train it.
+    `devices` share the run: by default one, or all if several processes train it. A resumed run
+    keeps `evaluate_every`, `sets` and `test_tasks`, so that its evaluations can be compared.
 
     Attributes:
       checkpoint_every: iterations between checkpoints.
@@ -162,3 +165,13 @@ class RunOptions(DeviceOptions):
             raise ValueError("sets must name one or more task sets, or be None for the default")
         for name in self.sets:
             tt.task_set(name)
+
+    def check_continues(self, before: "RunOptions") -> None:
+        """Raises ValueError if evaluations could not be compared with those of `before`."""
+        for name in EVALUATION:
+            old, new = getattr(before, name), getattr(self, name)
+            if new != old:
+                raise ValueError(
+                    f"the run has {name}={old}, not {new}; {', '.join(EVALUATION)} may not change "
+                    "in a run; to play other tasks, run python -m agents.evaluate"
+                )
