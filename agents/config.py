@@ -361,8 +361,7 @@ def _check_value(field: dataclasses.Field, value: Any) -> None:
     else:
         low, high = field.metadata["limits"]
         is_whole = "int" in str(kind)
-        wanted = f"{'an integer' if is_whole else 'a finite number'} from {low:,}"
-        wanted += f" to {high:,}" if high < MAX_INT32 else ""
+        wanted = f"{'an integer' if is_whole else 'a finite number'} from {low:,} to {high:,}"
         numbers = (value,)
         valid = True
         if get_origin(kind) is tuple:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import trap_tube_jax as tt
 from agents.config import Config
 from agents.curiosity.base import Curiosity, Experience, Params
-from agents.networks.layers import assert_floats
+from agents.networks.layers import assert_floats, draw
 from agents.registry import contract, curiosities
 from trap_tube_jax.objects import BOARD_SIZE
 
@@ -43,16 +43,22 @@ class CheckedCuriosity(Curiosity):
             kind = type(curiosity).__name__
             assert isinstance(curiosity, Curiosity), f"{kind} is no agents.curiosity.Curiosity"
             boards = jnp.zeros((2, BOARD_SIZE, BOARD_SIZE, config.num_features), jnp.uint8)
-            params = jax.eval_shape(curiosity.init, jax.random.key(0), boards[:1])
+            params = jax.eval_shape(self.init, jax.random.key(0), boards[:1])
             assert_floats(params)
             features = jax.eval_shape(curiosity.encode, params, boards)
             assert isinstance(features, jax.ShapeDtypeStruct), "encode must return an array"
             chex.assert_shape(features, (len(boards), None))
             chex.assert_type(features, jnp.float32)
         self.needs_next_hidden = curiosity.needs_next_hidden
-        self.init = curiosity.init
         self.memory = curiosity.memory
         self.encode = curiosity.encode
+
+    def init(self, key: jax.Array, board: jax.Array) -> Params:
+        """Draws the parameters; see `Curiosity.init`.
+
+        Also draws the kernels of `layers.dense` that a module's own `init` left undrawn.
+        """
+        return draw(jax.random.fold_in(key, 1), self.curiosity.init(key, board))
 
     def reward(self, params: Params, memory: Any, experience: Experience) -> tuple[jax.Array, Any]:
         """Returns reward and memory; see `Curiosity.reward`."""

@@ -166,6 +166,8 @@ def is_being_written(path: Path) -> bool:
             return False
     except BusyError:
         return True
+    except ValueError:  # training would be refused, too
+        return False
 
 
 def log_of(path: Path) -> Path:

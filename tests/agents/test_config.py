@@ -45,6 +45,7 @@ def test_a_preset_trains_in_a_custom_environment_without_curiosity_and_previous_
         ({"episodes_per_iteration": 1.0}, ["episodes_per_iteration", "integer", "1.0"]),
         ({"episodes_per_iteration": True}, ["episodes_per_iteration", "integer", "True"]),
         ({"episodes_per_iteration": 10**9}, ["episodes_per_iteration", "1000000000"]),
+        ({"max_transitions": 3 * 10**9}, ["from 1 to 2,147,483,647, got 3000000000"]),
         ({"filters": (32,)}, ["filters must be 2 numbers, each an integer", "(32,)"]),
         ({"filters": (0, 64)}, ["filters", "0"]),
         ({"replay_fractions": (0.6, 0.4)}, ["replay_fractions must leave", "(0.6, 0.4)"]),

@@ -10,7 +10,7 @@ from flax import nnx
 from agents import Config, make_learner
 from agents.curiosity import Curiosity
 from agents.networks.encoder import Encoder
-from agents.networks.layers import init_module
+from agents.networks.layers import dense, init_module
 from agents.parallel.devices import EpisodeAxis
 from agents.registry import curiosities, encoders
 from helpers.curiosities import Returning
@@ -78,6 +78,12 @@ def test_whatever_a_curiosity_returns_is_refused_in_one_line(curiosity, message,
         train()
     assert "\n" not in str(error.value)
     assert "Chex" not in str(error.value)
+
+
+def test_a_module_that_a_curiosity_initialises_by_itself_is_drawn(with_curiosity):
+    custom = with_curiosity(Broken(init=lambda key, x: dense(4).init(key, x.reshape(1, -1))))
+    params = custom.init(jax.random.key(0)).params["curiosity"]["params"]
+    assert len(np.unique(params["kernel"])) > 1_000
 
 
 class Maps(nn.Module):
