@@ -16,6 +16,7 @@ Python, because XLA's CPU backend is slow at derivatives of convolutions in a lo
 """
 
 import dataclasses
+import statistics
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -238,16 +239,18 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
         if name in PROGRAMS[network]
     }
     states: dict[str, Any] = {name: state for name, (*_, state) in programs.items()}
-    steps: dict[str, Any] = {}
+    steps: dict[str, list[float]] = {name: [] for name in programs}
     calls: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(options.repeats + 1):
         for name, (iterate, *_) in programs.items():
-            (states[name], steps[name]), spent = harness.timed(iterate, states[name])
+            (states[name], taken), spent = harness.timed(iterate, states[name])
+            steps[name].append(float(taken))
             calls[name].append(spent)
     speeds = []
     for name, (_, compile_s, _) in programs.items():
         timing = harness.Timing.of(compile_s, calls[name][1:])
-        speeds.append(Speed(task_set, network, name, float(steps[name]) / timing.median_s, timing))
+        speed = statistics.mean(steps[name][1:]) / timing.median_s
+        speeds.append(Speed(task_set, network, name, speed, timing))
     return speeds
 
 

@@ -136,7 +136,7 @@ def _register_with_gymnasium() -> None:
         return
     try:
         importlib.import_module("trap_tube_jax.adapters.to_gymnasium")
-    except ImportError as error:  # an old or broken one must not keep the environment from users
+    except Exception as error:  # an old or broken one must not keep the environment from users
         warnings.warn(f"no task set is registered with Gymnasium: {error}", stacklevel=2)
 
 

@@ -77,7 +77,8 @@ def render(
       u8[12 s, 12 s, 3].
 
     Raises:
-      ValueError: `cell_size` is not an integer >= 1, or `state` not one unbatched state.
+      ValueError: `cell_size` is not an integer >= 1, `grasp` not one integer, or `state` not one
+        unbatched state.
 
     Example:
       >>> picture = tt.render(tt.base_state(), 32, grasp=0)
@@ -86,6 +87,8 @@ def render(
     """
     check_state(state)
     cell_size = check_integer("cell_size", cell_size)
+    if grasp is not None and integer_array("grasp", grasp).shape:
+        raise ValueError(f"grasp must be one integer, got {grasp!r}")
     return _render(state, grasp, cell_size=cell_size, grid=bool(grid))
 
 
@@ -114,7 +117,7 @@ def rgb(features: jax.Array) -> jax.Array:
 
 
 def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarray:
-    """Draws an episode as u8[T + 1, 12 s, 12 s, 3]. Runs on the host.
+    """Draws an episode as u8[T + 1, 12 s, 12 s, 3], without a step limit. Runs on the host.
 
     A frame shows the board before an action, with the hand in the action's grasp direction. The
     last frame shows the final board without a hand.

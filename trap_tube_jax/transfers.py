@@ -89,7 +89,7 @@ class Composition:
 
     @property
     def __name__(self) -> str:
-        return ", ".join(map(transfer_name, self.transfers))
+        return ", ".join(map(transfer_name, self.transfers)) or "identity"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, check_own_state, describe_array, names_adapters
+from trap_tube_jax.checks import check_own_state, describe_array, names_adapters
 from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.prng import raw_shape
@@ -35,6 +35,7 @@ from trap_tube_jax.wrappers import (
 )
 
 MAX_SELECTED_FEATURES = 8
+MIN_CHUNK = 32  # environments that start over at a time
 
 
 class VectorState(ByValue, struct.PyTreeNode, eq=False):
@@ -68,12 +69,9 @@ class VectorEnvironment:
 
     Attributes:
       env: an environment without auto-reset, not a subclass: the batch would bypass its methods.
-      chunk_size: environments that start over at a time, at least 1; by default 32 on a CPU, and
-        the larger of 32 and a 32nd of the batch on other devices. Small chunks waste less when few
-        episodes end together; large ones occupy a GPU.
 
     Raises:
-      ValueError: naming the argument, its value and what is allowed.
+      ValueError: `env` is something else.
 
     Example:
       >>> env = tt.VectorEnvironment(tt.make("base"))
@@ -84,7 +82,6 @@ class VectorEnvironment:
     """
 
     env: Environment
-    chunk_size: int | None = dataclasses.field(default=None, kw_only=True)
     auto_resets: ClassVar = "SameStep"
 
     def __post_init__(self):
@@ -94,8 +91,6 @@ class VectorEnvironment:
                 f"env must be a trap_tube_jax.Environment, got {self.env!r}"
                 + (hint if isinstance(self.env, Environment) else "")
             )
-        if self.chunk_size is not None:
-            object.__setattr__(self, "chunk_size", check_integer("chunk_size", self.chunk_size))
 
     @names_adapters
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
@@ -139,7 +134,7 @@ class VectorEnvironment:
     ) -> tuple[VectorState, jax.Array]:
         """Starts the next episode where `done` bool[B], in the state and in the picture."""
         num_envs = len(done)
-        size = self._chunk_size(num_envs)
+        size = _chunk_size(num_envs)
         finished = jnp.cumsum(done, dtype=jnp.int32)
 
         def start_chunk(carry):
@@ -168,11 +163,14 @@ class VectorEnvironment:
         )
         return state, picture
 
-    def _chunk_size(self, num_envs: int) -> int:
-        size = self.chunk_size
-        if size is None:
-            size = 32 if jax.default_backend() == "cpu" else max(32, num_envs // 32)
-        return min(size, num_envs)
+
+def _chunk_size(num_envs: int) -> int:
+    """Returns how many environments start over at a time.
+
+    Small chunks waste less when few episodes end together; large ones occupy a GPU.
+    """
+    size = MIN_CHUNK if jax.default_backend() == "cpu" else max(MIN_CHUNK, num_envs // 32)
+    return min(size, num_envs)
 
 
 def _check_keys(keys: Any) -> None:

@@ -11,6 +11,7 @@ import pytest
 import trap_tube_jax as tt
 from helpers.jax_settings import needs_threefry
 from helpers.trees import assert_same, rows
+from trap_tube_jax import vector
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 SIZE = 20
@@ -26,9 +27,10 @@ ACTIONS = np.random.default_rng(0).integers(0, 4, (6, SIZE, 2), np.int32)
 
 
 @needs_threefry
-def test_next_step_spends_a_step_on_the_reset():
+def test_next_step_spends_a_step_on_the_reset(monkeypatch):
     # Fewer at a time than end together, so that the resets take more than one round.
-    batch = NextStepVectorEnvironment(tt.Environment((wander,), max_steps=4), chunk_size=8)
+    monkeypatch.setattr(vector, "MIN_CHUNK", 8)
+    batch = NextStepVectorEnvironment(tt.Environment((wander,), max_steps=4))
     reset = jax.jit(batch.reset)
     step = jax.jit(batch.step)
     state, _ = reset(jax.random.split(jax.random.key(0), SIZE))

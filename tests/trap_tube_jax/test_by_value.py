@@ -32,7 +32,6 @@ def environments() -> dict[str, Any]:
         "auto-reset": tt.AutoReset(tt.make("pstsy")),
         "statistics": tt.EpisodeStatistics(tt.AutoReset(tt.make("pstsy"))),
         "vector": tt.VectorEnvironment(tt.make("pstsy")),
-        "small chunks": tt.VectorEnvironment(tt.make("pstsy"), chunk_size=2),
         "next step": NextStepVectorEnvironment(tt.make("pstsy")),
     }
 

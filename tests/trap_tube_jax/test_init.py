@@ -1,5 +1,6 @@
 """Importing `trap_tube_jax`: exports, documentation, and the registration with Gymnasium."""
 
+import importlib
 import re
 import sys
 import textwrap
@@ -26,5 +27,12 @@ def test_only_a_missing_gymnasium_goes_unsaid(monkeypatch):
         without.setitem(sys.modules, "gymnasium", None)
         tt._register_with_gymnasium()
     monkeypatch.setitem(sys.modules, "gymnasium", tt)  # some version
+    with pytest.warns(UserWarning, match=r"Gymnasium: .*to_gymnasium"):
+        tt._register_with_gymnasium()
+
+    def fail(name):
+        raise AttributeError(name)
+
+    monkeypatch.setattr(importlib, "import_module", fail)
     with pytest.warns(UserWarning, match=r"Gymnasium: .*to_gymnasium"):
         tt._register_with_gymnasium()

@@ -11,6 +11,7 @@ import pytest
 import trap_tube_jax as tt
 from helpers.jax_settings import enable_x64
 from helpers.trees import assert_same, bits
+from trap_tube_jax.scoring import knowledge
 
 OPTIMISED = False  # few steps
 
@@ -36,7 +37,7 @@ def play() -> Any:
     """Episodes of two steps, alone and in a batch, and a picture; keys as their bits."""
     env = tt.Environment(TRANSFERS, base=BASE, max_steps=2)
     alone = tt.EpisodeStatistics(tt.AutoReset(tt.make("p", max_steps=2)))
-    batch = tt.EpisodeStatistics(tt.VectorEnvironment(env, chunk_size=2))
+    batch = tt.EpisodeStatistics(tt.VectorEnvironment(env))
     keys = jax.random.split(jax.random.key(5), 3)
     record: list[Any] = []
     for wrapped, key, shape in ((alone, jax.random.key(6), (2,)), (batch, keys, (3, 2))):
@@ -46,6 +47,9 @@ def play() -> Any:
             record.append((state, timestep))
             state, timestep = step(state, np.ones(shape, int))
     record.append(tt.render(tt.base_state(), 8, grasp=0))
+    first_tries = (knowledge.first_push, knowledge.first_grasp)
+    record += [find(tt.base_state(), np.ones((2, 2), int)) for find in first_tries]
+    record.append(knowledge.choice_of_exit(tt.base_state(), np.array([0, 1], np.int32)))
     record.append((tt.action_from_index(np.arange(16)), tt.action_to_index(np.array([1, 2]))))
     return jax.tree.map(bits, record)
 

@@ -123,6 +123,12 @@ def test_render_refuses_other_cell_sizes(size):
         tt.render(tt.base_state(), size)
 
 
+@pytest.mark.parametrize("grasp", ["up", 0.0, (0, 1)])
+def test_render_refuses_other_grasps(grasp):
+    with pytest.raises(ValueError, match="grasp must"):
+        tt.render(tt.base_state(), 8, grasp=grasp)
+
+
 def test_episode_frames_show_every_state_and_grasp_and_padding_moves_nothing():
     state = tt.base_state()
     frames = rendering.episode_frames(state, np.array([[0, 0], [0, 3]]), 8)

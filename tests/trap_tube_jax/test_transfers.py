@@ -281,3 +281,4 @@ def test_compose_applies_from_left_to_right():
     assert tt.compose(increment, double)(key, start).time == 2
     assert tt.compose(increment, double, increment)(key, start).time == 3
     jax.tree.map(np.testing.assert_array_equal, tt.compose()(key, start), start)
+    assert tt.make("base+p").transfers[0].__name__ == "identity + perceptual"

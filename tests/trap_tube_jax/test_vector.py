@@ -1,7 +1,5 @@
 """The fast path against its plain reference, `jax.vmap` of an `AutoReset`."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +8,7 @@ import pytest
 import trap_tube_jax as tt
 from helpers.refusal import assert_refused
 from helpers.trees import assert_same
+from trap_tube_jax import vector
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 from trap_tube_jax.vector import draw_movable, draw_static
 
@@ -34,8 +33,8 @@ def stagger(episodes):
     return episodes.replace(inner=episodes.inner.replace(time=time))
 
 
-def run_fast(env, chunk_size):
-    fast = tt.VectorEnvironment(env, chunk_size=chunk_size)
+def run_fast(env):
+    fast = tt.VectorEnvironment(env)
 
     def reset(keys):
         state, timestep = fast.reset(keys)
@@ -59,15 +58,16 @@ def run_plain(env):
 NEAR = tt.State.from_ascii(["AF.........T", *["." * 12] * 11])
 ENVIRONMENTS = [
     (tt.make("pstsy", max_steps=MAX_STEPS), 3, "threefry2x32"),
-    (tt.Environment((tt.structural,), base=NEAR, max_steps=MAX_STEPS), None, "unsafe_rbg"),
+    (tt.Environment((tt.structural,), base=NEAR, max_steps=MAX_STEPS), 32, "unsafe_rbg"),
     (tt.make("base", num_features=1, max_steps=MAX_STEPS), 1, "threefry2x32"),
 ]
 
 
 @pytest.mark.parametrize(("env", "chunk_size", "impl"), ENVIRONMENTS)
-def test_a_batch_equals_vmap_of_auto_reset_in_every_bit(env, chunk_size, impl):
+def test_a_batch_equals_vmap_of_auto_reset_in_every_bit(env, chunk_size, impl, monkeypatch):
+    monkeypatch.setattr(vector, "MIN_CHUNK", chunk_size)
     with jax.default_prng_impl(impl):
-        fast = run_fast(env, chunk_size)
+        fast = run_fast(env)
         plain = run_plain(env)
     ends = plain[2].done.sum(axis=1)
     assert 0 < ends.min(), "every step must end some episode"
@@ -95,11 +95,11 @@ def test_more_environments_start_over_at_once_on_other_devices_than_a_cpu(
     def recolor(key, state):
         return tt.structural(identity(key), state)
 
-    vector = tt.VectorEnvironment(tt.Environment((recolor,)))
-    state, _ = jax.eval_shape(vector.reset, jax.random.split(jax.random.key(0), 2048))
+    batch = tt.VectorEnvironment(tt.Environment((recolor,)))
+    state, _ = jax.eval_shape(batch.reset, jax.random.split(jax.random.key(0), 2048))
     sizes.clear()
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    jax.eval_shape(vector.step, state, jnp.zeros((2048, 2), jnp.int32))
+    jax.eval_shape(batch.step, state, jnp.zeros((2048, 2), jnp.int32))
     assert sizes == {size}
 
 
@@ -112,35 +112,29 @@ def test_a_picture_drawn_in_two_layers_equals_the_observation(num_features):
     np.testing.assert_array_equal(drawn.reshape(timestep.observation.shape), timestep.observation)
 
 
-def test_a_batch_of_other_environments_or_chunks_is_refused():
-    env = tt.make("base")
-    for size in (0, 2.0, True):
-        words = [f"chunk_size must be an integer >= 1, got {size}"]
-        assert_refused(words, tt.VectorEnvironment, env, chunk_size=size)
-    for other in (tt.AutoReset(env), None):
+def test_a_batch_of_other_environments_is_refused():
+    for other in (tt.AutoReset(tt.make("base")), None):
         assert_refused(["must be a trap_tube_jax.Environment"], tt.VectorEnvironment, other)
     words = ["jax.vmap(AutoReset(env).step) steps a subclass"]
     assert_refused(words, tt.VectorEnvironment, type("Own", (tt.Environment,), {})())
-    size: Any = np.int64(8)
-    assert type(tt.VectorEnvironment(env, chunk_size=size).chunk_size) is int
 
 
 def test_raw_keys_draw_the_same_tasks():
-    vector = tt.VectorEnvironment(tt.make("p"))
+    batch = tt.VectorEnvironment(tt.make("p"))
     keys = jax.random.split(jax.random.key(0), 3)
-    (_, typed), (_, raw) = map(vector.reset, (keys, jax.random.key_data(keys)))
+    (_, typed), (_, raw) = map(batch.reset, (keys, jax.random.key_data(keys)))
     assert_same(typed, raw)
 
 
 def test_a_batch_refuses_a_single_key_and_other_states():
-    vector = tt.VectorEnvironment(tt.make("base"))
+    batch = tt.VectorEnvironment(tt.make("base"))
     keys = jax.random.split(jax.random.key(0), 3)
     raw = np.zeros((3, 2), np.int32)
     for key in (keys[0], jax.random.PRNGKey(0), 0, None, "keys", keys[:0], list(keys), raw):
-        assert_refused(["PRNG keys [B]", "jax.random.split"], vector.reset, key)
-    state, timestep = jax.eval_shape(vector.reset, keys)
+        assert_refused(["PRNG keys [B]", "jax.random.split"], batch.reset, key)
+    state, timestep = jax.eval_shape(batch.reset, keys)
     actions = np.zeros((3, 2), np.int32)
     words = ["VectorState, got AutoResetTimeStep", "return (state, timestep)"]
-    for batch in (vector, NextStepVectorEnvironment(tt.make("base"))):
-        assert_refused(words, batch.step, timestep, actions)
-    assert_refused(["integer[3, 2]", "int32[2, 2]"], vector.step, state, actions[:2])
+    for either in (batch, NextStepVectorEnvironment(tt.make("base"))):
+        assert_refused(words, either.step, timestep, actions)
+    assert_refused(["integer[3, 2]", "int32[2, 2]"], batch.step, state, actions[:2])

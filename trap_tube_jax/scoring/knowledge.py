@@ -71,7 +71,8 @@ def _grasp(state: State, direction: jax.Array) -> jax.Array:
     cell = state.agent + unit_vector(direction)
     is_hidden = bar_covers(state.tool, state.tool_extent, cell)
     misses = (static_object(state.board, cell) > GROUND) & ~is_hidden
-    return jnp.where(state.done, 0, holds_tool(state, direction).astype(jnp.int32) - misses)
+    held = holds_tool(state, direction).astype(jnp.int32)
+    return jnp.where(state.done, 0, held - misses.astype(jnp.int32))
 
 
 def _can_move(task: State, way: jax.Array) -> jax.Array:
@@ -81,6 +82,7 @@ def _can_move(task: State, way: jax.Array) -> jax.Array:
 
 def _leads_to_exit(task: State, way: jax.Array) -> jax.Array:
     """Tests whether the first object other than ground from the food on is an exit."""
-    cells = task.food[None] + jnp.arange(1, BOARD_SIZE)[:, None] * way[None]
+    distance = jnp.arange(1, BOARD_SIZE, dtype=jnp.int32)
+    cells = task.food[None] + distance[:, None] * way[None]
     codes = jax.vmap(static_object, in_axes=(None, 0))(task.board, cells)
     return codes[jnp.argmax(codes != GROUND)] == EXIT

@@ -22,8 +22,9 @@ class PythonAgent:
           ValueError: the agent has no function to call, or one that needs other arguments, or it
             expects observations of another dtype than uint8.
         """
-        act = getattr(agent, "predict", None) or getattr(agent, "act", None)
-        if not callable(act):
+        found = [getattr(agent, name, None) for name in ("predict", "act")]
+        act = next(filter(callable, found), None)
+        if act is None:
             raise ValueError(
                 f"an agent has predict(observation) or act(observation); {type(agent).__name__} "
                 "has neither"

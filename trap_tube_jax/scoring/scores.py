@@ -4,7 +4,7 @@ Source: protocol.md, "Reporting".
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -132,8 +132,10 @@ class Score:
 
 
 @dataclasses.dataclass(frozen=True)
-class Scores:
+class Scores(Mapping[str, Score]):
     """The scores of an agent by the benchmark's protocol; a Markdown table in ASCII if printed.
+
+    A mapping from short names of sets to their scores, which also takes the sets' other names.
 
     Attributes:
       protocol: version of the fixed tasks.
@@ -155,19 +157,22 @@ class Scores:
     sets: tuple[Score, ...]
 
     def __getitem__(self, name: str) -> Score:
-        """Returns the score of a set by any of its names, or raises ValueError."""
-        by_name = {score.set: score for score in self.sets}
+        """Returns the score of a set by any of its names, or raises KeyError."""
         try:
             short = task_set(name).short
         except ValueError:  # the set is not registered here
             short = name
-        if short not in by_name:
-            raise ValueError(f"no score of {name!r}; allowed: {', '.join(by_name)}")
-        return by_name[short]
+        for score in self.sets:
+            if score.set == short:
+                return score
+        raise KeyError(f"no score of {name!r}; allowed: {', '.join(self)}")
 
     def __iter__(self) -> Iterator[str]:
         """Iterates over the short names of the sets."""
         return (score.set for score in self.sets)
+
+    def __len__(self) -> int:
+        return len(self.sets)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values for JSON; `sets` is a sequence of records."""

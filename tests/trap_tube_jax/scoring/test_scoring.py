@@ -64,6 +64,8 @@ class Random:
 class Single:
     """`Rightward` for one observation at a time; says how it was called."""
 
+    predict = "always"  # a value does not hide `act`
+
     def __init__(self, action):
         self.action = action
         self.resets = 0
@@ -250,9 +252,11 @@ def test_scores_are_records(scores):
     assert "layout counts as solved" in lines[-2]
     assert lines[-1] == f"Protocol {PROTOCOL}, trap-tube-jax {tt.__version__}."
     assert list(scores) == ["near", "base"]
-    assert "near" in scores
+    assert dict(scores) == {score.set: score for score in scores.sets}
+    assert "TrapTube-v0" in scores
+    assert "p" not in scores
     assert scores["TrapTube-v0"] is scores["base"]
-    with pytest.raises(ValueError, match="no score of 'p'; allowed: near, base"):
+    with pytest.raises(KeyError, match="no score of 'p'; allowed: near, base"):
         scores["p"]
 
 
