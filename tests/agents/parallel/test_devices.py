@@ -49,9 +49,10 @@ def test_one_device_needs_no_mesh_and_leaves_arrays_as_they_are():
 def test_two_devices_train_as_one():
     """By what `sharded_training` finds on two simulated devices."""
     environment = {k: v for k, v in os.environ.items() if k != "JAX_NUM_CPU_DEVICES"}
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     done = subprocess.run(
         [sys.executable, "-W", "error", ROOT / "tests" / "helpers" / "sharded_training.py"],
-        env={**environment, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
+        env={**environment, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,
         check=False,
