@@ -28,7 +28,8 @@ def one_line(error: Exception) -> str:
 
 def announce(work: str) -> None:
     """Announces on stderr a step that takes seconds or more, with its expected duration."""
-    print(f"{work} ...", file=sys.stderr, flush=True)
+    sys.stderr.write(f"{work} ...\n")  # at once, unlike `print`: a signal may come between
+    sys.stderr.flush()
 
 
 @contextlib.contextmanager
