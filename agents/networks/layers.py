@@ -1,8 +1,8 @@
 """Layers that all networks share, and the sampling of their kernels.
 
-XLA compiles every random draw separately, which takes 8.5 s on one core for the paper's network
-with ICM. So these layers initialise a kernel to `Undrawn`, which holds its standard deviation, and
-`draw` samples all kernels at once, in 1.6 s. `draw` leaves other parameters unchanged.
+XLA compiles every random draw separately, which takes seconds for the paper's network with ICM. So
+these layers initialise a kernel to `Undrawn`, which holds its standard deviation, and `draw`
+samples all kernels at once. `draw` leaves other parameters unchanged.
 
 Source: agents/agent.md, "Network".
 """

@@ -11,9 +11,18 @@ import pytest
 import trap_tube_jax as tt
 from trap_tube_jax import gallery
 from trap_tube_jax.checks import expand
-from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.solver import __main__ as solver_command
+
+
+def test_an_announcement_is_one_write(monkeypatch):
+    """Between two, a signal could print its line in the middle."""
+    written = []
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.stderr, "write", written.append)
+        announce("Solving")
+    assert written == ["Solving ...\n"]
 
 
 @pytest.mark.parametrize(

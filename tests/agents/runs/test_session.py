@@ -269,7 +269,7 @@ def test_a_run_with_missing_files_is_refused_unchanged(copy, name, damage, messa
 
 @pytest.mark.parametrize("changed", [{"sets": ("st",)}, {"evaluate_every": 0}, {"test_tasks": 9}])
 @pytest.mark.parametrize("more", [0, 1])
-def test_a_run_keeps_how_it_is_evaluated(copy, changed, more):
+def test_a_resumed_run_keeps_its_evaluation(copy, changed, more):
     before = contents(copy)
     with pytest.raises(ValueError, match="sets, test_tasks may not change in a run; to play other"):
         train_run(

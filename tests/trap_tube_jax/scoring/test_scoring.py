@@ -64,7 +64,7 @@ class Random:
 class Single:
     """`Rightward` for one observation at a time; says how it was called."""
 
-    predict = "always"  # a value does not hide `act`
+    predict = "always"  # no function, so `act` is called
 
     def __init__(self, action):
         self.action = action
