@@ -36,7 +36,7 @@ def main(
     jax.config.update("jax_platforms", "cpu")  # leaves other devices to the runs
     with plain_errors():
         options, run_options = parse_all([grid.options, grid.run_options], arguments, program)
-        runs = grid.make_runs(name, options)
+        runs = grid.make_runs(name, options, run_options)
         root = next(iter(runs)).parent
         with exit_when_stopped(lambda: "The same command continues."):
             workers = make_executor(options.processes, options.cluster)

@@ -78,8 +78,17 @@ class Grid:
     points: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=lambda: {"": {}})
     about: str = ""
 
-    def make_runs(self, name: str, options: Options) -> dict[Path, Run]:
-        """Returns the runs by their folders, seed after seed; the grid's begins with `name`."""
+    def make_runs(self, name: str, options: Options, run_options: RunOptions) -> dict[Path, Run]:
+        """Returns the runs by their folders, seed after seed.
+
+        Args:
+          name: beginning of the name of the grid's folder.
+          options: of the grid.
+          run_options: of every run.
+
+        Raises:
+          ValueError: an option is not allowed, or a stored run cannot be continued with it.
+        """
         check_integer("seeds", options.seeds, maximum=MAX_RUNS)
         for limit in ("processes", "seeds_per_program"):
             if getattr(options, limit) is not None:
@@ -106,7 +115,9 @@ class Grid:
                 path = root / f"{point}-seed{seed}"
                 check_name(path.name)
                 if RunFolder(path).config.is_file():
-                    run.check_continues(RunFolder(path).read()[0])
+                    stored, stored_options = RunFolder(path).read()
+                    run.check_continues(stored)
+                    run_options.check_continues(stored_options)
                 else:
                     RunFolder(path).check_free()
                 runs[path] = run

@@ -169,7 +169,7 @@ def test_seeds_share_a_program_where_that_pays(
     monkeypatch.setattr(launcher, "backend_of", lambda executor: backend)
     points = {"a": {"curiosity": "none"}, "b": {"curiosity": "effects"}}
     given = Options(preset=preset, seeds=3, out=tmp_path)
-    runs = Grid(points=points).make_runs("x", given)
+    runs = Grid(points=points).make_runs("x", given, RunOptions())
     found = launcher.group_runs(runs, RunOptions(devices=devices), Lost(), size)
     for name in points:
         of_point = [[run.seed for run in g.values() if run.algorithm == name] for g in found]

@@ -49,7 +49,7 @@ def test_runs_are_ordered_by_seed_and_carry_their_point(tmp_path, fresh_task_set
     given = Options(("curiosity=none,icm",), ("agents.examples.near_food",), seeds=2, seed=3)
     given = dataclasses.replace(given, env="near-food", out=tmp_path)
     import_modules(given.imports)
-    runs = Grid().make_runs("sweep", given)
+    runs = Grid().make_runs("sweep", given, RunOptions())
     assert [str(path.relative_to(tmp_path)) for path in runs] == [
         f"sweep-fast-near-food/curiosity={name}-seed{seed}"
         for seed in (3, 4)
@@ -64,7 +64,7 @@ def test_a_grid_of_sets_has_one_folder_in_any_order_and_for_any_choice(tmp_path)
     paths = set()
     for value, only in (("base,p", ()), ("p,base", ()), ("base,p,st", ("env_id=p",))):
         given = Options((f"env_id={value}",), only=only, out=tmp_path)
-        paths |= set(Grid().make_runs("sweep", given))
+        paths |= set(Grid().make_runs("sweep", given, RunOptions()))
     folder = tmp_path / "sweep-fast-sets"
     assert paths == {folder / f"env_id={name}-seed0" for name in ("base", "p")}
 
@@ -86,24 +86,34 @@ def test_a_named_grid_keeps_its_settings_unless_given():
     grid = GRIDS["curiosities"]
     for settings, iterations in ((("filters=[32,64]",), 312), (("iterations=20",), 20)):
         given = dataclasses.replace(grid.options, settings=settings, only=("ppo+effects",))
-        run = next(iter(grid.make_runs("curiosities", given).values()))
+        run = next(iter(grid.make_runs("curiosities", given, grid.run_options).values()))
         assert (run.algorithm, run.config.curiosity) == ("ppo+effects", "effects")
         assert run.config.iterations == iterations
-    assert next(iter(grid.make_runs("curiosities", grid.options))).parent.name == "curiosities"
+    assert (
+        next(iter(grid.make_runs("curiosities", grid.options, grid.run_options))).parent.name
+        == "curiosities"
+    )
     other = dataclasses.replace(grid.options, preset="fast")
-    assert next(iter(grid.make_runs("curiosities", other))).parent.name == "curiosities-fast-pstsy"
+    assert (
+        next(iter(grid.make_runs("curiosities", other, grid.run_options))).parent.name
+        == "curiosities-fast-pstsy"
+    )
 
 
-def test_a_stored_run_with_other_settings_is_refused(tmp_path):
+def test_a_stored_run_with_other_settings_or_evaluations_is_refused(tmp_path):
     given = Options(settings=("clip_eps=0.3",), out=tmp_path)
-    ((path, run),) = Grid().make_runs("sweep", given).items()
+    ((path, run),) = Grid().make_runs("sweep", given, RunOptions()).items()
     other = Run(dataclasses.replace(run.config, clip_eps=0.2), algorithm="fast")
     path.mkdir(parents=True)
     RunFolder(path).write_config(other)
-    assert_refused(["clip_eps=0.2, not 0.3", "another --name"], Grid().make_runs, "sweep", given)
+    assert_refused(
+        ["clip_eps=0.2, not 0.3", "another --name"], Grid().make_runs, "sweep", given, RunOptions()
+    )
     RunFolder(path).write_config(run)
     longer = dataclasses.replace(given, settings=("clip_eps=0.3", "iterations=200"))
-    assert Grid().make_runs("sweep", longer)[path].config.iterations == 200
+    assert Grid().make_runs("sweep", longer, RunOptions())[path].config.iterations == 200
+    words = ["test_tasks=None, not 7", "python -m agents.evaluate"]
+    assert_refused(words, Grid().make_runs, "sweep", given, RunOptions(test_tasks=7))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +123,9 @@ def test_a_grid_does_not_mix_with_other_results(name, kind, tmp_path):
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / name).touch()
     given = Options(name="x", out=tmp_path)
-    assert_refused([f"x holds {kind}; give another --name"], Grid().make_runs, "sweep", given)
+    assert_refused(
+        [f"x holds {kind}; give another --name"], Grid().make_runs, "sweep", given, RunOptions()
+    )
 
 
 def test_the_arms_of_the_published_code_hold_the_papers_two():
