@@ -235,7 +235,7 @@ def agents_that_know_colors() -> list[str]:
     right, solved = {}, {}
     for policy in rows_of("colors", "first_pushes")["policy"].unique():
         pushes = first_pushes("colors/first_pushes.csv", policy)
-        if policy in ("seed 202", "colors-p+psy+pstsy"):  # chosen on the first tasks
+        if policy in ("seed 202", "colors-p+psy+pstsy"):  # the first tasks chose them
             pushes -= first_pushes("colors/development.csv", policy)
         right[policy] = 100 * pushes.iloc[0] / pushes.sum()
         solved[policy] = percent_of("colors/confirmation.csv", policy)
@@ -309,18 +309,21 @@ def memory() -> list[str]:
     for text, pair in policies.items():
         found = np.concatenate([percent.loc[names, levels].mean() for names in pair])
         rows.append(f"| {text} | {cells(found)} |")
+    solved = percent_solved("ingredients")["sy"].eq(100).groupby("algorithm").sum()
+    assert solved[["no-memory", "best"]].tolist() == [8, 6]
+    rows.append("Without memory all eight solve {Sy}, with it six.")
     return [*rows, *(cost_of("no-memory", name) for name in ("p", "psy"))]
 
 
 def cost_of(arm: str, task_set: str) -> str:
-    """Returns success without an ingredient and with it, and the loss, corrected by Holm."""
+    """Returns success without an ingredient and with it, and the difference with its interval."""
     tested = tables.reported(rows_of("ingredients", "results"))
     mean = tables.by_set(tested)[task_set].groupby("algorithm").mean()
     found = tables.differences(tested).set_index(["algorithm", "task_set"])
-    ends = -found.loc[(arm, task_set), ["difference", "high", "low"]]
-    loss, low, high = map(one_decimal, ends)
+    ends = found.loc[(arm, task_set), ["difference", "low", "high"]]
+    difference, low, high = map(one_decimal, ends)
     success = f"{mean[arm]:.1f} instead of {mean['best']:.1f} % of {label(task_set)}"
-    return f"{success} (loss {loss} [{low}, {high}])"
+    return f"{success} (difference {difference} [{low}, {high}]"
 
 
 def steps_of_replay() -> str:
@@ -333,8 +336,9 @@ def steps_of_replay() -> str:
     known = known[known["transitions"] <= steps["no-replay"]]
     known = known.sort_values("transitions").groupby("seed").last()
     success = 100 * (known["solved"] / known["tasks"]).mean()
-    few, many = (f"{steps[arm] / 1e6:.1f}" for arm in ("no-replay", "best"))
-    return f"{few} instead of {many} million steps; after {few}, `best` solves {success:.1f} %"
+    counts = (steps["no-replay"], steps["best"], known["transitions"].mean())
+    few, many, reached = (f"{count / 1e6:.1f}" for count in counts)
+    return f"{few} instead of {many} million steps; after {reached}, `best` solves {success:.1f} %"
 
 
 def predicted_motion() -> list[str]:

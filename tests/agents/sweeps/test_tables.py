@@ -22,7 +22,6 @@ RESULTS = ROOT / "benchmarks" / "results"
 RECORDS = (
     "exp2_best",
     "exp2_curiosities",
-    "exp2_long",
     "exp2_paper",
     "exp2_paper_encoder",
     "fast_base",

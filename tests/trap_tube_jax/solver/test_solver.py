@@ -12,6 +12,7 @@ from helpers.refusal import assert_refused
 from trap_tube_jax.dynamics import replay
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
+from trap_tube_jax.scoring.knowledge import first_push
 from trap_tube_jax.solver import pictures
 from trap_tube_jax.solver.search import levels, validate_on_host
 from trap_tube_jax.state import take
@@ -130,6 +131,13 @@ def test_tasks_of_a_set_are_as_long_as_published_and_pay_at_the_plans_end(
     assert abs(plans.length.mean() - mean) < 4 * standard_deviation / np.sqrt(NUM_DRAWN)
     assert plans.length.max() <= MAX_STEPS
     assert_paid_exactly_at_the_end(states, plans)
+
+
+@pytest.mark.slow
+def test_as_few_plans_of_psy_move_the_food_as_the_readme_says():
+    tasks = tt.evaluation_tasks("psy", 1000)
+    pushes = jax.vmap(first_push)(tasks, tt.solve_batch(tasks).actions)
+    assert np.asarray(pushes).any(axis=-1).sum() == 202
 
 
 @pytest.mark.slow
