@@ -6,7 +6,7 @@ import inspect
 import itertools
 import re
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -143,7 +143,9 @@ def _flag(name: str) -> str:
 def _values(kind: Any) -> dict[str, Any]:
     """Returns the `add_argument` options for values of an annotated type."""
     if get_origin(kind) in (Union, types.UnionType):
-        return _values(next(part for part in get_args(kind) if part is not types.NoneType))
+        inner = next(part for part in get_args(kind) if part is not types.NoneType)
+        options = _values(inner)
+        return {**options, "type": _or_none(inner)} if inner in (int, float) else options
     if get_origin(kind) is Literal:
         return {"choices": get_args(kind)}
     if get_origin(kind) is tuple:
@@ -154,6 +156,16 @@ def _values(kind: Any) -> dict[str, Any]:
     if kind is Path:
         return {"type": path_argument, "metavar": "PATH"}
     return {"type": kind, "metavar": {int: "N", float: "X", str: "NAME"}[kind]}
+
+
+def _or_none(kind: type) -> Callable[[str], Any]:
+    """Returns a reader of numbers that takes "None", too: settings of a stored run may be reset."""
+
+    def read(text: str) -> Any:
+        return None if text == "None" else kind(text)
+
+    read.__name__ = kind.__name__  # for messages
+    return read
 
 
 def _documents(cls: type) -> dict[str, str]:

@@ -25,6 +25,7 @@ from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import announce, plain_errors
 from trap_tube_jax.interruptions import run_command
 
+TABLE = "profile.csv"
 FIGURES = ("success.png", "controls.png")
 
 
@@ -74,11 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = profile(policies, options.parts, options.strengths, options.tasks, announce)
     _print_tables(found)
     output.mkdir(parents=True, exist_ok=True)
+    write_json(output / PROVENANCE_FILE, origin)  # first: it marks the folder as a profile's
     for figure in FIGURES:  # of an earlier profile
         (output / figure).unlink(missing_ok=True)
     table = found.to_csv(index=False, float_format="%.6g")
-    write_bytes(output / "profile.csv", table.encode())
-    write_json(output / PROVENANCE_FILE, origin)
+    write_bytes(output / TABLE, table.encode())
     if set(options.parts) & set(plots.PANELS):
         plots.save_success(found, output / "success.png")
     if "control" in options.parts:
@@ -91,7 +92,12 @@ def _check_free(folder: Path, iterations: dict[str, int]) -> None:
     check_folder(folder)
     check_kind(folder, "a profile", "--output")
     origin = folder / PROVENANCE_FILE
-    found = read_json(origin) if is_file(origin) else {"iterations": iterations}
+    if not is_file(origin):
+        for path in (folder / name for name in (TABLE, *FIGURES)):
+            if path.exists():
+                raise ValueError(f"{path} is not a profile's; give another --output")
+        return
+    found = read_json(origin)
     if not isinstance(found, dict) or found.get("iterations") != iterations:
         raise ValueError(f"{folder} holds the profile of other policies; give another --output")
 

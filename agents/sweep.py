@@ -41,11 +41,12 @@ def main(
         with exit_when_stopped(lambda: "The same command continues."):
             workers = make_executor(options.processes, options.cluster)
             with workers as executor, lock_folder(root):
-                records.check(root, runs)
+                records.check(root, runs, run_options)
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 failed = launch(runs, run_options, executor, console, options.seeds_per_program)
                 if any(len(read_rows(RunFolder(path).metrics)) for path in runs):
-                    records.collect(root, f"{program} {shlex.join(arguments)}".strip(), runs)
+                    command = f"{program} {shlex.join(arguments)}".strip()
+                    records.collect(root, command, runs, list(grid.configs(options)))
                     console.out(records.write_tables(root))
                     files = [root / "results.csv", root / "table.md", *records.draw(root)]
                     console.out("", *files, sep="\n")

@@ -145,11 +145,18 @@ def summary(folder: RunFolder, run: Run) -> list[str]:
     config = run.config
     train_set = tt.task_set(config.env_id).label
     threshold = config.stop_when_solved or 1.0
-    solving = read_rows(folder.metrics).query("validation_success >= @threshold")["episodes"]
+    rows = read_rows(folder.metrics)
+    solving = rows.query("validation_success >= @threshold")["episodes"]
     if len(solving):
         share = "" if threshold == 1 else f"{100 * threshold:g} % of "
         more = "; --stop-when-solved 0 trains on" if config.stop_when_solved else ""
         lines.append(f"First solved {share}{train_set} after {solving.min():,} episodes{more}.")
+    done = max(rows["iteration"], default=0)
+    limit = config.max_transitions
+    if limit is not None and done < config.iterations and rows["transitions"].max() >= limit:
+        lines.append(
+            f"Stopped by --max-transitions {limit} after {done} of {config.iterations} iterations."
+        )
     if folder.page.exists():
         lines.append(f"Report with curves and episodes to step through: {folder.page}")
     if config.stop_when_solved and len(solving):

@@ -1,6 +1,7 @@
 """The program shared by runs that differ only in their seed: learner, devices, evaluators."""
 
 import functools
+import zlib
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -23,6 +24,7 @@ Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
 Metrics = dict[str, np.ndarray]
 Tree = TypeVar("Tree")
 
+FINE_TUNING = zlib.crc32(b"fine-tuning")  # unlike a small number, no key of a split
 # The settings that decide the shapes of a policy network.
 NETWORK = (
     "num_features",
@@ -89,7 +91,7 @@ class Program:
         if start is None:
             return self._init(key)
         # Even with the same seed, fine-tuning draws other tasks than the first training.
-        state = self._init(jax.random.fold_in(key, 1))
+        state = self._init(jax.random.fold_in(key, FINE_TUNING))
         try:
             params = from_arrays(
                 to_arrays(start.params), {part: state.params[part] for part in PARTS}

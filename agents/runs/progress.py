@@ -131,7 +131,7 @@ class Progress:
 
         Args:
           metrics: by `program.make_advance`.
-          seconds: wall time of the iteration, of all seeds of the program.
+          seconds: the run's share of the wall time of the iteration.
 
         Raises:
           ValueError: a loss or a gradient is not finite.
@@ -186,10 +186,7 @@ class Progress:
         return scores
 
     def _row(self, metrics: Metrics, seconds: float) -> Row:
-        """Returns a row of metrics.
-
-        `transitions_per_second` counts the run's steps, over the time of all seeds together.
-        """
+        """Returns a row of metrics; `seconds` is the run's share of the time of the iteration."""
         iteration = self.iteration + 1
         config = self.run.config
         # Computed before the first gradient step, with parameters that were finite.

@@ -49,19 +49,18 @@ def provenance() -> dict[str, Any]:
 
 
 def note_provenance(path: pathlib.Path, devices: str) -> None:
-    """Adds this machine, its versions and the commit to a JSON file of earlier entries.
+    """Puts this machine, its versions and the commit at the end of a JSON file of such entries.
 
     Raises:
       ValueError: the file is damaged; it stays as it is.
     """
-    known = read_provenance(path)
     here = {**provenance(), "devices": devices}
-    if here not in known:
-        write_json(path, [*known, here])
+    others = [machine for machine in read_provenance(path) if machine != here]
+    write_json(path, [*others, here])
 
 
 def read_provenance(path: pathlib.Path) -> list[Machine]:
-    """Reads the machines that a run was trained on, in order; none if the file is missing.
+    """Reads the machines that a run was trained on, the last one last; none if the file is missing.
 
     Raises:
       ValueError: the file is damaged; the message names it.

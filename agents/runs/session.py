@@ -157,12 +157,13 @@ def train(
             asked = signal.SIGTERM if stop is not None and stop() else request()
             # A signal may reach any process: all have to agree on it.
             number = processes.max_over_processes(asked)
+            count = sum(not p.is_trained for path, p in training.items() if path not in outcomes)
             for index, (path, progress) in enumerate(training.items()):
                 if path in outcomes:
                     continue
                 with capturing_outcome(outcomes, path):
                     if not progress.is_trained:
-                        progress.record(cohort.member(metrics, index), seconds)
+                        progress.record(cohort.member(metrics, index), seconds / count)
                     if number:
                         progress.save()
                         raise Stopped(number)

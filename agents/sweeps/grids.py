@@ -68,7 +68,7 @@ class Grid:
       options: defaults of its command line.
       run_options: defaults of the options of every run.
       settings: settings of all points, which the command line may replace.
-      points: settings by the name of the point.
+      points: settings by the name of the point. Tables compare the others with the first one.
       about: a line of help.
     """
 
@@ -93,6 +93,8 @@ class Grid:
         for limit in ("processes", "seeds_per_program"):
             if getattr(options, limit) is not None:
                 check_integer(limit, getattr(options, limit))
+        if (options.seeds_per_program or 1) > 1 and (run_options.devices or 1) > 1:
+            raise ValueError("several seeds_per_program use one device; leave out --devices")
         points = self.configs(options)
         names = {tt.task_set(config.env_id).short for config in points.values()}
         short = names.pop() if len(names) == 1 else "sets"
@@ -178,7 +180,7 @@ CODE_POINTS = {
 }
 PAPER_RUN = RunOptions(evaluate_every=1, test_tasks=1000)
 BEST_RUN = RunOptions(evaluate_every=20, test_tasks=1000)
-CURIOSITIES = ("icm", "rnd", "noveld", "effects")
+CURIOSITIES = ("effects", "rnd", "noveld", "icm")
 # Preset `best`, and without one ingredient at a time.
 INGREDIENT_POINTS: dict[str, dict[str, Any]] = {
     "best": {},
@@ -238,8 +240,8 @@ GRIDS = {
         BEST_RUN,
         {"iterations": 312},
         {
-            "ppo": {"curiosity": "none"},
             **{f"ppo+{name}": {"curiosity": name} for name in CURIOSITIES},
+            "ppo": {"curiosity": "none"},
         },
         "preset best with every intrinsic reward; 7 hours on one core",
     ),

@@ -12,13 +12,13 @@ from typing import NotRequired, TypedDict
 
 import agents
 import trap_tube_jax as tt
-from agents.files import is_file, read_json, write_bytes, write_json
+from agents.files import is_file, naming_file, read_json, write_bytes, write_json
 from agents.runs.folder import CONFIG_FILE, GRID_FILE, RunFolder, Settings, check_name
 from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.provenance import Machine, read_provenance
 from agents.runs.results import find_runs, metrics
-from agents.runs.run import Run
+from agents.runs.run import EVALUATION, Run, RunOptions
 from agents.sweeps import figures, tables
 
 COUNTS = ["iteration", "episodes", "transitions", "seconds"]
@@ -50,19 +50,29 @@ class About(TypedDict):
     note: NotRequired[str]
 
 
-def check(root: Path, launched: Mapping[Path, Run]) -> None:
-    """Checks that `collect` can make the files of a grid again.
+def check(root: Path, launched: Mapping[Path, Run], options: RunOptions) -> None:
+    """Checks that `collect` can make the files of a grid again, and average over seeds.
 
     Args:
       root: folder of the grid.
       launched: the runs to train by folder, also those whose folders are gone.
+      options: of the runs to train.
 
     Raises:
-      ValueError: a file is damaged, or has rows of another run whose folder is gone.
+      ValueError: a file is damaged, or has rows of another run whose folder is gone; a name in a
+        run's settings is unknown; or a stored run differs from a seed of its point to train.
     """
     _read_about(root)
-    stored = [RunFolder(path.parent).stored() for path in root.rglob(CONFIG_FILE)]
-    here = {(run["algorithm"], run["seed"]) for run in stored}
+    points = {run.algorithm: run for run in launched.values()}
+    here = set()
+    for path in sorted(root.rglob(CONFIG_FILE)):
+        folder = RunFolder(path.parent)
+        stored = folder.stored()
+        with naming_file(folder.config):
+            tt.task_set(stored["config"]["env_id"])
+        here.add((stored["algorithm"], stored["seed"]))
+        if stored["algorithm"] in points and folder.path not in launched:
+            _check_seed(folder, points[stored["algorithm"]], options)
     here |= {(run.algorithm, run.seed) for run in launched.values()}
     for path in (root / "results.csv", root / "curves.csv"):
         rows = read_rows(path)
@@ -75,7 +85,23 @@ def check(root: Path, launched: Mapping[Path, Run]) -> None:
             )
 
 
-def collect(root: Path, command: str, launched: Mapping[Path, Run]) -> None:
+def _check_seed(folder: RunFolder, run: Run, options: RunOptions) -> None:
+    """Raises ValueError unless a stored run differs from one to train only in its seed."""
+    stored, stored_options = folder.read(run.imports)
+    pairs = ((stored.config, stored_options), (run.config, options))
+    old, new = (
+        {**config.to_dict(), **{name: getattr(x, name) for name in EVALUATION}}
+        for config, x in pairs
+    )
+    for name, value in old.items():
+        if new[name] != value:
+            raise ValueError(
+                f"{folder.path} has {name}={value}, not {new[name]}; seeds of a point differ in "
+                "nothing else; train all of them with it, or train under another --name"
+            )
+
+
+def collect(root: Path, command: str, launched: Mapping[Path, Run], points: Sequence[str]) -> None:
     """Writes results.csv, curves.csv and grid.json from the runs in a folder.
 
     Keeps the commands and the note already in grid.json.
@@ -84,6 +110,7 @@ def collect(root: Path, command: str, launched: Mapping[Path, Run]) -> None:
       root: folder of the grid.
       command: command that has trained the runs.
       launched: its runs by folder, also those that left no settings there.
+      points: names of the grid's points, in the order of tables.
 
     Raises:
       ValueError: a file is damaged, or a folder has a name that no table can hold.
@@ -98,10 +125,18 @@ def collect(root: Path, command: str, launched: Mapping[Path, Run]) -> None:
     about["unfinished"] += [[run.algorithm, run.seed] for run in missing]
     if before and "note" in before:
         about["note"] = before["note"]
-    results = agents.results(root)
+    results = _ordered(agents.results(root), points)
     write_rows(root / "results.csv", results.assign(run=results["run"].map(lambda x: Path(x).name)))
-    write_rows(root / "curves.csv", metrics(root)[CURVES])
+    write_rows(root / "curves.csv", _ordered(metrics(root), points)[CURVES])
     write_json(root / GRID_FILE, about)
+
+
+def _ordered(rows: Table, points: Sequence[str]) -> Table:
+    """Returns rows in the order of the points; other algorithms follow."""
+    order = {name: index for index, name in enumerate(points)}
+    return rows.sort_values(
+        "algorithm", key=lambda names: names.map(order).fillna(len(order)), kind="stable"
+    )
 
 
 def _read_about(root: Path) -> About | None:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from agents.command_line import option, parse
+from agents.command_line import option, parse, parse_all
+from agents.config import Config
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +52,16 @@ def test_help_shows_the_first_sentence_about_an_option(capsys):
     shown = " ".join(capsys.readouterr().out.split())
     assert "some files, by default those of `here`" in shown
     assert "missing" not in shown
+
+
+def test_a_number_that_may_be_missing_can_be_reset(capsys):
+    """As fine-tuning begins with the limits of a stored run."""
+    preset = Config.preset("best")
+    found = parse_all([preset], ["--max-transitions", "None", "--max-steps", "7"], "x")[0]
+    assert (found.max_transitions, found.max_steps) == (None, 7)
+    with pytest.raises(SystemExit):
+        parse_all([preset], ["--max-steps", "none"], "x")
+    assert "argument --max-steps: invalid int value: 'none'" in capsys.readouterr().err
 
 
 def test_a_leading_tilde_in_a_path_is_the_home_folder(monkeypatch):

@@ -69,6 +69,14 @@ def test_a_profile_of_other_policies_is_not_replaced(origin, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["provenance.json"]
 
 
+@pytest.mark.parametrize("name", ["profile.csv", "success.png"])
+def test_files_of_others_are_not_replaced(name, tmp_path, capsys):
+    (tmp_path / name).write_text("mine")
+    message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
+    assert f"{name} is not a profile's; give another --output" in message
+    assert (tmp_path / name).read_text() == "mine"
+
+
 @pytest.mark.parametrize(("name", "kind"), [("config.json", "a run"), ("grid.json", "a grid")])
 def test_a_profile_does_not_mix_with_other_results(name, kind, tmp_path, capsys):
     (tmp_path / name).touch()

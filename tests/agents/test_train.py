@@ -363,6 +363,14 @@ def test_a_run_ends_with_facts_and_what_to_do_next(settings, episodes, expected,
     assert (solved in lines) == bool(episodes)
 
 
+def test_a_limit_that_ended_a_run_is_named(tmp_path):
+    run = Run(small_config(max_transitions=40))
+    folder = RunFolder(tmp_path)
+    append_rows(folder.metrics, [metrics_row(1), metrics_row(2, transitions=48)])
+    stopped = "Stopped by --max-transitions 40 after 2 of"
+    assert summary(folder, run)[0].startswith(stopped)
+
+
 def test_the_share_of_solved_tasks_that_ends_a_run_is_named(tmp_path):
     run = Run(small_config(stop_when_solved=0.995))
     folder = RunFolder(tmp_path)

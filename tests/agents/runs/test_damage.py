@@ -50,7 +50,10 @@ GRID = {
 ABOUT = {"config": CONFIG.to_dict(), "iteration": 4}
 PARAMS = to_arrays(random_params())
 
-GRID_READERS = [lambda run: records.read(run.path), lambda run: records.check(run.path, {})]
+GRID_READERS = [
+    lambda run: records.read(run.path),
+    lambda run: records.check(run.path, {}, RunOptions()),
+]
 # What reads a file of a run or a grid, by the file's name.
 READERS: dict[str, list[Any]] = {
     "config.json": [RunFolder.read, RunFolder.devices, lambda run: results(run.path)],

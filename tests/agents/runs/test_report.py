@@ -15,11 +15,11 @@ from PIL import Image
 from rich.console import Console
 
 import trap_tube_jax as tt
-from agents.runs import display, report
+from agents.runs import display, provenance, report
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows
-from agents.runs.provenance import commit, note_provenance
+from agents.runs.provenance import commit, note_provenance, read_provenance
 from agents.runs.run import Run
 from helpers.small_runs import metrics_row, small_config
 from helpers.tiny_policy import food_next_to_agent, random_params
@@ -182,3 +182,11 @@ def test_a_narrow_terminal_shows_total_time_left_and_success():
         numbers = {"success": 1.0, "validation_success": 1.0, "episodes": 1_177_600}
         progress.show(metrics_row(1149, **numbers))
     assert re.search(r"1149/1150 .* left, 100.0% solved, 100.0% greedily, ", shown.get())
+
+
+def test_the_newest_commit_of_a_run_is_noted_last(tmp_path, monkeypatch):
+    path = tmp_path / "provenance.json"
+    for name in ("aaaa", "bbbb", "aaaa"):
+        monkeypatch.setattr(provenance, "commit", lambda name=name: name)
+        note_provenance(path, "cpu")
+    assert [machine["commit"] for machine in read_provenance(path)] == ["bbbb", "aaaa"]

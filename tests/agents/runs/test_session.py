@@ -23,7 +23,7 @@ from agents.runs.metrics import append_rows, read_rows
 from agents.runs.progress import Progress
 from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
-from agents.runs.session import train_run
+from agents.runs.session import train_run, train_runs
 from helpers.small_runs import final_state, small_config, untimed
 from helpers.training import (
     ITERATIONS,
@@ -385,7 +385,7 @@ def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch
 
 
 def test_speed_is_steps_over_the_seconds_of_an_iteration(tmp_path, monkeypatch):
-    """By a clock on which every iteration takes two seconds."""
+    """By a clock on which every iteration takes two seconds; seeds of a program share them."""
     clock = itertools.count(0, 2)
     monkeypatch.setattr(session, "time", SimpleNamespace(perf_counter=clock.__next__))
 
@@ -397,6 +397,9 @@ def test_speed_is_steps_over_the_seconds_of_an_iteration(tmp_path, monkeypatch):
     rows = read_rows(tmp_path / "x" / "metrics.csv")
     assert rows["transitions_per_second"].tolist() == [15, 15]
     assert rows["seconds"].tolist() == [2, 4]
+    train_runs({tmp_path / str(seed): small_run(seed=seed, iterations=2) for seed in (0, 1)}, PLAIN)
+    for seed in (0, 1):
+        assert read_rows(tmp_path / str(seed) / "metrics.csv")["seconds"].tolist() == [1, 2]
 
 
 def test_all_solved_is_a_share_of_one_for_any_number_of_tasks(tmp_path, monkeypatch):

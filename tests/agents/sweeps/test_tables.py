@@ -1,5 +1,6 @@
 """Tables and figures are functions of tidy rows, and say what the published records say."""
 
+import dataclasses
 import shutil
 
 import numpy as np
@@ -12,7 +13,7 @@ from agents.files import read_json, write_json
 from agents.runs.folder import RunFolder
 from agents.runs.metrics import append_rows, read_rows
 from agents.runs.provenance import note_provenance
-from agents.runs.run import Run
+from agents.runs.run import Run, RunOptions
 from agents.sweeps import figures, records, tables
 from helpers.paths import ROOT
 from helpers.refusal import assert_refused
@@ -321,7 +322,7 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
         append_rows(folder.evaluations, tested.to_dict("records"))
     launched = {tmp_path / "seed2": Run(small_config(), 2)}  # which left no settings
     for command in ("first", "second", "first"):
-        records.collect(tmp_path, command, launched)
+        records.collect(tmp_path, command, launched, [])
     shown = records.write_tables(tmp_path)
     assert "2 of 3, 2 unfinished" in shown
     note = "Unfinished, so the table may change: ppo+effects seed 1, ppo+effects seed 2."
@@ -336,11 +337,12 @@ def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
         folder.write_config(Run(small_config(env_id=name, stop_when_solved=threshold)))
         metrics = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, metrics.to_dict("records"))
-    records.collect(tmp_path, "sweep", {})
+    records.collect(tmp_path, "sweep", {}, [])
     about = read_json(tmp_path / "grid.json")
     assert about["title"].endswith(": trained on base or {Sy}")
     assert about["train_set"] == "training set"
     assert about["threshold"] == 0.9, "what one run solves is solved by the standard of all"
+    assert "Training; solved: 90 % of the tasks" in records.write_tables(tmp_path)
 
 
 def test_what_others_have_written_is_plain_text(tmp_path):
@@ -351,13 +353,13 @@ def test_what_others_have_written_is_plain_text(tmp_path):
     note_provenance(folder.provenance, "cpu")
     (machine,) = read_json(folder.provenance)
     write_json(folder.provenance, [{**machine, "processor": "<b>[x](y)`"}])
-    records.collect(tmp_path, "sweep `<script>`", {})
+    records.collect(tmp_path, "sweep `<script>`", {}, [])
     records.write_tables(tmp_path)
     text = (tmp_path / "table.md").read_text()
     assert "\n    sweep `<script>`\n" in text, "a block of code"
     assert r"\<b\>\[x\](y)\`" in text
     folder.path.rename(tmp_path / "=1+1")
-    assert_refused(["got '=1+1'"], records.collect, tmp_path, "sweep", {})
+    assert_refused(["got '=1+1'"], records.collect, tmp_path, "sweep", {}, [])
 
 
 def test_what_cannot_be_made_again_is_kept(tmp_path):
@@ -367,19 +369,63 @@ def test_what_cannot_be_made_again_is_kept(tmp_path):
         folder.write_config(Run(small_config(), seed))
         done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
         append_rows(folder.metrics, done.to_dict("records"))
-    records.check(tmp_path, {})
-    records.collect(tmp_path, "first", {})
+    records.check(tmp_path, {}, RunOptions())
+    records.collect(tmp_path, "first", {}, [])
     about = read_json(tmp_path / "grid.json")
     write_json(tmp_path / "grid.json", {**about, "note": "mine"})
-    records.collect(tmp_path, "second", {})
+    records.collect(tmp_path, "second", {}, [])
     assert read_json(tmp_path / "grid.json")["note"] == "mine"
     records.write_tables(tmp_path)
     assert "\n\nmine\n\n" in (tmp_path / "table.md").read_text()
-    records.check(tmp_path, {})
+    records.check(tmp_path, {}, RunOptions())
     shutil.rmtree(tmp_path / "seed1")
     words = ["curves.csv has rows of runs whose folders are gone: ppo+effects seed 1;"]
-    assert_refused(words, records.check, tmp_path, {})
-    records.check(tmp_path, {tmp_path / "seed1": Run(small_config(), 1)})  # trains it again
+    assert_refused(words, records.check, tmp_path, {}, RunOptions())
+    again = {tmp_path / "seed1": Run(small_config(), 1)}
+    records.check(tmp_path, again, RunOptions())
+
+
+@pytest.mark.parametrize(
+    ("settings", "options", "words"),
+    [
+        ({"learning_rate": 0.5}, {}, "seed0 has learning_rate=0.001, not 0.5; seeds of a point"),
+        ({"iterations": 9}, {}, "seed0 has iterations=2, not 9; seeds of a point"),
+        ({}, {"sets": ("p",)}, "seed0 has sets=None, not ('p',); seeds of a point"),
+    ],
+)
+def test_seeds_of_other_settings_or_evaluations_are_not_averaged(
+    settings, options, words, tmp_path
+):
+    config = small_config(iterations=2, learning_rate=0.001)
+    RunFolder(tmp_path / "seed0").write_config(Run(config))
+    RunFolder(tmp_path / "other").write_config(Run(config, algorithm="other"))
+    other = Run(dataclasses.replace(config, **settings), 1)
+    later = {tmp_path / "seed1": other}
+    assert_refused([words, "another --name"], records.check, tmp_path, later, RunOptions(**options))
+    records.check(tmp_path, {tmp_path / "seed1": Run(config, 1)}, RunOptions())
+    records.check(tmp_path, {**later, tmp_path / "seed0": other}, RunOptions(**options))
+
+
+def test_an_unknown_set_of_a_stored_run_is_refused_before_training(tmp_path):
+    folder = RunFolder(tmp_path / "seed0")
+    folder.write_config(Run(small_config()))
+    folder.config.write_text(folder.config.read_text().replace("TrapTube-v0", "Gone-v0"))
+    words = ["seed0/config.json", "unknown task set 'Gone-v0'", "--import"]
+    assert_refused(words, records.check, tmp_path, {}, RunOptions())
+
+
+def test_tables_follow_the_order_of_the_points(tmp_path):
+    """So that the first one is what the others are compared with."""
+    for name in ("a", "b", "c", "d"):
+        folder = RunFolder(tmp_path / name)
+        folder.write_config(Run(small_config(), algorithm=name))
+        append_rows(folder.metrics, curves().drop(columns=["algorithm", "seed"]).to_dict("records"))
+        tested = pd.DataFrame(rows(name, [1])).drop(columns=["algorithm", "seed"])
+        append_rows(folder.evaluations, tested.to_dict("records"))
+    records.collect(tmp_path, "sweep", {}, ["d", "b", "c"])
+    for name in ("results", "curves"):
+        found = read_rows(tmp_path / f"{name}.csv")["algorithm"]
+        assert list(found.unique()) == ["d", "b", "c", "a"]
 
 
 def test_a_figure_that_fails_costs_a_line(tmp_path, monkeypatch, capsys):
