@@ -275,7 +275,7 @@ def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
 
 
 def main(options: Options) -> list[Throughput]:
-    """Measures, writes the record and prints a table."""
+    """Measures, prints a table and writes the record."""
     console = harness.begin(options)
     subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
     bandwidth = copy_bandwidth()
@@ -296,8 +296,8 @@ def main(options: Options) -> list[Throughput]:
             f"{result.bytes_per_s / bandwidth:.0%}",
             f"{result.timing.compile_s:.1f}",
         )
-    harness.write_record("env_throughput", options, results, copy_bytes_per_s=bandwidth)
     console.print(table)
+    harness.write_record("env_throughput", options, results, copy_bytes_per_s=bandwidth)
     return results
 
 

@@ -50,6 +50,8 @@ class Options:
           ValueError: an option is not allowed, or `output` is given and the code is uncommitted.
         """
         check_integer("repeats", self.repeats)
+        if self.output is not None and self.output.is_dir():
+            raise ValueError(f"output must be a file, and {self.output} is a folder")
         name = commit()
         if self.output is not None and (name is None or name.endswith("-dirty")):
             raise ValueError(

@@ -255,7 +255,7 @@ def measure(task_set: str, network: NetworkName, options: Options) -> list[Speed
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, writes the record and prints a table."""
+    """Measures, prints a table and writes the record."""
     cases: list[tuple[str, NetworkName]] = [
         (name, network) for name in options.sets for network in options.networks
     ]
@@ -281,8 +281,8 @@ def main(options: Options) -> list[Speed]:
                 f"{speeds[0].steps_per_s / speed.steps_per_s:.1f}",
                 f"{speed.timing.compile_s:.1f}",
             )
-    harness.write_record("learner_peers", options, results)
     console.print(table)
+    harness.write_record("learner_peers", options, results)
     return results
 
 

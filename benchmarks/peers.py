@@ -7,6 +7,7 @@ peer that cannot be imported or fails is skipped, and the reason is printed.
 
 import dataclasses
 import importlib
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -113,21 +114,22 @@ class Options(StepOptions):
 def measure(
     options: Options, subjects: Sequence[Subject]
 ) -> tuple[list[Throughput], dict[str, str]]:
-    """Measures our task sets and the peers; returns results, and reasons by skipped peer."""
-    results = _measure(subjects, options)
+    """Measures our task sets and the peers; returns results, and reasons by what was skipped."""
+    pairs = itertools.product(subjects, options.num_envs)
+    results = [env_throughput.measure_throughput(*pair, options) for pair in pairs]
     skipped = {}
-    for name in options.peers:
+    for name, num_envs in itertools.product(options.peers, options.num_envs):
         try:
-            results += _measure([PEERS[name]()], options)
-        except Exception as error:  # a broken peer must not break the others
+            results.append(env_throughput.measure_throughput(PEERS[name](), num_envs, options))
+        except Exception as error:  # a broken peer, or one out of memory, must not break the others
             first_line = next(iter(str(error).splitlines()), "")
             hint = INSTALL if isinstance(error, ImportError) else ""
-            skipped[name] = f"{type(error).__name__}: {first_line}{hint}"
+            skipped[f"{name}, {num_envs:,} envs"] = f"{type(error).__name__}: {first_line}{hint}"
     return results, skipped
 
 
 def main(options: Options) -> None:
-    """Measures, writes the record, and prints a table and the skipped peers."""
+    """Measures, prints a table and the skipped peers, and writes the record."""
     console = harness.begin(options)
     subjects = [env_throughput.task_set_subject(name) for name in options.sets]
     results, skipped = measure(options, subjects)
@@ -145,19 +147,11 @@ def main(options: Options) -> None:
             f"{result.bytes_per_s / 1e9:.2f}",
             f"{result.timing.compile_s:.1f}",
         )
-    harness.write_record("peers", options, results, skipped=skipped)
     console.print(table)
     console.print("ratio: speed of the first subject over this one; µs of one environment's step")
     for name, reason in skipped.items():
         console.print(f"skipped {name}: {reason}", markup=False)
-
-
-def _measure(subjects: Sequence[Subject], options: StepOptions) -> list[Throughput]:
-    return [
-        env_throughput.measure_throughput(subject, num_envs, options)
-        for subject in subjects
-        for num_envs in options.num_envs
-    ]
+    harness.write_record("peers", options, results, skipped=skipped)
 
 
 def _stateless(

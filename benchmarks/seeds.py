@@ -105,7 +105,7 @@ def measure(config: Config, seeds: int, options: Options) -> Speed:
 
 
 def main(options: Options) -> list[Speed]:
-    """Measures, writes the record and prints a table."""
+    """Measures, prints a table and writes the record."""
     if options.cache:
         compilation.enable_cache()
     preset = Config.preset(options.preset)
@@ -126,8 +126,8 @@ def main(options: Options) -> list[Speed]:
             f"{speed.steps_per_s:,.0f}",
             f"{speed.timing.compile_s:.1f}",
         )
-    harness.write_record("seeds", options, results)
     console.print(table)
+    harness.write_record("seeds", options, results)
     return results
 
 

@@ -160,7 +160,7 @@ def _sum_over_minibatches(
 
 
 def main(options: Options) -> list[Part]:
-    """Measures, writes the record and prints a table."""
+    """Measures, prints a table and writes the record."""
     configs = [Config.preset(options.preset, env_id=tt.task_set(each).id) for each in options.sets]
     console = harness.begin(options)
     table = Table(
@@ -177,8 +177,8 @@ def main(options: Options) -> list[Part]:
             f"{part.steps_per_s:,.0f}",
             f"{part.timing.compile_s:.1f}",
         )
-    harness.write_record("train_throughput", options, results)
     console.print(table)
+    harness.write_record("train_throughput", options, results)
     return results
 
 

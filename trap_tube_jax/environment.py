@@ -3,9 +3,10 @@
 Source: paper, section "Environments"; environment.md.
 """
 
+import copy
 import dataclasses
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping, Set
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ from trap_tube_jax.state import (
     TimeStep,
     base_state,
     check_state,
+    take,
     validate,
     with_narrow_integers,
 )
@@ -44,6 +46,7 @@ from trap_tube_jax.transfers import (
 )
 
 MAX_TIME = 2**31 - 1  # `State.time` is an i32
+NUM_TRIALS = 32  # of a custom transfer
 
 _PAPER_TRANSFERS = {perceptual, structural, symbolic}  # known to be valid, so never tried
 
@@ -92,9 +95,9 @@ class Environment(ByValue):
         base: State | None = None,
         max_steps: int = MAX_STEPS,
     ):
-        """Checks the arguments, and tries every custom transfer once.
+        """Checks the arguments, and tries every custom transfer with 32 keys.
 
-        A trial runs the transfer under jit, on the output of the transfers before it.
+        A trial runs the transfer under jit and vmap, on the output of the transfers before it.
 
         Args:
           transfers: functions (key, state) -> state, applied in order at every reset,
@@ -105,7 +108,10 @@ class Environment(ByValue):
         Raises:
           ValueError: naming the argument, its value and what is allowed.
         """
-        if callable(transfers) or isinstance(transfers, str) or not isinstance(transfers, Iterable):
+        has_order = isinstance(transfers, Iterable) and not isinstance(
+            transfers, Set | Mapping | str
+        )
+        if callable(transfers) or not has_order:
             raise ValueError(
                 f"transfers must be a sequence of functions (key, state) -> state, "
                 f"got {transfers!r}"
@@ -116,10 +122,25 @@ class Environment(ByValue):
         num_tried = len(custom) - custom[::-1].index(True) if any(custom) else 0
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             self.base = base_state() if base is None else _check_base(base)
-            state = self.base
-            key = jax.random.key(0)
-            for transfer in self.transfers[:num_tried]:
-                state = _try_transfer(transfer, jax.random.clone(key), state)
+            if num_tried:
+                states = jax.tree.map(lambda x: jnp.stack([x] * NUM_TRIALS), self.base)
+                keys = jax.random.split(jax.random.key(0), NUM_TRIALS)
+                for transfer in self.transfers[:num_tried]:
+                    states = _try_transfer(transfer, jax.random.clone(keys), states)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Raises AttributeError if the attribute exists: compiled programs would not notice."""
+        if name in vars(self):
+            raise AttributeError(
+                f"{name} of an environment is constant; make another one, as by with_max_steps"
+            )
+        super().__setattr__(name, value)
+
+    def with_max_steps(self, max_steps: int) -> Self:
+        """Returns an environment with another step limit, 1 to 2**31 - 1."""
+        env = copy.copy(self)
+        vars(env)["max_steps"] = check_integer("max_steps", max_steps, maximum=MAX_TIME)
+        return env
 
     @names_adapters
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
@@ -187,7 +208,8 @@ class Environment(ByValue):
 
     def __repr__(self) -> str:
         names = ", ".join(map(transfer_name, self.transfers))
-        return f"{type(self).__name__}(transfers=({names}), max_steps={self.max_steps})"
+        base = "" if self.base == base_state() else "base=..., "
+        return f"{type(self).__name__}(transfers=({names}), {base}max_steps={self.max_steps})"
 
 
 def action_from_index(index: jax.typing.ArrayLike) -> jax.Array:
@@ -282,23 +304,27 @@ def _check_base(base: State) -> State:
     return jax.tree.map(jnp.array, base)
 
 
-def _try_transfer(transfer: Transfer, key: jax.Array, state: State) -> State:
-    """Returns the state that a transfer returns, if an episode may start from it."""
+def _try_transfer(transfer: Transfer, keys: jax.Array, states: State) -> State:
+    """Returns the batch of states that a transfer returns, if episodes may start from them."""
     name = transfer_name(transfer)
     try:
-        drawn = jax.jit(compose(transfer))(key, state)
+        batch = jax.jit(jax.vmap(compose(transfer)))(keys, states)
     except (TypeError, ValueError, IndexError) as error:  # JAX raises all of them
         raise ValueError(
             f"transfer {name} failed; allowed: a function (key, state) -> state that runs under "
-            f"jax.jit; {type(error).__name__}: {error}"
+            f"jax.jit and jax.vmap; {type(error).__name__}: {error}"
         ) from error
-    try:
-        drawn = validate(drawn)
-    except ValueError as error:
-        raise ValueError(f"transfer {name} returned an invalid state: {error}") from error
-    if int(drawn.time) or drawn.palette.shape != state.palette.shape:
-        raise ValueError(
-            f"transfer {name} must keep time 0 and a palette of {describe_array(state.palette)}, "
-            f"got time {int(drawn.time)} and {describe_array(drawn.palette)}"
-        )
-    return drawn
+    palette = take(states, 0).palette
+    concrete = jax.device_get(batch)
+    for index in range(NUM_TRIALS):
+        drawn = take(concrete, index)
+        try:
+            validate(drawn)
+        except ValueError as error:
+            raise ValueError(f"transfer {name} returned an invalid state: {error}") from error
+        if int(drawn.time) or drawn.palette.shape != palette.shape:
+            raise ValueError(
+                f"transfer {name} must keep time 0 and a palette of {describe_array(palette)}, "
+                f"got time {int(drawn.time)} and {describe_array(drawn.palette)}"
+            )
+    return batch

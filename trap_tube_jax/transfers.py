@@ -89,7 +89,8 @@ class Composition:
 
     @property
     def __name__(self) -> str:
-        return ", ".join(map(transfer_name, self.transfers)) or "identity"
+        names = ", ".join(map(transfer_name, self.transfers))
+        return f"({names})" if len(self.transfers) > 1 else names or "identity"
 
 
 @dataclasses.dataclass(frozen=True)

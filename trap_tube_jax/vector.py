@@ -43,7 +43,8 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
 
     Attributes:
       episodes: states and keys, as `jax.vmap` of an `AutoReset` keeps them.
-      background: u8[B, 12 * 12 * N], the boards without food, tool and agent.
+      background: u8[B, 12 * 12 * N], the boards without food, tool and agent, as `draw_static`
+        draws them; to replace `episodes.inner`, replace it, too.
 
     Example:
       >>> env = tt.VectorEnvironment(tt.make("base"))

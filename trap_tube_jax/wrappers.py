@@ -87,11 +87,7 @@ class AutoReset:
 
     def __post_init__(self):
         _check_environment(self.env)
-        if _auto_resets(self.env):
-            raise ValueError(
-                f"{type(self.env).__name__} resets itself already; allowed: an environment that "
-                "does not, such as a trap_tube_jax.Environment"
-            )
+        self._check_reset(bool(_auto_resets(self.env)))
         if isinstance(self.env, EpisodeStatistics):
             raise ValueError(
                 "AutoReset cannot wrap EpisodeStatistics, whose counts would start anew with every "
@@ -103,6 +99,7 @@ class AutoReset:
         """Starts the first episode. See `Environment.reset`."""
         reset_key, next_key = jax.random.split(threefry_key(key))
         inner, timestep = self.env.reset(reset_key)
+        self._check_reset(isinstance(timestep, AutoResetTimeStep))  # within a user's wrapper
         final = jnp.copy(timestep.observation)  # in other memory, so both may be donated
         first = auto_reset_timestep(timestep, timestep.observation, final)
         return AutoResetState(inner, next_key), first
@@ -128,6 +125,13 @@ class AutoReset:
         )
         next_state = next_state.replace(key=jax.random.clone(next_state.key))
         return next_state, auto_reset_timestep(timestep, observation, timestep.observation)
+
+    def _check_reset(self, resets_itself: bool) -> None:
+        if resets_itself:
+            raise ValueError(
+                f"{type(self.env).__name__} resets itself already; allowed: an environment that "
+                "does not, such as a trap_tube_jax.Environment"
+            )
 
 
 class EpisodeStatisticsState(ByValue, struct.PyTreeNode, eq=False):
@@ -216,6 +220,8 @@ class EpisodeStatistics:
         running_return = state.running_return + jnp.where(is_counted, timestep.reward, 0.0)
         running_length = state.running_length + is_counted.astype(jnp.int32)
         finished = timestep.done & is_counted
+        # By the timestep, since a user's wrapper may hide the attribute.
+        has_reset = isinstance(timestep, AutoResetTimeStep) and self.auto_resets != "NextStep"
         return EpisodeStatisticsState(
             inner=inner,
             running_return=jnp.where(timestep.done, 0.0, running_return),
@@ -223,7 +229,7 @@ class EpisodeStatistics:
             last_return=jnp.where(finished, running_return, state.last_return),
             last_length=jnp.where(finished, running_length, state.last_length),
             episodes=state.episodes + finished.astype(jnp.int32),
-            over=timestep.done & (self.auto_resets != "SameStep"),
+            over=jnp.zeros_like(timestep.done) if has_reset else timestep.done,
         ), timestep
 
 

@@ -55,8 +55,8 @@ def tables(results: Table, curves: Table, about: Mapping[str, Any]) -> dict[str,
         unfinished[algorithm].add(seed)
     with_paper = train_set == "base"
     threshold = about["threshold"]
-    heading = "Training" + ("" if threshold == 1 else f"; solved: {100 * threshold:g} % of the tasks")
-    found = {heading: training_table(curves, threshold, with_paper, unfinished)}
+    share = "" if threshold == 1 else f"; solved: {100 * threshold:g} % of the tasks"
+    found = {f"Training{share}": training_table(curves, threshold, with_paper, unfinished)}
     if len(tested):
         found["Test tasks solved, %"] = success_table(tested, train_set == "pstsy")
     compared = differences(tested)

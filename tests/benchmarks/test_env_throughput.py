@@ -1,5 +1,6 @@
 """Throughput of environments, ours and others'."""
 
+import functools
 import itertools
 
 import jax
@@ -79,12 +80,24 @@ def test_peers_prints_steps_and_skips_libraries_that_fail(timed, capsys, monkeyp
     def broken():
         raise ValueError("broken\nin two lines")
 
-    monkeypatch.setattr(peers, "PEERS", {"pgx": absent, "navix": broken})
+    def out_of_memory(subject, num_envs, options, measure=env_throughput.measure_throughput):
+        if num_envs > 2:
+            raise MemoryError("full")
+        return measure(subject, num_envs, options)
+
+    known = functools.partial(env_throughput.task_set_subject, "p")
+    monkeypatch.setattr(peers, "PEERS", {"pgx": absent, "navix": broken, "jumanji": known})
     monkeypatch.setattr(harness, "machine", dict)
     size = {"num_envs": (2,), "num_steps": 4, "repeats": 3}
     peers.main(peers.Options(sets=("base",), peers=("pgx", "navix"), **size))
     *table, absent_line, broken_line = capsys.readouterr().out.splitlines()
     (cells,) = [line.strip("│").split("│") for line in table if "base" in line]
     assert [cell.strip() for cell in cells[4:6]] == ["250000.000", "432"]
-    assert absent_line == "skipped pgx: ImportError: no such package (pip install -e '.[bench]')"
-    assert broken_line == "skipped navix: ValueError: broken"
+    absence = "ImportError: no such package (pip install -e '.[bench]')"
+    assert absent_line == f"skipped pgx, 2 envs: {absence}"
+    assert broken_line == "skipped navix, 2 envs: ValueError: broken"
+    monkeypatch.setattr(env_throughput, "measure_throughput", out_of_memory)
+    options = peers.Options(peers=("jumanji",), **{**size, "num_envs": (2, 4)})
+    results, skipped = peers.measure(options, [])
+    assert [result.num_envs for result in results] == [2]
+    assert skipped == {"jumanji, 4 envs": "MemoryError: full"}

@@ -70,6 +70,10 @@ def test_recorded_commands_can_be_given():
         (seeds, ("--seeds", "1", "0"), "seeds must be an integer >= 1, got 0"),
         (seeds, ("--iterations", "0"), "iterations must be an integer >= 1, got 0"),
         (learner_peers, ("--minibatch-size", "5"), "minibatch_size must divide "),
+        *(
+            (module, ("--output", "."), "output must be a file, and . is a folder")
+            for module in MODULES
+        ),
         *((module, ("--output", "x"), "a record needs committed code") for module in MODULES),
         *((module, ("--repeats", "0"), "repeats must be an integer >= 1") for module in MODULES),
         *((module, ("--sets", "typo"), "unknown task set 'typo'; allowed: ") for module in MODULES),

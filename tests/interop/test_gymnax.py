@@ -140,13 +140,14 @@ def test_invalid_arguments_are_refused(arguments, message):
 
 
 @pytest.mark.parametrize("index", [16, -1, jnp.int32(99), np.int64(16)])
-def test_indices_of_no_action_are_refused(easy, easy_env, index):
+def test_indices_of_no_action_are_no_directions(easy, easy_env, index):
     env, params = easy
     key = jax.random.key(0)
     _, state = env.reset(key, params)
     for adapter in (env, to_gymnax.SixValueTrapTube(easy_env)):
-        with pytest.raises(ValueError, match=f"from 0 to 15, got .*{int(index)}"):
-            adapter.step_env(key, state, index, params)
+        after = adapter.step(key, state, index, params)[1]
+        np.testing.assert_array_equal(after.agent, state.agent)
+        assert after.time == 1
 
 
 def test_a_pair_in_place_of_an_index_is_answered_with_the_option(easy):

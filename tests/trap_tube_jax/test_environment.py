@@ -193,7 +193,7 @@ def test_custom_transfers_apply_in_order():
     state, _ = env.reset(jax.random.key(0))
     assert state.agent.tolist() == [5, 4]
     assert state.palette.shape == (8, 2)
-    assert repr(env) == "Environment(transfers=(clear, into_the_tube), max_steps=50)"
+    assert repr(env) == "Environment(transfers=(clear, into_the_tube), base=..., max_steps=50)"
     assert_refused(["into_the_tube", "stands on trap"], tt.Environment, (into_the_tube, clear))
 
 
@@ -210,6 +210,23 @@ def test_custom_transfers_get_typed_keys_by_fold_in(make_key):
     state, _ = tt.Environment((tt.structural, custom), base=EASY).reset(key)
     expected = jax.random.fold_in(key, 1)
     np.testing.assert_array_equal(state.agent, jax.random.randint(expected, (2,), 8, 12))
+
+
+def test_an_environment_is_constant():
+    """Since compiled programs hold it, and equal ones share them."""
+    env = tt.make("p")
+    for name in ("max_steps", "base", "transfers"):
+        with pytest.raises(AttributeError, match=f"{name} of an environment is constant"):
+            setattr(env, name, getattr(env, name))
+    assert env.with_max_steps(7) == tt.make("p", max_steps=7) != env == tt.make("p")
+    assert_refused(["max_steps", ">= 1", "0"], env.with_max_steps, 0)
+
+
+def test_unequal_environments_print_differently():
+    both = tt.compose(tt.perceptual, tt.structural)
+    env = tt.Environment((both, tt.symbolic))
+    assert repr(env) == "Environment(transfers=((perceptual, structural), symbolic), max_steps=50)"
+    assert "(perceptual + (perceptual, structural))" in repr(tt.make("p+pst"))
 
 
 def test_action_numbers_are_four_times_grasp_plus_move():
@@ -260,6 +277,10 @@ def broken(**fields: Any) -> tt.Transfer:
     return transfer
 
 
+def often_invalid(key, state):
+    return state.replace(food=jnp.stack([5, jax.random.randint(key, (), 4, 8, jnp.int32)]))
+
+
 def no_state(key, state):
     del key, state
 
@@ -288,6 +309,8 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
     ({"base": EASY.replace(time=np.int32(3))}, ["time 3", "allowed: time 0"]),
     ({"transfers": None}, ["transfers", "(key, state) -> state", "None"]),
     ({"transfers": tt.symbolic}, ["transfers", "sequence", "symbolic"]),
+    ({"transfers": {tt.symbolic}}, ["transfers", "sequence", "symbolic"]),  # has no order
+    ({"transfers": (often_invalid,)}, ["often_invalid", "invalid state", "food at (5, "]),
     ({"transfers": ("symbolic",)}, ["(key, state) -> state", "'symbolic'"]),
     ({"transfers": (no_state,)}, ["no_state", "invalid", "State", "NoneType"]),
     ({"transfers": (broken(time=np.int32(3)),)}, ["transfer must keep time 0", "got time 3"]),

@@ -131,6 +131,32 @@ def test_episode_statistics_of_a_vector_count_its_environments_without_resets(ve
     np.testing.assert_array_equal(state.running_length, [0, 0])
 
 
+class Shaped:
+    """A user's wrapper."""
+
+    def __init__(self, env):
+        self.env = env
+
+    def reset(self, key):
+        return self.env.reset(key)
+
+    def step(self, state, action):
+        state, timestep = self.env.step(state, action)
+        return state, timestep.replace(reward=timestep.reward - 0.5)
+
+
+def test_a_users_wrapper_does_not_hide_auto_reset():
+    inner = Shaped(tt.AutoReset(tt.Environment(base=EASY, max_steps=9)))
+    env = tt.EpisodeStatistics(inner)
+    step = jax.jit(env.step)
+    state, _ = env.reset(jax.random.key(0))
+    for _ in range(4):
+        state, _ = step(state, RIGHT)
+    assert (state.episodes, state.last_length, state.last_return) == (2, 2, 0)
+    words = ["Shaped resets itself", "trap_tube_jax.Environment"]
+    assert_refused(words, tt.AutoReset(inner).reset, jax.random.key(0))
+
+
 @pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
 def test_auto_reset_refuses_environments_that_reset_themselves_or_count(wrapper):
     env = wrapper(tt.Environment())

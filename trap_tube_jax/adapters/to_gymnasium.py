@@ -8,7 +8,6 @@ Importing `trap_tube_jax` registers them where Gymnasium >= 1.1 is installed:
 Both take the keyword arguments of the classes below. The step limit is `max_steps`.
 """
 
-import copy
 import functools
 import reprlib
 from collections.abc import Callable, Sequence
@@ -220,8 +219,7 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
         self.env = one.env
         if max_episode_steps is not None:
             limit = check_integer("max_episode_steps", max_episode_steps)
-            self.env = copy.copy(one.env)
-            self.env.max_steps = min(limit, one.env.max_steps)
+            self.env = one.env.with_max_steps(min(limit, one.env.max_steps))
         self.render_mode = one.render_mode
         self.cell_size = one.cell_size
         self.single_observation_space = one.observation_space

@@ -11,7 +11,6 @@ gymnax: `make` and `FiveValueTrapTube`. A step of gymnax 1.0 returns six values:
     observation, state, reward, terminated, truncated, info = env.step(...)
 """
 
-import copy
 import functools
 from typing import Any
 
@@ -19,11 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.core import Tracer
 
 from trap_tube_jax.environment import MAX_TIME, Environment, action_from_index
 from trap_tube_jax.imports import needs_extra
-from trap_tube_jax.objects import MAX_STEPS, NO_DIRECTION, NUM_ACTIONS, NUM_DIRECTIONS
+from trap_tube_jax.objects import MAX_STEPS, NUM_ACTIONS, NUM_DIRECTIONS
 from trap_tube_jax.observation import observe
 from trap_tube_jax.registry import make as make_environment
 from trap_tube_jax.registry import registered_ids
@@ -63,7 +61,7 @@ class _TrapTube(environment.Environment):
           task_set: registered id, short name or label, or an `Environment`, whose number of
             features and, as the default parameter, step limit hold.
           flat_actions: takes 4 * grasp + move, `Discrete(16)`, instead of (grasp, move),
-            `Tuple((Discrete(4), Discrete(4)))` or i32[2].
+            `Tuple((Discrete(4), Discrete(4)))` or i32[2]. Any other number means no direction.
           num_features: N, the feature channels of the observation; see `trap_tube_jax.make`.
 
         Raises:
@@ -81,8 +79,7 @@ class _TrapTube(environment.Environment):
         else:
             self._name = repr(task_set)
         self._default_max_steps = task_set.max_steps
-        self._env = copy.copy(task_set)
-        self._env.max_steps = MAX_TIME  # the limit in the parameters replaces it
+        self._env = task_set.with_max_steps(MAX_TIME)  # the limit in the parameters replaces it
         self.flat_actions = flat_actions
 
     @property
@@ -141,16 +138,13 @@ class _TrapTube(environment.Environment):
 
 
 def _pair(index: Any) -> jax.Array:
-    """Returns the action i32[2] of an index; raises ValueError for pairs, and beyond 0 to 15."""
+    """Returns the action i32[2] of an index; raises ValueError for pairs."""
     if np.ndim(index):
         raise ValueError(
             "an action is one index 4 * grasp + move; make the environment with flat_actions=False "
             f"to pass (grasp, move), got shape {np.shape(index)}"
         )
-    pair = action_from_index(index)
-    if not isinstance(pair, Tracer) and np.any(np.asarray(pair) == NO_DIRECTION):
-        raise ValueError(f"an action's index must be from 0 to {NUM_ACTIONS - 1}, got {index!r}")
-    return pair
+    return action_from_index(index)
 
 
 class FiveValueTrapTube(_TrapTube):
@@ -202,11 +196,7 @@ class FiveValueTrapTube(_TrapTube):
     def step_env(
         self, key: jax.Array, state: State, action: Any, params: EnvParams
     ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action; a finished episode stays as it is.
-
-        Raises:
-          ValueError: the action is concrete and out of range; see `Environment.step`.
-        """
+        """Takes one action; a finished episode stays as it is."""
         del key
         state, timestep = self._transition(state, action, params)
         info = {
@@ -235,11 +225,7 @@ class SixValueTrapTube(_TrapTube):
     def step_env(
         self, key: jax.Array, state: State, action: Any, params: EnvParams
     ) -> tuple[jax.Array, State, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action and returns (observation, state, reward, terminated, info).
-
-        Raises:
-          ValueError: the action is concrete and out of range; see `Environment.step`.
-        """
+        """Takes one action and returns (observation, state, reward, terminated, info)."""
         del key
         state, timestep = self._transition(state, action, params)
         info = {"discount": timestep.discount}

@@ -227,11 +227,7 @@ def _play(
     def step(now: _Episodes) -> _Episodes:
         step_key = jax.random.fold_in(key, now.time)
         action, carry = _pair(policy.act(now.observation, now.carry, step_key), batch)
-        expected, got = (jax.tree.structure(tree) for tree in (now.carry, carry))
-        if got != expected:
-            raise ValueError(
-                f"the policy's act must return a carry like that of initial, {expected}, got {got}"
-            )
+        _check_carry(now.carry, carry)
         states, timestep = jax.vmap(env.step)(now.states, action)
         in_range = jnp.all((action >= 0) & (action < NUM_DIRECTIONS), axis=-1)
         return _Episodes(
@@ -254,6 +250,19 @@ def _play(
     last = jax.lax.while_loop(lambda now: ~jnp.all(now.states.done), step, first)
     is_number = jnp.broadcast_to(last.is_number, (batch,))
     return last.states.terminated, last.states.time, last.in_range, is_number
+
+
+def _check_carry(before: Any, after: Any) -> None:
+    """Raises ValueError unless two carries have the same structure, shapes and dtypes."""
+    expected, got = (jax.tree.map(jax.typeof, tree) for tree in (before, after))
+    same = jax.tree.structure(expected) == jax.tree.structure(got) and all(
+        old.shape == new.shape and (old.dtype == new.dtype or old.weak_type)
+        for old, new in zip(*map(jax.tree.leaves, (expected, got)), strict=True)
+    )
+    if not same:
+        raise ValueError(
+            f"the policy's act must return a carry like that of initial, {expected}, got {got}"
+        )
 
 
 def _has_nan(tree: Any) -> jax.Array:

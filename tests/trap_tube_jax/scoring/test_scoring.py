@@ -417,7 +417,12 @@ def test_act_must_return_a_carry(near, tasks):
     words = ["act must return a pair (actions i32[B, 2], carry)", "got "]
     assert_refused(words, tt.score, policy, ["near"], tasks)
     policy.act = lambda observation, carry, key: (jnp.zeros((len(observation), 2), int), (0, 0))
-    words = ["act must return a carry like that of initial", "got PyTreeDef((*, *))"]
+    words = ["act must return a carry like that of initial", "got (ShapedArray(int32[]"]
+    assert_refused(words, tt.score, policy, ["near"], tasks)
+    policy.initial = jnp.zeros
+    half = jnp.zeros(tasks, jnp.float16)
+    policy.act = lambda observation, carry, key: (jnp.zeros((len(observation), 2), int), half)
+    words = ["like that of initial, ", f"float32[{tasks}]", "got ", f"float16[{tasks}]"]
     assert_refused(words, tt.score, policy, ["near"], tasks)
 
 
