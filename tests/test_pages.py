@@ -382,6 +382,19 @@ def steps_with_colors(*policies: str) -> int:
     return curves.max().loc[list(policies)].sum()
 
 
+def sought_bonus() -> str:
+    """Returns how the bonus per step and the entropy change in the published code's PPO."""
+    found = rows_of("exp1_code", "bonus").pivot(index="seed", columns="iteration")
+    (first, last), (before, after) = (
+        (values[1], values[250]) for values in (found["intrinsic_reward"], found["entropy"])
+    )
+    return (
+        f"per step this rises from {first.min():.0f}–{first.max():.0f} to "
+        f"{last.min():,.0f}–{last.max():,.0f}, while entropy falls from {before.min():.1f}–"
+        f"{before.max():.1f} to at most {after.max():.2f} nats"
+    )
+
+
 def random_actions() -> list[float]:
     scores = json.loads((RESULTS / "leaderboard" / "random.json").read_text())
     return [score["percent"] for score in scores["sets"]]
@@ -431,6 +444,9 @@ def test_stated_results_are_those_of_the_records():
         rows[CURIOSITIES].append(f"| `{name}` | {means(own.drop(columns='base'))} |")
     solved = rows_of("exp1", "curves").query("validation_success == 1")
     first = solved.pivot_table("episodes", "seed", "algorithm", "min").reindex(range(5))
+    rows[PAPER].append(sought_bonus())
+    never = rows_of("exp1_code", "curves").groupby("seed")[["episodes", "validation_success"]].max()
+    assert never.to_numpy().tolist() == [[256_000, 0]] * 5
     for seed, (ppo, icm) in first.map("{:,.0f}".format).replace("nan", "–").iterrows():
         rows[PAPER].append(f"| {seed} | {icm} | {ppo} |")
     tested = tables.reported(rows_of("exp2_curiosities", "results"))

@@ -21,6 +21,7 @@ from helpers.small_runs import small_config
 
 RESULTS = ROOT / "benchmarks" / "results"
 RECORDS = (
+    "exp1_code",
     "exp2_best",
     "exp2_curiosities",
     "exp2_paper",
