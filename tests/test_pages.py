@@ -241,8 +241,6 @@ def agents_that_know_colors() -> list[str]:
         solved[policy] = percent_of("colors/confirmation.csv", policy)
         if not policy.startswith(("seed 2", "seed 300", "seed 301")):
             rows.append(f"{policy} | {knowledge(pushes, solved[policy])} |")
-    earlier = [right[f"seed {number}"] for number in (202, 300, 301)]
-    rows.append("have {:.1f}, {:.1f} and {:.1f} % right first pushes".format(*earlier))
     five = [f"seed {number}" for number in range(330, 335)]
     mean = tables.mean_text(np.array([right[policy] for policy in five]), ".1f", high=100)
     percent = pd.DataFrame(solved)[five].mean(axis=1)[["p", "pst", "psy", "pstsy"]]
@@ -315,15 +313,41 @@ def memory() -> list[str]:
     return [*rows, *(cost_of("no-memory", name) for name in ("p", "psy"))]
 
 
+@functools.cache
+def ingredients(task_set: str) -> tuple[dict[str, int], dict[str, str], dict[str, str]]:
+    """Returns seeds, success and the difference from `best` with its interval, by arm."""
+    tested = tables.reported(rows_of("ingredients", "results"))
+    arms = tables.by_set(tested)[task_set].groupby("algorithm")
+    found = tables.differences(tested).set_index(["task_set", "algorithm"]).loc[task_set]
+    differences = {
+        arm: "{} [{}, {}]".format(*map(one_decimal, ends))
+        for arm, *ends in found[["difference", "low", "high"]].itertuples()
+    }
+    return arms.size().to_dict(), arms.mean().map(one_decimal).to_dict(), differences
+
+
+def without_an_ingredient() -> list[str]:
+    """Returns the rows of the table of ingredients."""
+    names = {
+        "replay": "no-replay",
+        "`effects`, RND instead": "rnd",
+        "[memory](profiles.md#memory)": "no-memory",
+        "turning the board": "unturned",
+    }
+    seeds, percent, differences = ingredients("p")
+    assert {"best", *names.values()} == set(seeds)
+    rows = [
+        f"| {text} | {seeds[arm]} | {percent[arm]} | {differences[arm]} |"
+        for text, arm in names.items()
+    ]
+    return [f"eight seeds of `best` solve {percent['best']} % of {{P}}.", *rows]
+
+
 def cost_of(arm: str, task_set: str) -> str:
     """Returns success without an ingredient and with it, and the difference with its interval."""
-    tested = tables.reported(rows_of("ingredients", "results"))
-    mean = tables.by_set(tested)[task_set].groupby("algorithm").mean()
-    found = tables.differences(tested).set_index(["algorithm", "task_set"])
-    ends = found.loc[(arm, task_set), ["difference", "low", "high"]]
-    difference, low, high = map(one_decimal, ends)
-    success = f"{mean[arm]:.1f} instead of {mean['best']:.1f} % of {label(task_set)}"
-    return f"{success} (difference {difference} [{low}, {high}]"
+    _, percent, differences = ingredients(task_set)
+    success = f"{percent[arm]} instead of {percent['best']} % of {label(task_set)}"
+    return f"{success} (difference {differences[arm]}"
 
 
 def steps_of_replay() -> str:
@@ -439,7 +463,7 @@ def test_stated_results_are_those_of_the_records():
     table = best.droplevel(0).drop(columns=["base", tables.MEAN])
     rows[BEST] += [f"| {seed} | {cells(own)} |" for seed, own in table.iterrows()]
     rows[BEST].append(f"| mean | {cells(table.mean())} |")
-    rows[BEST] += [*(cost_of(arm, "p") for arm in ("no-replay", "unturned")), steps_of_replay()]
+    rows[BEST] += [*without_an_ingredient(), steps_of_replay()]
     for name, own in percent_solved("exp2_curiosities").groupby("algorithm"):
         rows[CURIOSITIES].append(f"| `{name}` | {means(own.drop(columns='base'))} |")
     solved = rows_of("exp1", "curves").query("validation_success == 1")
