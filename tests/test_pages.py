@@ -35,13 +35,8 @@ RESULTS = ROOT / "benchmarks" / "results"
 BEST, CURIOSITIES, MOTION, PAPER, PROFILES, REPEATS, TABLE_2 = (
     f"benchmarks/results/{name}.md"
     for name in (
-        "best_preset",
-        "curiosities",
-        "motion",
-        "paper_preset",
-        "profiles",
-        "repeats",
-        "table_2",
+        *("best_preset", "curiosities", "motion", "paper_preset"),
+        *("profiles", "repeats", "table_2"),
     )
 )
 
@@ -235,7 +230,7 @@ def agents_that_know_colors() -> list[str]:
     right, solved = {}, {}
     for policy in rows_of("colors", "first_pushes")["policy"].unique():
         pushes = first_pushes("colors/first_pushes.csv", policy)
-        if policy in ("seed 202", "colors-p+psy+pstsy"):  # the first tasks chose them
+        if policy == "colors-p+psy+pstsy":  # the first tasks chose it
             pushes -= first_pushes("colors/development.csv", policy)
         right[policy] = 100 * pushes.iloc[0] / pushes.sum()
         solved[policy] = percent_of("colors/confirmation.csv", policy)
@@ -346,8 +341,8 @@ def without_an_ingredient() -> list[str]:
 def cost_of(arm: str, task_set: str) -> str:
     """Returns success without an ingredient and with it, and the difference with its interval."""
     _, percent, differences = ingredients(task_set)
-    success = f"{percent[arm]} instead of {percent['best']} % of {label(task_set)}"
-    return f"{success} (difference {differences[arm]}"
+    percents = f"{percent[arm]} instead of {percent['best']} % of {label(task_set)}"
+    return f"{percents} (difference {differences[arm]}"
 
 
 def steps_of_replay() -> str:
@@ -409,14 +404,14 @@ def steps_with_colors(*policies: str) -> int:
 def sought_bonus() -> str:
     """Returns how the bonus per step and the entropy change in the published code's PPO."""
     found = rows_of("exp1_code", "bonus").pivot(index="seed", columns="iteration")
-    (first, last), (before, after) = (
-        (values[1], values[250]) for values in (found["intrinsic_reward"], found["entropy"])
+    low, high = found.min(), found.max()
+    bonus = [
+        f"{low['intrinsic_reward', i]:,.0f}–{high['intrinsic_reward', i]:,.0f}" for i in (1, 250)
+    ]
+    entropy = (
+        f"{low['entropy', 1]:.1f}–{high['entropy', 1]:.1f} to at most {high['entropy', 250]:.2f}"
     )
-    return (
-        f"per step this rises from {first.min():.0f}–{first.max():.0f} to "
-        f"{last.min():,.0f}–{last.max():,.0f}, while entropy falls from {before.min():.1f}–"
-        f"{before.max():.1f} to at most {after.max():.2f} nats"
-    )
+    return f"rises from {bonus[0]} to {bonus[1]}, while entropy falls from {entropy} nats"
 
 
 def random_actions() -> list[float]:

@@ -44,7 +44,7 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
     Attributes:
       episodes: states and keys, as `jax.vmap` of an `AutoReset` keeps them.
       background: u8[B, 12 * 12 * N], the boards without food, tool and agent, as `draw_static`
-        draws them; to replace `episodes.inner`, replace it, too.
+        draws them. Replace it together with `episodes.inner`.
 
     Example:
       >>> env = tt.VectorEnvironment(tt.make("base"))
