@@ -27,6 +27,7 @@ DESCRIPTION = """Finds exact shortest plans of the trap-tube tasks. Without --sh
 prints statistics of whole task sets and draws a histogram. Sets that differ only in colours have
 the same statistics. Only the pictures need the extra [pictures]."""
 SURVEYED = ("base", "sy", "p", "psy")
+TASKS = 1000  # to survey per set
 QUANTILES = (5, 25, 50, 75, 95)
 
 
@@ -37,12 +38,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         import_modules(options.imports)
         if options.output is not None:
             options.output.parent.mkdir(parents=True, exist_ok=True)
-        if options.show is not None:
-            _show(options)
-        elif options.distances is not None:
-            _distances(options)
-        else:
+        if options.show is None and options.distances is None:
             _survey(options)
+        elif options.sets is not None or options.tasks is not None:
+            raise ValueError("--sets and --tasks are not allowed with --show and --distances")
+        elif options.show is not None:
+            _show(options)
+        else:
+            _distances(options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -51,11 +54,10 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--sets",
         nargs="+",
-        default=SURVEYED,
         metavar="SET",
         help=f"task sets [{' '.join(SURVEYED)}]",
     )
-    add("--tasks", type=int, default=1000, help="tasks to solve per set [%(default)s]")
+    add("--tasks", type=int, help=f"tasks to solve per set [{TASKS}]")
     add("--seed", type=int, default=0, help="seed of the tasks, 0 to 2**32 - 1 [%(default)s]")
     modes = parser.add_mutually_exclusive_group()
     modes.add_argument("--show", metavar="SET", help="plan one task, as text and GIF")
@@ -70,10 +72,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _survey(options: argparse.Namespace) -> None:
-    tasks = check_integer("tasks", options.tasks, maximum=MAX_TASKS)
+    tasks = TASKS if options.tasks is None else options.tasks
+    check_integer("tasks", tasks, maximum=MAX_TASKS)
     keys = jax.random.split(jax.random.key(check_seed(options.seed)), tasks)
     lengths = {}
-    for entry in dict.fromkeys(task_set(name) for name in options.sets):
+    for entry in dict.fromkeys(task_set(name) for name in options.sets or SURVEYED):
         announce(f"Solving {tasks:,} tasks of {entry.label}, up to a minute per 1,000 tasks")
         states, _ = jax.jit(jax.vmap(make(entry.id).reset))(keys)
         lengths[entry.label] = solve_batch(states).length

@@ -106,6 +106,8 @@ def test_command_line_draws_distances(tmp_path, capsys):
     ("arguments", "message"),
     [
         (["--show", "p", "--distances", "p"], "not allowed with argument --show"),
+        (["--show", "p", "--tasks", "9"], "--sets and --tasks are not allowed with --show"),
+        (["--distances", "p", "--sets", "p"], "--sets and --tasks are not allowed with --show"),
         (["--show", "nowhere"], "unknown task set 'nowhere'"),
         (["--tasks", "0"], "tasks must be an integer >= 1"),
         (["--tasks", "1000000000"], "<= 1000000, got 1000000000"),
