@@ -71,11 +71,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     announce(f"Playing {tasks:,} tasks of every set, up to a minute per 1,000")
     played = evaluator(policy.params)
     scores = evaluator.suite.scores(played, shortest=shortest)
-    title = f"{policy.name}, iteration {policy.iteration}, {options.purpose} tasks"
+    title = f"{options.source}, iteration {policy.iteration}, {options.purpose} tasks"
     print(title, scores, sep="\n\n", flush=True)
     if options.output is not None:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         table = pd.DataFrame(evaluation_rows(scores, policy, options.purpose))
+        table.insert(0, "policy", options.source)
         write_rows(options.output, table)
         print(f"\nresults: {options.output}")
     if options.gif is not None:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trap_tube_jax.geometry import bar_cells, bar_covers, cell_of, is_on_board
+from trap_tube_jax.geometry import bar_cells, bar_covers, cell_of
 from trap_tube_jax.layouts import LayoutTables, layout_tables
 from trap_tube_jax.objects import (
     AGENT,
@@ -241,9 +241,8 @@ def symbolic(key: jax.Array, state: State) -> State:
     new tool starts at the object's top-left cell, has as many cells, and is horizontal if the
     first two in reading order share a row. The object takes the old tool's cells.
 
-    On custom boards, the state stays as it is if the object cannot be a tool (it has no
-    cells, more than four, or its bar would leave the board), or if the tool covers agent or
-    food, which would then stand on the object.
+    On custom boards, the state stays as it is if the object is not a bar of one to four cells, or
+    if the tool covers agent or food, which would then stand on the object.
     Source: environment.md, "Symbolic".
 
     Args:
@@ -288,8 +287,8 @@ def swap_with_tool(state: State, code: jax.Array) -> State:
 
     covers = functools.partial(bar_covers, state.tool, state.tool_extent)
     is_clear = ~covers(state.agent) & ~covers(state.food)
-    fits = is_on_board(corner + extent - 1)
-    swaps = (length >= 1) & (length <= MAX_TOOL_LENGTH) & fits & is_clear
+    is_bar = jnp.all(bar_cells(corner, extent).reshape(-1) == is_object)
+    swaps = (length >= 1) & (length <= MAX_TOOL_LENGTH) & is_bar & is_clear
     old_tool = bar_cells(state.tool, state.tool_extent)
     board = jnp.where(state.board == code, jnp.uint8(GROUND), state.board)
     board = jnp.where(old_tool, code, board)

@@ -85,7 +85,8 @@ class Learner:
     """The parts of training as pure functions of arrays; holds no parameters.
 
     `init` and `iterate` are all that training needs: jit `iterate`, and vmap both over seeds. A
-    learner is a pytree without leaves, so it can be an argument of a jitted function.
+    learner is a pytree without leaves, so it can be an argument of a jitted function. To change a
+    setting, build another learner: replacing `config` alone keeps optimizer and network.
 
     Attributes:
       config: settings.

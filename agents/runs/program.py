@@ -24,7 +24,6 @@ Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
 Metrics = dict[str, np.ndarray]
 Tree = TypeVar("Tree")
 
-FINE_TUNING = zlib.crc32(b"fine-tuning")  # unlike a small number, no key of a split
 # The settings that decide the shapes of a policy network.
 NETWORK = (
     "num_features",
@@ -90,12 +89,12 @@ class Program:
         key = jax.random.key(seed)
         if start is None:
             return self._init(key)
-        # Even with the same seed, fine-tuning draws other tasks than the first training.
-        state = self._init(jax.random.fold_in(key, FINE_TUNING))
+        arrays = to_arrays(start.params)
+        # Even with the same seed, fine-tuning draws other tasks than the training of `start`.
+        checksum = zlib.crc32(b"".join(array.tobytes() for array in arrays.values()))
+        state = self._init(jax.random.fold_in(key, np.uint32(checksum)))
         try:
-            params = from_arrays(
-                to_arrays(start.params), {part: state.params[part] for part in PARTS}
-            )
+            params = from_arrays(arrays, {part: state.params[part] for part in PARTS})
         except ValueError as error:
             old, new = start.config.to_dict(), self.config.to_dict()
             changed = [f"{x}={old[x]}, not {new[x]}" for x in NETWORK if old[x] != new[x]]

@@ -130,8 +130,8 @@ class RunOptions(DeviceOptions):
 
     Attributes:
       checkpoint_every: iterations between checkpoints.
-      evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation
-        selects the parameters that the run reports.
+      evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation,
+        of equal ones the first, selects the parameters that the run reports.
       sets: sets to evaluate on, by default the paper's eight and the training set.
       test_tasks: test tasks per set, by default `eval_episodes`.
       report: writes curves, page and GIF at the end.

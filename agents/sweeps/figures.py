@@ -1,5 +1,6 @@
 """Figures of a grid's results, after the paper's figures of experiments 1 and 2."""
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from trap_tube_jax.scoring.tasks import label
 DPI = 150
 UNITS = {"transitions": "environment steps", "episodes": "episodes"}
 MAX_RANGES = 3  # of seeds that a panel can show
+LOOKS = [{"color": color, "linestyle": style} for style in ("-", "--", ":") for color in COLORS]
 
 
 def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) -> list[Path]:
@@ -22,15 +24,14 @@ def save(root: Path, results: Table, curves: Table, about: Mapping[str, Any]) ->
     """
     tested = tables.reported(results)
     compared = tables.differences(tested)
-    has_few = curves["algorithm"].nunique() <= len(COLORS)
     drawn = []
     for name, is_drawn, make in (
-        ("curves.png", has_few, lambda: draw_curves(results, curves, about)),
+        ("curves.png", True, lambda: draw_curves(results, curves, about)),
         ("success.png", len(tested) > 0, lambda: draw_success(tested, about)),
         ("differences.png", len(compared) > 0, lambda: draw_differences(compared, about)),
     ):
         path = root / name
-        path.unlink(missing_ok=True)  # it may be of an earlier, smaller grid
+        path.unlink(missing_ok=True)  # it may be of an earlier grid
         if is_drawn:
             with drawing(path):
                 write_bytes(path, to_png(make(), DPI))
@@ -60,10 +61,10 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
     has_ranges = len(names) <= MAX_RANGES
     shown = set()
     for axis, rows in zip(axes, panels.values(), strict=True):
-        for color, name in zip(COLORS, names, strict=False):
+        for name, look in zip(names, itertools.cycle(LOOKS), strict=False):
             curves_of_name = rows[rows["algorithm"] == name]
             if len(curves_of_name):
-                shown.add(_draw_seeds(axis, curves_of_name, color, name, has_ranges))
+                shown.add(_draw_seeds(axis, curves_of_name, look, name, has_ranges))
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
         axis.set_xlabel(f"{UNITS[unit]}, millions")
@@ -121,7 +122,7 @@ def draw_differences(compared: Table, about: Mapping[str, Any]) -> Any:
     return figure
 
 
-def _draw_seeds(axis: Any, rows: Table, color: str, name: str, has_range: bool) -> str:
+def _draw_seeds(axis: Any, rows: Table, look: dict[str, str], name: str, has_range: bool) -> str:
     """Plots the mean of seeds that end at the same iteration, else a line per seed.
 
     `has_range` adds their range. Returns a description of the lines.
@@ -131,15 +132,14 @@ def _draw_seeds(axis: Any, rows: Table, color: str, name: str, has_range: bool) 
     if values.shape[1] > 1 and bool(values.iloc[-1].notna().all()):
         together = values.dropna()
         x = progress.loc[together.index].mean(axis=1)
-        axis.plot(x, together.mean(axis=1), color=color, label=name)
+        axis.plot(x, together.mean(axis=1), label=name, **look)
         if not has_range:
             return "mean of seeds"
-        axis.fill_between(x, together.min(axis=1), together.max(axis=1), color=color, alpha=0.1)
+        low, high = together.min(axis=1), together.max(axis=1)
+        axis.fill_between(x, low, high, color=look["color"], alpha=0.1)
         return "mean and range of seeds"
     for count, seed in enumerate(values):
         curve = values[seed].dropna()
         name_once = "" if count else name
-        axis.plot(
-            progress.loc[curve.index, seed], curve, color=color, label=name_once, linewidth=1.2
-        )
+        axis.plot(progress.loc[curve.index, seed], curve, label=name_once, linewidth=1.2, **look)
     return "a line per seed"

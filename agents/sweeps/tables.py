@@ -32,7 +32,8 @@ NOTE = (
     "Means over seeds with 95 % intervals (Student's t); the paper's are ± one standard deviation. "
     "A layout counts as solved if more than half of its draws are solved. Differences have 95 % "
     "intervals of Welch's t-test, corrected by Holm's method for the comparisons in a row, and "
-    "none where scores do not vary; * marks p < 0.05."
+    "none where scores do not vary; * marks p < 0.05. The mean counts the sets that all columns "
+    "share."
 )
 MEAN = "mean without base"  # over the task sets of all algorithms, each counting the same
 ROUNDING = 1e-9  # percent, a spread of means that rounding explains

@@ -69,7 +69,7 @@ def test_killed_runs_continue_to_the_same_bits(whole, tmp_path):
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert 2 <= final_state(path)[0] < ITERATIONS, "killed in training"
-    assert "seed 0, iteration" in run("agents.evaluate", path, "--sets", "base")
+    assert f"{path}, iteration" in run("agents.evaluate", path, "--sets", "base")
     run("agents.train", "--resume", path, "--checkpoint-every", 1)
     assert final_state(path) == final_state(whole[0])
     assert untimed(path) == untimed(whole[0])
@@ -147,8 +147,10 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
     output = run("agents.evaluate", *arguments, *files, PYTHONIOENCODING="ascii")
     with (tmp_path / "new/x.csv").open() as file:
         rows = list(csv.DictReader(file))
-    found = [(row["iteration"], row["purpose"], row["task_set"], row["tasks"]) for row in rows]
-    assert found == [("30", "confirmation", "base", "1"), ("30", "confirmation", "st", "3")]
+    columns = ("policy", "iteration", "purpose", "task_set", "tasks")
+    found = [tuple(row[name] for name in columns) for row in rows]
+    start = (str(whole[0]), "30", "confirmation")
+    assert found == [(*start, "base", "1"), (*start, "st", "3")]
     assert "{St}" in output
     assert str(tmp_path / "new/x.csv") in output
 

@@ -240,8 +240,8 @@ def test_symbolic_keeps_the_observation(drawn):
     np.testing.assert_array_equal(before, after)
 
 
-def test_symbolic_swaps_no_object_that_cannot_be_a_tool():
-    """On custom boards: objects of no cell or of five, and one whose bar would leave the board."""
+def test_symbolic_swaps_only_bars_of_one_to_four_cells():
+    """On custom boards: not objects of no cell, of five, bent, or in two parts."""
     start = tt.State.from_ascii(
         ["11111......A", "TT..........", *["." * 12] * 8, ".........F..", "..........xx"],
         palette=DISTINCT_PALETTE,
@@ -250,7 +250,11 @@ def test_symbolic_swaps_no_object_that_cannot_be_a_tool():
     bent_trap[10, 11] = spec.TRAP  # three cells now; their bar would end in row 12
     last_cell = np.asarray(start.board).copy()
     last_cell[11, 10] = spec.GROUND  # the trap has only the board's last cell
-    for board, fits in ((np.asarray(start.board), True), (bent_trap, False), (last_cell, True)):
+    parted = np.asarray(start.board).copy()
+    parted[11, 10:] = spec.GROUND, spec.TRAP
+    parted[9, 10] = spec.TRAP
+    boards = ((np.asarray(start.board), True), (bent_trap, False), (parted, False))
+    for board, fits in (*boards, (last_cell, True)):
         state = start.replace(board=jnp.asarray(board))
         outcomes = [_looks(state)]
         if fits:

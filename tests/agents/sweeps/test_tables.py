@@ -277,14 +277,16 @@ def test_an_algorithm_without_an_evaluation_has_no_line_there():
     assert figure.get_supylabel() == "solved, %: mean and range of seeds"
 
 
-def test_many_algorithms_are_points_and_bars_but_not_lines(tmp_path):
+def test_many_algorithms_are_told_apart(tmp_path):
     names = [f"a{i}" for i in range(8)]
     tested = pd.DataFrame([row for name in names for row in rows(name, [3, 4])])
     many = pd.concat(map(curves, names))
-    (tmp_path / "curves.png").touch()  # of a smaller grid
-    path, other = figures.save(tmp_path, tested, many, ABOUT)
-    assert sorted(tmp_path.iterdir()) == [other, path]
-    assert (path.name, other.name) == ("success.png", "differences.png")
+    drawn = figures.save(tmp_path, tested, many, ABOUT)
+    assert [path.name for path in drawn] == ["curves.png", "success.png", "differences.png"]
+    path = drawn[1]
+    lines = figures.draw_curves(tested, many, ABOUT).axes[0].lines
+    looks = {line.get_label(): (line.get_color(), line.get_linestyle()) for line in lines}
+    assert len(set(looks.values()) - {looks["a7"]}) == 7
     with Image.open(path) as picture:
         assert picture.width == 8.3 * figures.DPI
     axis = figures.draw_success(tables.reported(tested), ABOUT).axes[0]
