@@ -184,6 +184,7 @@ def without_an_ingredient() -> list[str]:
     """Returns the rows of the table of ingredients."""
     names = {
         "replay": "no-replay",
+        "[predicting motion](motion.md)": "no-motion",
         "`effects`, RND instead": "rnd",
         "[memory](profiles.md#memory)": "no-memory",
         "turning the board": "unturned",
@@ -233,6 +234,8 @@ def predicted_motion() -> list[str]:
         f"The difference, {difference} points [{low}, {high}], may be chance (Welch's t-test, "
         f"p = {test.pvalue:.2f})"
     )
+    gain = ingredients("p")[2]["no-motion"].split()[0].lstrip("−")
+    rows.append(f"After 8 million steps, [it gains {gain} points]")
     return rows
 
 
