@@ -1,27 +1,21 @@
 """Environment steps per second: `python -m benchmarks.env_throughput`.
 
-Environments take random actions and reset automatically, each time with a new task. In every step,
-a pattern consumes the observations, as a user's program would.
+Environments take random actions and reset automatically, each time with a new task. Every step
+folds every byte of the observations into an array of their size, so that all of them are made.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from rich.table import Table
 
 import trap_tube_jax as tt
 from benchmarks import harness
 from trap_tube_jax.checks import check_integer
 from trap_tube_jax.objects import NUM_DIRECTIONS
-
-DENSE_UNITS = 64
-ONE_HOT_LEVELS = 8
-
-PatternName = Literal["bytes", "sum", "flat-sum", "mean", "dense", "one-hot", "last"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,14 +54,9 @@ class Options(StepOptions):
     """Measures environment steps per second under random actions.
 
     Attributes:
-      patterns: uses of the observations: `bytes` folds every byte into an array of their size,
-        `sum` adds them in int32, `flat-sum` flattens them first, `mean` averages in float32,
-        `dense` casts to float32 and applies a layer of 64 units, `one-hot` counts the values of a
-        flattened one-hot of 8 levels, `last` keeps the last observation alone.
       plain: measures `jax.vmap` of an `AutoReset` instead of a `VectorEnvironment`.
     """
 
-    patterns: tuple[PatternName, ...] = ("bytes",)
     plain: bool = False
 
 
@@ -92,20 +81,11 @@ class Subject:
 
 
 @dataclasses.dataclass(frozen=True)
-class Pattern:
-    """A use of observations [B, ...] in every step: total <- join(total, read(observations))."""
-
-    read: Callable[[jax.Array], jax.Array]
-    join: Callable[[jax.Array, jax.Array], jax.Array] = jnp.add
-
-
-@dataclasses.dataclass(frozen=True)
 class Throughput:
     """Speed of a subject.
 
     Attributes:
       name: name of the subject.
-      pattern: name of the pattern.
       num_envs: B, environments on all devices together.
       num_steps: steps of each environment in a call.
       devices: number of devices.
@@ -115,7 +95,6 @@ class Throughput:
     """
 
     name: str
-    pattern: str
     num_envs: int
     num_steps: int
     devices: int
@@ -131,39 +110,10 @@ class Throughput:
 
 def bits(observations: jax.Array) -> jax.Array:
     """Returns observations [B, ...] as unsigned integers [B, K] of the same width."""
-    rows = flat(observations)
+    rows = observations.reshape(len(observations), -1)
     if rows.dtype == jnp.bool_:
         return rows.astype(jnp.uint8)
     return jax.lax.bitcast_convert_type(rows, jnp.dtype(f"uint{8 * rows.dtype.itemsize}"))
-
-
-def flat(observations: jax.Array) -> jax.Array:
-    """Returns observations [B, ...] as rows [B, K]."""
-    return observations.reshape(len(observations), -1)
-
-
-def dense(observations: jax.Array) -> jax.Array:
-    """Casts to float32 and applies a layer: f32[B, DENSE_UNITS]."""
-    rows = flat(observations).astype(jnp.float32)
-    kernel = np.random.default_rng(0).standard_normal((rows.shape[1], DENSE_UNITS), np.float32)
-    return rows @ kernel
-
-
-def one_hot_counts(observations: jax.Array) -> jax.Array:
-    """Counts the entries of a flattened one-hot of the bytes' top 3 bits: f32[8 K]."""
-    levels = flat(observations) // (256 // ONE_HOT_LEVELS)
-    return jnp.sum(flat(jax.nn.one_hot(levels, ONE_HOT_LEVELS, dtype=jnp.float32)), axis=0)
-
-
-PATTERNS: dict[PatternName, Pattern] = {
-    "bytes": Pattern(bits, jnp.bitwise_xor),
-    "sum": Pattern(lambda observations: observations.astype(jnp.int32).sum()),
-    "flat-sum": Pattern(lambda observations: flat(observations).astype(jnp.int32).sum()),
-    "mean": Pattern(lambda observations: observations.astype(jnp.float32).mean()),
-    "dense": Pattern(dense),
-    "one-hot": Pattern(one_hot_counts),
-    "last": Pattern(lambda observations: observations, lambda _, last: last),
-}
 
 
 def task_set_subject(task_set: str, *, plain: bool = False) -> Subject:
@@ -185,27 +135,24 @@ def sample_actions(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return jax.random.randint(key, (*shape, 2), 0, NUM_DIRECTIONS)
 
 
-def measure_throughput(
-    subject: Subject, num_envs: int, options: StepOptions, pattern: PatternName = "bytes"
-) -> Throughput:
+def measure_throughput(subject: Subject, num_envs: int, options: StepOptions) -> Throughput:
     """Steps a subject by random actions, which are drawn before the clock starts.
 
     Each call continues from the states of the one before. Devices step their shares of the
     environments and exchange nothing.
     """
     devices = options.devices
-    use = PATTERNS[pattern]
 
     def reset(keys: jax.Array) -> Any:
         state, timestep = subject.reset(keys)
         observations = subject.observe(timestep)
-        return (state, jnp.zeros_like(use.read(observations))), observations
+        return (state, jnp.zeros_like(bits(observations))), observations
 
     def run(carry: Any, actions: jax.Array) -> Any:
         def step(carry: Any, actions: jax.Array) -> tuple[Any, None]:
-            state, total = carry
+            state, folded = carry
             state, timestep = subject.step(state, actions)
-            return (state, use.join(total, use.read(subject.observe(timestep)))), None
+            return (state, folded ^ bits(subject.observe(timestep))), None
 
         return jax.lax.scan(step, carry, actions)[0]
 
@@ -222,7 +169,6 @@ def measure_throughput(
     timing = harness.Timing.of(compile_s, calls[1:])
     return Throughput(
         name=subject.name,
-        pattern=pattern,
         num_envs=num_envs,
         num_steps=options.num_steps,
         devices=devices,
@@ -281,17 +227,15 @@ def main(options: Options) -> list[Throughput]:
     bandwidth = copy_bandwidth()
     console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
     results = [
-        measure_throughput(subject, num_envs, options, pattern)
+        measure_throughput(subject, num_envs, options)
         for subject in subjects
         for num_envs in options.num_envs
-        for pattern in options.patterns
     ]
-    table = Table("set", "environments", "pattern", "M steps/s", "of copy", "compile, s")
+    table = Table("set", "environments", "M steps/s", "of copy", "compile, s")
     for result in results:
         table.add_row(
             result.name,
             f"{result.num_envs:,}",
-            result.pattern,
             f"{result.steps_per_s / 1e6:.3f}",
             f"{result.bytes_per_s / bandwidth:.0%}",
             f"{result.timing.compile_s:.1f}",

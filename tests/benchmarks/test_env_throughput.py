@@ -5,11 +5,10 @@ import itertools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from benchmarks import env_throughput, harness, peers
-from benchmarks.env_throughput import PATTERNS, StepOptions, Subject
+from benchmarks.env_throughput import StepOptions, Subject
 from trap_tube_jax import VectorState
 
 
@@ -28,18 +27,16 @@ def counter(name, *, plain=False):
     )
 
 
-def test_throughput_measures_every_set_batch_and_pattern(timed, monkeypatch):
+def test_throughput_measures_every_set_and_batch(timed, monkeypatch):
     monkeypatch.setattr(env_throughput, "copy_bandwidth", lambda: 1e9)
     monkeypatch.setattr(env_throughput, "task_set_subject", counter)
-    options = env_throughput.Options(
-        sets=("base", "sy"), num_envs=(2, 4), num_steps=3, repeats=3, patterns=("sum", "last")
-    )
+    options = env_throughput.Options(sets=("base", "sy"), num_envs=(2, 4), num_steps=3, repeats=3)
     results = env_throughput.main(options)
-    measured = [(x.name, x.num_envs, x.pattern) for x in results]
-    assert measured == list(itertools.product(("base", "sy"), (2, 4), ("sum", "last")))
+    measured = [(x.name, x.num_envs) for x in results]
+    assert measured == list(itertools.product(("base", "sy"), (2, 4)))
     assert {x.observation_bytes for x in results} == {3 * 4}
     assert {x.timing for x in results} == {harness.Timing(7, 2, 1, 6)}
-    assert results[2].steps_per_s == 4 * 3 / 2
+    assert results[1].steps_per_s == 4 * 3 / 2
 
 
 def test_throughput_folds_every_observation(timed):
@@ -58,19 +55,6 @@ def test_a_task_set_steps_by_the_vector_environment_or_by_vmap(plain):
     state, timestep = jax.eval_shape(subject.step, state, actions)
     assert isinstance(state, VectorState) != plain
     assert subject.observe(timestep).shape == (2, 12, 12, 3)
-
-
-def test_patterns_read_observations_as_their_names_say():
-    observations = jax.random.bits(jax.random.key(0), (4, 12, 12, 3), jnp.uint8)
-    values = np.asarray(observations, np.int64)
-    read = {name: np.asarray(pattern.read(observations)) for name, pattern in PATTERNS.items()}
-    assert read["bytes"].tolist() == values.reshape(4, -1).tolist()
-    assert read["sum"] == read["flat-sum"] == values.sum()
-    np.testing.assert_allclose(read["mean"], values.mean(), rtol=1e-5)
-    assert read["dense"].shape == (4, env_throughput.DENSE_UNITS)
-    counts = [np.sum(values // 32 == level) for level in range(8)]
-    assert read["one-hot"].reshape(-1, 8).sum(axis=0).tolist() == counts
-    assert PATTERNS["last"].join(jnp.zeros_like(observations), observations) is observations
 
 
 def test_peers_prints_steps_and_skips_libraries_that_fail(timed, capsys, monkeypatch):
