@@ -42,8 +42,10 @@ def means(percent: Any) -> str:
     """Returns means over seeds, with intervals except of sets of few layouts."""
     few = {"st", "sy", "stsy"}
     texts = [
-        cells([own.mean()]) if name in few else tables.mean_text(own.to_numpy(), ".1f", high=100)
-        for name, own in percent.items()
+        cells([seeds.mean()])
+        if name in few
+        else tables.mean_text(seeds.to_numpy(), ".1f", high=100)
+        for name, seeds in percent.items()
     ]
     return " | ".join(texts)
 
@@ -310,15 +312,20 @@ def on_the_leaderboard() -> list[str]:
         (fast.mean(), steps("fast_base").mean()),
         (fast.loc[7], steps("fast_base")[7]),
         (percent_solved("exp2_best").drop(columns=tables.MEAN).mean(), steps("exp2_best").mean()),
-        *(
-            (percent_of("colors/test.csv", policies[0]), steps_with_colors(*policies))
-            for policies in (("seed 330, fine-tuned", "seed 330"), ("colors-p+psy+pstsy",))
-        ),
     ]
+    colors = {
+        "p+p+pst+pstsy": ("seed 330, fine-tuned", "seed 330"),
+        "p+psy+pstsy": ("colors-p+psy+pstsy",),
+    }
     return [
         *published,
         bound_of_plans(),
         *(f"| {cells(percent)} | {taken:,.0f} |" for percent, taken in rows),
+        *(
+            f"| {sets} | {cells(percent_of('colors/test.csv', policies[0]))} | "
+            f"{steps_with_colors(*policies):,.0f} |"
+            for sets, policies in colors.items()
+        ),
         f"| {cells(percent_of('leaderboard/icm-base.csv'))} |",
         f"| {cells(random_actions())} |",
     ]
@@ -353,7 +360,7 @@ def on_best_preset_md() -> list[str]:
     """Returns the seeds of `best`, and what its ingredients give."""
     table = percent_solved("exp2_best").droplevel(0).drop(columns=["base", tables.MEAN])
     return [
-        *(f"| {seed} | {cells(own)} |" for seed, own in table.iterrows()),
+        *(f"| {seed} | {cells(row)} |" for seed, row in table.iterrows()),
         f"| mean | {cells(table.mean())} |",
         *without_an_ingredient(),
         steps_of_replay(),
@@ -369,7 +376,7 @@ def on_curiosities_md() -> list[str]:
     rnd = -rnd[["difference", "high", "low"]]
     percent = percent_solved("exp2_curiosities").drop(columns="base").groupby("algorithm")
     return [
-        *(f"| `{name}` | {means(own)} |" for name, own in percent),
+        *(f"| `{name}` | {means(seeds)} |" for name, seeds in percent),
         "by {:.1f} points on {{P}} [{:.1f}, {:.1f}]".format(*rnd),
     ]
 
