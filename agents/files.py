@@ -1,36 +1,15 @@
-"""Files of runs: read only where they are regular and as expected, written whole or not at all."""
+"""Files of runs: written whole or not at all; errors name them."""
 
 import contextlib
-import dataclasses
-import errno
 import json
 import os
-import reprlib
-import types
-import typing
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 import filelock
 
-from trap_tube_jax.checks import is_printable
 from trap_tube_jax.command_line import one_line
-
-Plain = bool | int | float | str | None
-
-
-def is_file(path: Path) -> bool:
-    """Returns whether a path names a regular file; False if it names nothing.
-
-    Raises:
-      ValueError: it names something else, such as a folder, a FIFO or a dangling link.
-    """
-    if path.is_file():
-        return True
-    if os.path.lexists(path):
-        raise ValueError(f"{path} is not a regular file")
-    return False
 
 
 def check_folder(path: Path) -> None:
@@ -40,12 +19,6 @@ def check_folder(path: Path) -> None:
         raise ValueError(f"{existing} is not a folder; give another path")
 
 
-def check_file(path: Path) -> None:
-    """Raises FileNotFoundError or ValueError unless a path names a regular file."""
-    if not is_file(path):
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
-
-
 @contextlib.contextmanager
 def naming_file(path: Path) -> Iterator[None]:
     """Turns what a parser raises about a file's content into a ValueError with the file's path."""
@@ -53,100 +26,21 @@ def naming_file(path: Path) -> Iterator[None]:
         yield
     except (OSError, MemoryError):
         raise
-    except Exception as error:  # parsers raise many kinds, also RecursionError
+    except KeyError as error:
+        raise ValueError(f"{path} lacks {error}") from error
+    except Exception as error:  # parsers raise many kinds
         raise ValueError(f"{path} cannot be read: {one_line(error)}") from error
 
 
-def read_text(path: Path) -> str:
-    """Reads a file of UTF-8.
+def read_json(path: Path) -> Any:
+    """Reads a JSON file.
 
     Raises:
-      ValueError: the file is not regular or not UTF-8.
+      ValueError: the file is not JSON; the message names it.
       OSError: the file is missing or cannot be opened.
     """
-    check_file(path)
     with naming_file(path):
-        return path.read_bytes().decode()
-
-
-def read_json(path: Path, kind: Any = Any) -> Any:
-    """Reads a JSON file whose value is of an annotated type; see `parse_json`.
-
-    Raises:
-      ValueError: the file is damaged; the message names it.
-      OSError: the file is missing or cannot be opened.
-    """
-    text = read_text(path)
-    with naming_file(path):
-        return parse_json(text, kind)
-
-
-def parse_json(text: str, kind: Any) -> Any:
-    """Parses JSON, and checks that the value is of an annotated type.
-
-    Strings must be printable, because terminals show them. Keys of a TypedDict or a dataclass must
-    be known, and the required keys of a TypedDict present.
-
-    Args:
-      text: the JSON.
-      kind: a plain type, a union, `list[X]`, `tuple[X, ...]`, `dict[str, X]`, a TypedDict, or a
-        dataclass.
-
-    Raises:
-      ValueError: the text is not JSON, or its value is of another type.
-    """
-    value = json.loads(text)
-    _check_kind(value, kind, "it")
-    return value
-
-
-def _check_kind(value: Any, kind: Any, name: str) -> None:
-    """Raises ValueError, which names the part, unless a JSON value is of a type."""
-    form = get_origin(kind) or kind
-    arguments = get_args(kind)
-    if form is Any:
-        return
-    if form in (Union, types.UnionType):
-        _check_union(value, arguments, name)
-    elif form in (list, tuple):
-        _check_is(value, list, name)
-        for index, part in enumerate(value):
-            _check_kind(part, arguments[0], f"{name}[{index}]")
-    elif form is dict:
-        _check_is(value, dict, name)
-        for key, part in value.items():
-            _check_is(key, str, f"a key of {name}")
-            _check_kind(part, arguments[1], key)
-    elif typing.is_typeddict(form) or dataclasses.is_dataclass(form):
-        _check_is(value, dict, name)
-        _check_keys(value, form, name)
-        kinds = get_type_hints(form)
-        for key, part in value.items():
-            _check_kind(part, kinds[key], key)
-    else:
-        _check_is(value, form, name)
-
-
-def _check_union(value: Any, kinds: tuple[Any, ...], name: str) -> None:
-    for kind in kinds:
-        with contextlib.suppress(ValueError):
-            return _check_kind(value, kind, name)
-    wanted = " or ".join(getattr(kind, "__name__", str(kind)) for kind in kinds)
-    raise ValueError(f"{name} must be {wanted}, got {reprlib.repr(value)}")
-
-
-def _check_is(value: Any, kind: type, name: str) -> None:
-    if type(value) not in ((int, float) if kind is float else (kind,)):
-        raise ValueError(f"{name} must be {kind.__name__}, got {reprlib.repr(value)}")
-    if kind is str and not is_printable(value):
-        raise ValueError(f"{name} must be printable, got {reprlib.repr(value)}")
-
-
-def _check_keys(value: dict[str, Any], form: Any, name: str) -> None:
-    for key in sorted(getattr(form, "__required_keys__", set()) - value.keys()):
-        raise ValueError(f"{name} lacks {key!r}")
-    for key in sorted(value.keys() - get_type_hints(form).keys()):
-        raise ValueError(f"{name} has an unknown {reprlib.repr(key)}")
+        return json.loads(path.read_text(encoding="utf-8"))
 
 
 class BusyError(ValueError):
@@ -162,13 +56,9 @@ def lock_folder(path: Path, wait: float = 1) -> Iterator[None]:
 
     Raises:
       BusyError: another process writes to the folder.
-      ValueError: the folder holds a link.
       OSError: the folder cannot be created or locked.
     """
     path.mkdir(parents=True, exist_ok=True)
-    for entry in path.iterdir():
-        if entry.is_symlink():  # writing would change a file elsewhere
-            raise ValueError(f"{entry} is a link; replace it by a copy of what it names")
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(filelock.FileLock(path / ".lock", timeout=wait))
@@ -182,12 +72,8 @@ def lock_folder(path: Path, wait: float = 1) -> Iterator[None]:
 
 @contextlib.contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
-    """Yields a path to write to; its file replaces `path` at the end of the block.
-
-    A link at `path` is replaced, and the file that it names stays as it is.
-    """
+    """Yields a path to write to; its file replaces `path` at the end of the block."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.unlink(missing_ok=True)  # of a killed process of this number, or a link
     try:
         yield draft
         draft.replace(path)
@@ -213,10 +99,10 @@ def append_text(path: Path, text: str, head: str) -> None:
     Appends all lines or, if the disk is full, none.
 
     Raises:
-      ValueError: the file is not regular, or begins with another line.
+      ValueError: the file begins with another line.
       OSError: the file cannot be written.
     """
-    size = path.stat().st_size if is_file(path) else 0
+    size = path.stat().st_size if path.is_file() else 0
     try:
         with path.open("a+", encoding="utf-8", newline="") as file:
             file.seek(0)

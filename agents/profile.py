@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.command_line import option, parse
-from agents.files import check_folder, is_file, read_json, write_bytes, write_json
+from agents.files import check_folder, read_json, write_bytes, write_json
 from agents.profiles import plots
 from agents.profiles.measure import (
     Table,
@@ -92,7 +92,7 @@ def _check_free(folder: Path, iterations: dict[str, int]) -> None:
     check_folder(folder)
     check_kind(folder, "a profile", "--output")
     origin = folder / PROVENANCE_FILE
-    if not is_file(origin):
+    if not origin.is_file():
         for path in (folder / name for name in (TABLE, *FIGURES)):
             if path.exists():
                 raise ValueError(f"{path} is not a profile's; give another --output")

@@ -6,7 +6,6 @@ import inspect
 import os
 import re
 import reprlib
-import unicodedata
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -20,7 +19,6 @@ Result = TypeVar("Result")
 
 MAX_SEED = 2**32 - 1  # `jax.random.key` keeps the low 32 bits only
 MAX_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
-JOINERS = "\u200c\u200d"  # within words of some scripts, and within emoji
 
 
 def check_integer(name: str, value: Any, minimum: int = 1, maximum: int | None = None) -> int:
@@ -42,29 +40,12 @@ def expand(path: str | os.PathLike[str]) -> Path:
     Shells expand `--out ~/x`, but not `--out=~/x`; Python expands neither.
 
     Raises:
-      ValueError: there is no such home folder, or a terminal would take the path for a command.
+      ValueError: there is no such home folder.
     """
-    check_printable(path)
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
         raise ValueError(f"{path} cannot be expanded: {error}") from error
-
-
-def check_printable(path: str | os.PathLike[str]) -> None:
-    """Raises ValueError for a path that a terminal would take for a command."""
-    if not is_printable(str(path)):
-        raise ValueError(f"paths must be printable, got {str(path)!r}; rename it")
-
-
-def is_printable(text: str) -> bool:
-    """Returns whether a terminal shows a text as it is, on one line.
-
-    Unlike `str.isprintable`, allows every kind of space, and joiners.
-    """
-    return all(
-        char.isprintable() or char in JOINERS or unicodedata.category(char) == "Zs" for char in text
-    )
 
 
 def integer_array(name: str, value: Any) -> jax.Array | np.ndarray:
@@ -98,16 +79,6 @@ def check_registered_name(kind: str, name: Any) -> None:
     """
     if not isinstance(name, str) or not re.fullmatch(r"[\w.-]+", name, re.ASCII):
         raise ValueError(f"{kind} names consist of letters, digits, '_', '.' and '-', got {name!r}")
-
-
-def check_stored_name(kind: str, name: Any) -> None:
-    """Checks a name that a file holds: a registered name, or task sets of a mixture joined by "+".
-
-    Raises:
-      ValueError: see `check_registered_name`.
-    """
-    for part in name.split("+") if isinstance(name, str) else [name]:
-        check_registered_name(kind, part)
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from trap_tube_jax.checks import expand, is_printable
+from trap_tube_jax.checks import expand
 from trap_tube_jax.interruptions import close_stdout
 
 CLOSED_PIPE = 128 + 13  # as by SIGPIPE, which Windows lacks
@@ -21,9 +21,8 @@ def prepare_terminal() -> None:
 
 
 def one_line(error: Exception) -> str:
-    """Returns the message of an error as one line that any terminal can show."""
-    text = " ".join(str(error).split())
-    return "".join(char if is_printable(char) else ascii(char)[1:-1] for char in text)
+    """Returns the message of an error as one line."""
+    return " ".join(str(error).split())
 
 
 def announce(work: str) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from agents.arrays import SUFFIX, Arrays, read_arrays, to_arrays, write_arrays
-from agents.files import Plain, naming_file
 
 KEPT = 3  # the newest checkpoints
 CANONICAL = re.compile("0|[1-9][0-9]*")  # names of files; others are somebody else's
@@ -54,13 +53,9 @@ def load(folder: Path, iteration: int | None = None) -> tuple[Arrays, dict[str, 
         raise ValueError(f"{folder} holds no checkpoint {chosen}; allowed: {allowed}")
     path = _file(folder, chosen)
     try:
-        arrays, record = read_arrays(path, dict[str, Plain])
-        with naming_file(path):
-            if record.get("iteration") != chosen:
-                raise ValueError(f"its iteration is {record.get('iteration')!r}")
+        return read_arrays(path)
     except ValueError as error:
         raise ValueError(f"{error}; delete it to use the checkpoint before it") from error
-    return arrays, record
 
 
 def _file(folder: Path, iteration: int) -> Path:

@@ -3,12 +3,12 @@
 import dataclasses
 import difflib
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
-from agents.files import Plain, check_folder, is_file, naming_file, read_json, write_json
-from agents.runs.run import DeviceOptions, Run, RunOptions, check_algorithm
+from agents.files import check_folder, naming_file, read_json, write_json
+from agents.runs.run import Run, RunOptions
 from trap_tube_jax._version import __version__
-from trap_tube_jax.checks import check_seed, check_stored_name, expand, is_printable
+from trap_tube_jax.checks import expand
 from trap_tube_jax.imports import import_modules
 
 CONFIG_FILE = "config.json"
@@ -21,20 +21,7 @@ KINDS = {  # of results, by the file that every folder of the kind holds
 }
 RUNS = Path("runs")  # where agents.train puts them
 MAX_LISTED = 10
-
-Settings = dict[str, Plain | list[int | float]]
-
-
-class StoredRun(TypedDict):
-    """The content of config.json: a run, its options and the version that wrote it."""
-
-    version: NotRequired[str]
-    config: Settings
-    seed: int
-    algorithm: str
-    imports: list[str]
-    finetune: NotRequired[str | None]
-    options: RunOptions
+STORED = ("config", "seed", "algorithm", "imports", "options")  # what config.json must hold
 
 
 class RunFolder:
@@ -76,26 +63,22 @@ class RunFolder:
         write_json(self.config, {"version": __version__, **values})
 
     def stored(self) -> dict[str, Any]:
-        """Reads config.json as a `StoredRun`, without looking up the names in its settings.
+        """Reads config.json: a run, its options and the version that wrote it, as plain values.
+
+        Looks up no name in the settings.
 
         Raises:
           ValueError: there is no run, or the file is damaged.
         """
-        if not is_file(self.config):
+        if not self.config.is_file():
             raise ValueError(f"{self.path} holds no run; {runs_near(self.path)}")
-        values = read_json(self.config, StoredRun)
+        values = read_json(self.config)
         with naming_file(self.config):
-            check_seed(values["seed"])
-            check_algorithm(values["algorithm"])
-            DeviceOptions(values["options"].get("devices"))
-            for setting, value in values["config"].items():
-                if isinstance(value, str):
-                    check_stored_name(setting, value)
-        return values
+            return {**values, **{name: values[name] for name in STORED}}
 
     def devices(self) -> int | None:
         """Returns the stored option, None without a run; unlike `read`, needs no modules."""
-        return self.stored()["options"].get("devices") if is_file(self.config) else None
+        return self.stored()["options"].get("devices") if self.config.is_file() else None
 
     def read(self, imports: tuple[str, ...] = ()) -> tuple[Run, RunOptions]:
         """Returns the stored run and its options.
@@ -111,7 +94,7 @@ class RunFolder:
             sets = options.get("sets")
             options["sets"] = None if sets is None else tuple(sets)
             return Run.from_dict(values), RunOptions(**options)
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             missing = [f"--import {name}" for name in values["imports"] if name not in imports]
             hint = f"; it was trained with {' '.join(missing)}" if missing else ""
             raise ValueError(
@@ -132,11 +115,12 @@ def _kind_of(path: Path) -> str | None:
 
 def check_output(path: Path) -> None:
     """Raises ValueError if a file cannot be written, or would replace one of other results."""
-    exists = is_file(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give the path of a file")
     check_folder(path.parent)
     if run := run_of(path):
         raise ValueError(f"{path} is a file of the run {run.path}; give another path")
-    if exists and (kind := _kind_of(path.parent)):
+    if path.exists() and (kind := _kind_of(path.parent)):
         raise ValueError(f"{path} may be a file of {kind}; give another path")
 
 
@@ -161,8 +145,7 @@ def runs_near(path: Path) -> str:
 
 
 def _runs_in(path: Path) -> list[Path]:
-    found = sorted(entry.parent for entry in path.glob(f"*/{CONFIG_FILE}"))
-    return [run for run in found if is_printable(run.name)]
+    return sorted(entry.parent for entry in path.glob(f"*/{CONFIG_FILE}"))
 
 
 def _listed(runs: list[Path]) -> str:
@@ -171,9 +154,9 @@ def _listed(runs: list[Path]) -> str:
 
 
 def check_name(name: str) -> None:
-    """Raises ValueError unless a name is a plain folder name; tables and shells take it as text."""
-    if Path(name).name != name or name[:1] in ("", *".-=+@") or not is_printable(name):
+    """Raises ValueError unless a name is a plain folder name."""
+    if Path(name).name != name or name[:1] in ("", ".", "-") or not name.isprintable():
         raise ValueError(
-            f"name must be a folder's name without a path, got {name!r}; it cannot begin with any "
-            "of .-=+@"
+            f"name must be a folder's name without a path that begins with neither . nor -, got "
+            f"{name!r}"
         )

@@ -1,18 +1,19 @@
 """The history of a run, as its files hold it: checkpoint, rows and best policy."""
 
 from agents.arrays import from_arrays, read_arrays
+from agents.files import naming_file
 from agents.ppo.learner import TrainState
 from agents.runs import checkpoint
 from agents.runs.folder import RunFolder
-from agents.runs.loading import StoredPolicy, read_policy
-from agents.runs.metrics import Row, Table, check_row, is_last, read_rows
+from agents.runs.loading import read_policy
+from agents.runs.metrics import COLUMNS, Row, Table, is_last, read_rows
 from agents.runs.run import Run
 
 
 def restore(folder: RunFolder, shapes: TrainState) -> tuple[TrainState | None, Row | None]:
     """Returns the newest checkpoint's state and row of metrics; None for one that is missing.
 
-    Raises ValueError for a checkpoint of other settings, or without the values of its row.
+    Raises ValueError for a checkpoint of other settings, or of a version with other metrics.
     """
     if not checkpoint.iterations(folder.checkpoints):
         return None, None
@@ -20,8 +21,8 @@ def restore(folder: RunFolder, shapes: TrainState) -> tuple[TrainState | None, R
     done = row["iteration"]
     try:
         state = from_arrays(arrays, shapes)
-        if done:
-            check_row(row)
+        if done and (missing := COLUMNS["metrics.csv"].keys() - row):
+            raise ValueError(f"it has no {', '.join(sorted(missing))}")
     except ValueError as error:
         raise ValueError(
             f"checkpoint {done} in {folder.checkpoints} cannot be continued: {error}"
@@ -90,7 +91,8 @@ def best_iteration(folder: RunFolder) -> int | None:
     """Returns the iteration of the best policy so far; None if there is none."""
     if not folder.best.is_file():
         return None
-    return read_arrays(folder.best, StoredPolicy)[1]["iteration"]
+    with naming_file(folder.best):
+        return read_arrays(folder.best)[1]["iteration"]
 
 
 def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:

@@ -1,7 +1,6 @@
 """Trained policies: files of parameters, runs' folders and the shipped agents."""
 
 from pathlib import Path
-from typing import TypedDict
 
 import jax
 import numpy as np
@@ -10,19 +9,12 @@ from agents import pretrained
 from agents.acting.policy import Policy
 from agents.arrays import SUFFIX, Arrays, from_arrays, read_arrays, to_arrays, write_arrays
 from agents.config import Config
-from agents.files import is_file
+from agents.files import naming_file
 from agents.networks.agent import PARTS, Agent, Params
 from agents.runs import checkpoint
-from agents.runs.folder import RunFolder, Settings, run_of, runs_near
-from trap_tube_jax.checks import check_integer, expand
+from agents.runs.folder import RunFolder, run_of, runs_near
+from trap_tube_jax.checks import expand
 from trap_tube_jax.imports import import_modules
-
-
-class StoredPolicy(TypedDict):
-    """The plain values in a policy's file."""
-
-    config: Settings
-    iteration: int
 
 
 def load(
@@ -54,7 +46,7 @@ def load(
       ('PerceptualStructuralSymbolicTrapTube-v0', 1150)
     """
     folder = RunFolder(source)
-    if is_file(folder.config):
+    if folder.config.is_file():
         return _load_run(folder, iteration, imports).replace(greedy=greedy)
     path = folder.path
     if (run := run_of(path)) and path not in (run.start, run.best):
@@ -62,7 +54,7 @@ def load(
         raise ValueError(f"{source} is in the run {run.path}; give the run{number}")
     if not path.is_file():
         path = pretrained.FILES.get(str(source), path)
-    if path.is_dir() or not is_file(path):
+    if not path.is_file():
         raise ValueError(
             f"{source} is neither a run, a file nor a shipped agent; {runs_near(path)}; "
             f"shipped agents: {', '.join(pretrained.FILES)}"
@@ -85,7 +77,7 @@ def short_name(source: str | Path) -> str:
 def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]) -> Policy:
     run, _ = folder.read(imports)
     name = f"seed {run.seed}"
-    if iteration is None and is_file(folder.best):
+    if iteration is None and folder.best.is_file():
         return read_policy(folder.best).replace(name=name)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)
@@ -123,14 +115,11 @@ def read_policy(path: Path) -> Policy:
       ValueError: the file is damaged, of another kind, or its settings are unknown.
       OSError: the file cannot be opened.
     """
-    arrays, about = read_arrays(path, StoredPolicy)
-    try:
-        iteration = check_integer("iteration", about["iteration"], minimum=0)
+    arrays, about = read_arrays(path)
+    with naming_file(path):
         config = Config.from_dict(about["config"])
         params = _params(config, arrays)
-    except ValueError as error:
-        raise ValueError(f"{path} does not hold a policy of this version: {error}") from error
-    return Policy(path.name.removesuffix(SUFFIX), config, params, iteration)
+        return Policy(path.name.removesuffix(SUFFIX), config, params, about["iteration"])
 
 
 def _params(config: Config, arrays: Arrays) -> Params:

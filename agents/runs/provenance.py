@@ -6,33 +6,16 @@ import pathlib
 import platform
 import re
 import subprocess
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 import jax
 
-from agents.files import is_file, naming_file, read_json, write_json
+from agents.files import read_json, write_json
 
 ROOT = pathlib.Path(__file__).parents[2]
 VERSIONED = ("jax", "jaxlib", "flax", "optax", "numpy")
 # Code that decides results; records and texts may change between two of them.
 CODE = ("agents/*.py", "benchmarks/*.py", "trap_tube_jax/*.py", "pyproject.toml")
-
-
-class Machine(TypedDict):
-    """Hardware, versions and commit, as provenance.json holds them."""
-
-    processor: str
-    cores: int
-    device: str
-    platform: str
-    python: str
-    jax: str
-    jaxlib: str
-    flax: str
-    optax: str
-    numpy: str
-    commit: str | None
-    devices: NotRequired[str]
 
 
 def provenance() -> dict[str, Any]:
@@ -59,19 +42,15 @@ def note_provenance(path: pathlib.Path, devices: str) -> None:
     write_json(path, [*others, here])
 
 
-def read_provenance(path: pathlib.Path) -> list[Machine]:
-    """Reads the machines that a run was trained on, the last one last; none if the file is missing.
+def read_provenance(path: pathlib.Path) -> list[dict[str, Any]]:
+    """Reads what `provenance` returned on the machines that trained a run, in order.
+
+    Returns none if the file is missing.
 
     Raises:
       ValueError: the file is damaged; the message names it.
     """
-    machines: list[Machine] = read_json(path, list[Machine]) if is_file(path) else []
-    with naming_file(path):
-        for machine in machines:
-            commit = machine["commit"]
-            if commit is not None and not re.fullmatch("[0-9a-f]+(-dirty)?", commit):
-                raise ValueError(f"commit must be hexadecimal, got {commit!r}")
-    return machines
+    return read_json(path) if path.is_file() else []
 
 
 def commit() -> str | None:

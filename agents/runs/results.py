@@ -69,7 +69,7 @@ def find_runs(paths: Paths) -> list[RunFolder]:
     """
     found: dict[str, Path] = {}
     for path in map(expand, [paths] if isinstance(paths, str | Path) else paths):
-        runs = sorted(_runs_below(path, set()))
+        runs = sorted(file.parent for file in path.rglob(CONFIG_FILE))
         if not runs:
             raise ValueError(f"{path} holds no run; {runs_near(path)}")
         for run in runs:
@@ -77,22 +77,6 @@ def find_runs(paths: Paths) -> list[RunFolder]:
     if not found:
         raise ValueError("paths must name at least one folder")
     return list(map(RunFolder, found.values()))
-
-
-def _runs_below(path: Path, seen: set[str]) -> Iterable[Path]:
-    """Yields the runs in a folder and below; adds the folders looked into to `seen`."""
-    if os.path.realpath(path) in seen:
-        return
-    seen.add(os.path.realpath(path))
-    try:
-        entries = sorted(path.iterdir(), key=lambda entry: (entry.is_symlink(), entry))
-    except (FileNotFoundError, NotADirectoryError):  # deleted meanwhile, or never there
-        return
-    if (path / CONFIG_FILE) in entries:
-        yield path
-    for entry in entries:
-        if entry.is_dir():
-            yield from _runs_below(entry, seen)
 
 
 def _table(folder: RunFolder, path: Path, stored: dict[str, Any], **about: Any) -> pd.DataFrame:

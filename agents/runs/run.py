@@ -9,7 +9,7 @@ from typing import Any, Self
 import trap_tube_jax as tt
 from agents.command_line import option
 from agents.config import Config
-from trap_tube_jax.checks import MAX_TASKS, check_integer, check_printable, check_seed
+from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
 
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
@@ -50,7 +50,6 @@ class Run:
         env_id = tt.task_set(self.config.env_id).id
         object.__setattr__(self, "config", dataclasses.replace(self.config, env_id=env_id))
         if self.finetune is not None:
-            check_printable(self.finetune)  # the home folder may be another one by now
             object.__setattr__(self, "finetune", str(self.finetune))
         if not self.algorithm:
             curiosity = self.config.curiosity

@@ -64,6 +64,5 @@ def _rows(path: Path) -> int:
     """Counts the iterations in a run's file, which a worker may be writing."""
     metrics = RunFolder(path).metrics
     with contextlib.suppress(OSError):
-        if metrics.is_file():  # reading a FIFO would never end
-            return max(0, metrics.read_bytes().count(b"\n") - 1)
+        return max(0, metrics.read_bytes().count(b"\n") - 1)
     return 0

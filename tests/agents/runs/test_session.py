@@ -5,7 +5,6 @@ import io
 import itertools
 import shutil
 from types import SimpleNamespace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -87,15 +86,13 @@ def test_only_the_final_evaluation_plays_test_tasks(whole):
     assert [*chosen_by, ("TrapTube-v0", "test"), ("PerceptualTrapTube-v0", "test")] == ASKED
 
 
-def test_results_are_a_tidy_table(whole, tmp_path):
+def test_results_are_a_tidy_table(whole):
     table = results(whole.parent)
     assert list(table["task_set"]) == ["base", "p"] * 4
     assert set(table["algorithm"]) == {"ppo+effects"}
     assert set(table["hidden"]) == {4}
     assert set(table["run"]) == {str(whole)}
     assert list(metrics([whole])["iteration"]) == list(range(1, ITERATIONS + 1))
-    (tmp_path / "link").symlink_to(whole)
-    assert len(results(tmp_path)) == len(table)
     with pytest.raises(ValueError, match="holds no run"):
         results(whole / "checkpoints")
 
@@ -232,7 +229,7 @@ def forget(key):
     """Returns a function that removes one of the plain values of a file of arrays."""
 
     def damage(path):
-        arrays, about = read_arrays(path, dict[str, Any])
+        arrays, about = read_arrays(path)
         del about[key]
         write_arrays(path, arrays, about)
 
@@ -249,11 +246,11 @@ def forget(key):
         ("evaluations.csv", remove, "evaluations.csv lacks the evaluation of iteration"),
         ("best.safetensors", remove, "best.safetensors is missing"),
         ("best.safetensors", make_a_file, "best.safetensors cannot be read"),
-        ("best.safetensors", forget("iteration"), "cannot be read: it lacks 'iteration'"),
+        ("best.safetensors", forget("iteration"), "best.safetensors lacks 'iteration'"),
         (
             "checkpoints/6.safetensors",
             forget("seconds"),
-            "cannot be continued: it has no 'seconds'",
+            "cannot be continued: it has no seconds",
         ),
     ],
 )
