@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.command_line import option, parse
-from agents.files import check_folder, read_json, write_bytes, write_json
+from agents.files import check_folder, write_bytes, write_json
 from agents.profiles import plots
 from agents.profiles.measure import (
     Table,
@@ -19,7 +19,7 @@ from agents.profiles.measure import (
 )
 from agents.profiles.tasks import FIRST_TRIES, PARTS, STRENGTHS
 from agents.runs import compilation
-from agents.runs.folder import PROVENANCE_FILE, check_kind
+from agents.runs.folder import PROVENANCE_FILE
 from agents.runs.loading import load, short_name
 from agents.runs.provenance import provenance
 from trap_tube_jax.command_line import announce, plain_errors
@@ -39,8 +39,7 @@ class Options:
 
     Attributes:
       runs: runs' folders, files of parameters, or names of shipped agents.
-      output: folder for the files, by default runs/profile-NAMES. Only a profile of the same
-        policies is replaced.
+      output: folder for the files, by default runs/profile-NAMES; an earlier profile is replaced.
       parts: some of structural, perceptual and both (success by strength), symbolic (by the object
         that is the tool), kind and plan-length (of the tasks of {P}), first-push-p and
         first-push-pst (towards the exit or away from it, in {P} and {P, St}), first-grasp-psy and
@@ -71,35 +70,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     origin = {"command": command, "iterations": iterations, **provenance()}
     names = "+".join(map(short_name, policies))
     output = options.output or Path("runs", f"profile-{names}")
-    _check_free(output, iterations)
+    check_folder(output)
+    if output.is_dir() and any(output.iterdir()) and not (output / TABLE).is_file():
+        raise ValueError(f"{output} holds other files than a profile's; give another --output")
     found = profile(policies, options.parts, options.strengths, options.tasks, announce)
     _print_tables(found)
     output.mkdir(parents=True, exist_ok=True)
-    write_json(output / PROVENANCE_FILE, origin)  # first: it marks the folder as a profile's
     for figure in FIGURES:  # of an earlier profile
         (output / figure).unlink(missing_ok=True)
     table = found.to_csv(index=False, float_format="%.6g")
     write_bytes(output / TABLE, table.encode())
+    write_json(output / PROVENANCE_FILE, origin)
     if set(options.parts) & set(plots.PANELS):
         plots.save_success(found, output / "success.png")
     if "control" in options.parts:
         plots.save_controls(found, output / "controls.png")
     print(f"results: {output}")
-
-
-def _check_free(folder: Path, iterations: dict[str, int]) -> None:
-    """Raises ValueError if a folder holds other results than a profile of these policies."""
-    check_folder(folder)
-    check_kind(folder, "a profile", "--output")
-    origin = folder / PROVENANCE_FILE
-    if not origin.is_file():
-        for path in (folder / name for name in (TABLE, *FIGURES)):
-            if path.exists():
-                raise ValueError(f"{path} is not a profile's; give another --output")
-        return
-    found = read_json(origin)
-    if not isinstance(found, dict) or found.get("iterations") != iterations:
-        raise ValueError(f"{folder} holds the profile of other policies; give another --output")
 
 
 def _print_tables(found: Table) -> None:

@@ -14,11 +14,6 @@ from trap_tube_jax.imports import import_modules
 CONFIG_FILE = "config.json"
 PROVENANCE_FILE = "provenance.json"
 GRID_FILE = "grid.json"
-KINDS = {  # of results, by the file that every folder of the kind holds
-    CONFIG_FILE: "a run",  # first, since a run has provenance, too
-    GRID_FILE: "a grid",
-    PROVENANCE_FILE: "a profile",
-}
 RUNS = Path("runs")  # where agents.train puts them
 MAX_LISTED = 10
 STORED = ("config", "seed", "algorithm", "imports", "options")  # what config.json must hold
@@ -102,26 +97,13 @@ class RunFolder:
             ) from error
 
 
-def check_kind(path: Path, kind: str, option: str) -> None:
-    """Raises ValueError, which names the option, if a folder holds another of `KINDS`."""
-    found = _kind_of(path)
-    if found not in (None, kind):
-        raise ValueError(f"{path} holds {found}; give another {option}")
-
-
-def _kind_of(path: Path) -> str | None:
-    return next((kind for name, kind in KINDS.items() if (path / name).is_file()), None)
-
-
 def check_output(path: Path) -> None:
-    """Raises ValueError if a file cannot be written, or would replace one of other results."""
+    """Raises ValueError if a file cannot be written, or would replace one of a run."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder; give the path of a file")
     check_folder(path.parent)
     if run := run_of(path):
         raise ValueError(f"{path} is a file of the run {run.path}; give another path")
-    if path.exists() and (kind := _kind_of(path.parent)):
-        raise ValueError(f"{path} may be a file of {kind}; give another path")
 
 
 def run_of(path: Path) -> RunFolder | None:

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,11 +12,10 @@ import trap_tube_jax as tt
 from agents.command_line import option
 from agents.config import Config
 from agents.ppo.learner import make_learner
-from agents.runs.folder import RunFolder, check_kind, check_name
+from agents.runs.folder import RunFolder, check_name
 from agents.runs.run import Run, RunOptions
 from trap_tube_jax.checks import check_integer
 
-MAX_RUNS = 10_000  # a folder each
 COMMA = re.compile(r",(?![^\[]*\])")  # but not within a list
 
 
@@ -89,7 +87,7 @@ class Grid:
         Raises:
           ValueError: an option is not allowed, or a stored run cannot be continued with it.
         """
-        check_integer("seeds", options.seeds, maximum=MAX_RUNS)
+        check_integer("seeds", options.seeds)
         for limit in ("processes", "seeds_per_program"):
             if getattr(options, limit) is not None:
                 check_integer(limit, getattr(options, limit))
@@ -109,7 +107,8 @@ class Grid:
         for config in configs.values():
             make_learner(config)  # refuses what cannot be trained with
         root = options.out / name
-        check_kind(root, "a grid", "--name")
+        if RunFolder(root).config.is_file():
+            raise ValueError(f"{root} is a run; give another --name")
         runs = {}
         for seed in range(options.seed, options.seed + options.seeds):
             for point, config in configs.items():
@@ -135,11 +134,6 @@ class Grid:
         fixed = sorted({name for point in self.points.values() for name in point} & given.keys())
         if fixed:
             raise ValueError(f"the grid's points decide {', '.join(fixed)}; use --only")
-        points = len(self.points) * math.prod(map(len, given.values()))
-        if points * options.seeds > MAX_RUNS:
-            raise ValueError(
-                f"a grid has at most {MAX_RUNS:,} runs, got {points * options.seeds:,}"
-            )
         common = {**self.settings, **({} if options.env is None else {"env_id": options.env})}
         configs = {}
         for name, *labels in itertools.product(self.points, *given.values()):

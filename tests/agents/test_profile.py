@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-import agents
 from agents import profile
 from agents.pretrained import FOLDER
 from agents.profiles import plots, tasks
@@ -32,9 +31,8 @@ def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monk
     arguments = ["fast-base", str(source), *options.split()]
     out = tmp_path / "runs" / r"profile-fast-base+$\frac{$=0.1-x"
     out.mkdir(parents=True)
-    (out / "success.png").write_text("of an earlier profile of the same policies")
-    earlier = {"iterations": {name: agents.load(name).iteration for name in arguments[:2]}}
-    (out / "provenance.json").write_text(json.dumps(earlier))
+    for name in ("profile.csv", "success.png"):
+        (out / name).write_text("of an earlier profile")
     files = []
     shown = []
     draw = plots.save_success
@@ -59,29 +57,11 @@ def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monk
             assert picture.width == 830
 
 
-@pytest.mark.parametrize(
-    "origin", [[], {"iterations": {"fast-base": 7}}, {"iterations": {"icm-base": 19}}]
-)
-def test_a_profile_of_other_policies_is_not_replaced(origin, tmp_path, capsys):
-    (tmp_path / "provenance.json").write_text(json.dumps(origin))
-    message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
-    assert "holds the profile of other policies; give another --output" in message
-    assert [path.name for path in tmp_path.iterdir()] == ["provenance.json"]
-
-
-@pytest.mark.parametrize("name", ["profile.csv", "success.png"])
-def test_files_of_others_are_not_replaced(name, tmp_path, capsys):
-    (tmp_path / name).write_text("mine")
-    message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
-    assert f"{name} is not a profile's; give another --output" in message
-    assert (tmp_path / name).read_text() == "mine"
-
-
-@pytest.mark.parametrize(("name", "kind"), [("config.json", "a run"), ("grid.json", "a grid")])
-def test_a_profile_does_not_mix_with_other_results(name, kind, tmp_path, capsys):
+@pytest.mark.parametrize("name", ["config.json", "grid.json"])
+def test_a_profile_does_not_mix_with_other_files(name, tmp_path, capsys):
     (tmp_path / name).touch()
     message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
-    assert f"{tmp_path} holds {kind}; give another --output" in message
+    assert f"{tmp_path} holds other files than a profile's; give another --output" in message
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 

@@ -31,7 +31,6 @@ SETTINGS = [
     f"{name}={json.dumps(value, separators=(',', ':'))}"
     for name, value in small_runs.SETTINGS.items()
 ]
-MANY = f"discount={','.join(str(i / 2000) for i in range(2000))}"
 NEAR_FOOD = ["--import", "agents.examples.near_food", "--env", "near-food", "--sets", "near-food"]
 
 
@@ -198,9 +197,7 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
         (["--settings", "max_transitions=5"], "max_transitions must allow an iteration"),
         (["--only", "fst"], "no point 'fst'; allowed: fast"),
         ([*NEAR_FOOD, "--only", "x"], "no point 'x'"),  # the module registers the set first
-        (["--seeds", "0"], "seeds must be an integer >= 1 and <= 10000, got 0"),
-        (["--seeds", "2000000000"], "seeds must be an integer >= 1 and <= 10000"),
-        (["--seeds", "9", "--settings", MANY], "a grid has at most 10,000 runs, got 18,000"),
+        (["--seeds", "0"], "seeds must be an integer >= 1, got 0"),
         (["--seed", "-1"], "seed must be an integer >= 0"),
         (["--processes", "0"], "processes must be an integer >= 1, got 0"),
         (["--seeds-per-program", "0"], "seeds_per_program must be an integer"),

@@ -248,17 +248,6 @@ def test_an_evaluation_replaces_no_file_of_a_run(option, name, capsys, whole):
     assert f"{name} is a file of the run {whole[0]}; give another path" in message
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [("grid.json", "a grid"), ("provenance.json", "a profile")]
-)
-def test_an_evaluation_replaces_no_file_of_other_results(name, kind, capsys, tmp_path):
-    for file in (name, "results.csv"):
-        (tmp_path / file).touch()
-    path = tmp_path / "results.csv"
-    message = refused(capsys, evaluate.main, "best-pstsy", "--output", path)
-    assert f"{path} may be a file of {kind}; give another path" in message
-
-
 @pytest.mark.parametrize("option", ["--output", "--gif"])
 def test_an_evaluation_refuses_to_write_to_a_folder_before_it_plays(option, capsys, tmp_path):
     message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path)

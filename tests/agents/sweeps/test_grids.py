@@ -116,16 +116,11 @@ def test_a_stored_run_with_other_settings_or_evaluations_is_refused(tmp_path):
     assert_refused(words, Grid().make_runs, "sweep", given, RunOptions(test_tasks=7))
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [("config.json", "a run"), ("provenance.json", "a profile")]
-)
-def test_a_grid_does_not_mix_with_other_results(name, kind, tmp_path):
+def test_a_grid_is_not_put_into_a_run(tmp_path):
     (tmp_path / "x").mkdir()
-    (tmp_path / "x" / name).touch()
+    (tmp_path / "x" / "config.json").touch()
     given = Options(name="x", out=tmp_path)
-    assert_refused(
-        [f"x holds {kind}; give another --name"], Grid().make_runs, "sweep", given, RunOptions()
-    )
+    assert_refused(["x is a run; give another"], Grid().make_runs, "sweep", given, RunOptions())
 
 
 def test_the_arms_of_the_published_code_hold_the_papers_two():
