@@ -43,19 +43,12 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
 
 
-class BusyError(ValueError):
-    """Another process writes to a folder."""
-
-
 @contextlib.contextmanager
-def lock_folder(path: Path, wait: float = 1) -> Iterator[None]:
+def lock_folder(path: Path, wait: float = 0) -> Iterator[None]:
     """Makes this process the only writer of a folder; makes the folder if missing.
 
-    Waits for up to `wait` seconds, because a launcher takes the lock for a moment to see whether a
-    run has begun.
-
     Raises:
-      BusyError: another process writes to the folder.
+      ValueError: another process writes to the folder, even after `wait` seconds.
       OSError: the folder cannot be created or locked.
     """
     path.mkdir(parents=True, exist_ok=True)
@@ -64,7 +57,7 @@ def lock_folder(path: Path, wait: float = 1) -> Iterator[None]:
             stack.enter_context(filelock.FileLock(path / ".lock", timeout=wait))
         except filelock.Timeout:
             reason = f"{path} is being written by another process; wait for its end"
-            raise BusyError(reason) from None
+            raise ValueError(reason) from None
         except NotImplementedError as error:
             raise OSError(f"{path} cannot be locked: {error}") from error
         yield

@@ -12,18 +12,12 @@ from agents.runs.folder import RunFolder
 from agents.runs.history import has_ended
 from agents.runs.run import Run, RunOptions
 from agents.sweeps.overview import Overview
-from agents.sweeps.workers import (
-    DONE,
-    STOPPED,
-    Launch,
-    backend_of,
-    is_being_written,
-    log_of,
-    train_logged,
-)
+from agents.sweeps.workers import Launch, ProcessPerCall, backend_of, log_of, train_logged
 from trap_tube_jax.interruptions import Stopped, deferring
 
 Group = Mapping[Path, Run]
+DONE = "done"
+STOPPED = "stopped"
 LOST = "its worker, or the scheduler of the cluster, was lost"
 
 
@@ -81,15 +75,14 @@ def launch(
                 overview.show()
                 # A wait without a timeout would miss a signal that arrives just before it.
                 ended, pending = wait(pending, timeout=1, return_when=FIRST_COMPLETED)
-                if request():
-                    _cancel_waiting({call: calls[call] for call in pending})
-                    ended |= {call for call in pending if call.cancelled()}  # Dask does not tell
-                    pending -= ended
+                if request() and isinstance(executor, ProcessPerCall):
+                    for call in pending:
+                        call.cancel()  # unless it has begun; Dask would also drop those that have
                 for call in (call for call in calls if call in ended):
-                    for path, outcome in _outcomes(call, calls[call], bool(request())).items():
+                    for path, run in calls[call].items():
                         count += 1
-                        text = f"{path.name}: {outcome}{_log(outcome, path)}"
-                        console.out(f"[{count}/{len(runs)}] {text}")
+                        outcome = _outcome(call, path, run, bool(request()))
+                        console.out(f"[{count}/{len(runs)}] {path.name}: {outcome}")
                         failed += [] if outcome in (DONE, STOPPED) else [path]
             if number := request():
                 raise Stopped(number)
@@ -107,30 +100,13 @@ def _call(group: Group, options: RunOptions, current: Launch) -> tuple:
     return train_logged, absolute, options, current
 
 
-def _outcomes(call: Future, group: Group, stopped: bool) -> dict[Path, str]:
-    """Returns the outcomes of the runs of a call: `done`, `stopped` or an error.
-
-    If a call was lost or reports `done`, the runs' files decide the outcome.
-    """
-    error = None if call.cancelled() else call.exception()  # its process was killed, for example
-    if call.cancelled() or error:
-        found = dict.fromkeys(group, STOPPED if call.cancelled() and stopped else DONE)
-    else:
-        found = dict(zip(group, call.result().values(), strict=True))
-    for path, outcome in found.items():
-        has_to_go_on = outcome == STOPPED and not stopped
-        if has_to_go_on or (outcome == DONE and not has_ended(RunFolder(path), group[path])):
-            found[path] = f"failed: {error or LOST}"
-    return found
-
-
-def _cancel_waiting(pending: Mapping[Future, Group]) -> None:
-    """Cancels the calls that train nothing yet. Dask would also drop those that do."""
-    for call, group in pending.items():
-        if not any(path.exists() and is_being_written(path) for path in group):
-            call.cancel()
-
-
-def _log(outcome: str, path: Path) -> str:
+def _outcome(call: Future, path: Path, run: Run, stopped: bool) -> str:
+    """Returns `done`, `stopped` or an error; the run's files tell whether it is done."""
+    crash = LOST if call.cancelled() else call.exception()  # its process was killed, for example
+    error = None if crash else call.result().get(path.absolute())
+    if not error and has_ended(RunFolder(path), run):
+        return DONE
+    if not error and stopped:
+        return STOPPED
     log = log_of(path)
-    return f"; see {log}" if outcome not in (DONE, STOPPED) and log.exists() else ""
+    return f"failed: {error or crash or LOST}{f'; see {log}' if log.exists() else ''}"

@@ -6,7 +6,6 @@ import logging
 import multiprocessing
 import os
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -18,7 +17,7 @@ from uuid import uuid4
 import jax
 from rich.console import Console
 
-from agents.files import BusyError, lock_folder, write_bytes
+from agents.files import write_bytes
 from agents.parallel.devices import split_cpu
 from agents.runs.compilation import enable_cache
 from agents.runs.provenance import cores
@@ -28,9 +27,7 @@ from trap_tube_jax.imports import import_modules, needs_extra
 from trap_tube_jax.interruptions import Stopped, block_signals
 
 SPAWN = multiprocessing.get_context("spawn")
-DONE = "done"
-STOPPED = "stopped"
-MAX_WAIT = 600  # seconds; the longest iterations, with their evaluation, take a few minutes
+MAX_WAIT = 600.0  # seconds; the longest iterations, with their evaluation, take a few minutes
 
 
 class ProcessPerCall(ThreadPoolExecutor):
@@ -127,10 +124,13 @@ class Launch:
 def train_logged(runs: Mapping[Path, Run], options: RunOptions, launch: Launch) -> dict[Path, str]:
     """Trains runs by one program, and logs them next to their folders.
 
-    Returns `done`, `stopped` or an error by folder.
+    Waits for workers whose launcher has died until they have saved the runs.
+
+    Returns:
+      The errors of the runs that failed, by folder.
     """
     if launch.has_ended():
-        return dict.fromkeys(runs, STOPPED)
+        return {}
     with contextlib.ExitStack() as stack:
         consoles = {}
         for path in runs:
@@ -142,46 +142,21 @@ def train_logged(runs: Mapping[Path, Run], options: RunOptions, launch: Launch) 
             for run in runs.values():
                 import_modules(run.imports)
             enable_cache()
-            for path, console in consoles.items():
-                wait_for_earlier_launch(path, launch, console)
-            outcomes = train_runs(runs, options, consoles=consoles, stop=launch.has_ended)
+            stop = launch.has_ended
+            outcomes = train_runs(runs, options, consoles=consoles, stop=stop, wait=MAX_WAIT)
         except Exception as error:
             outcomes = dict.fromkeys(runs, error)
-        return {path: _described(outcomes[path], console) for path, console in consoles.items()}
-
-
-def wait_for_earlier_launch(path: Path, launch: Launch, console: Console) -> None:
-    """Waits until a worker whose launcher has died has saved a run, at most for `MAX_WAIT`."""
-    end = time.monotonic() + MAX_WAIT
-    if is_being_written(path):
-        console.out("Waiting for the process that writes to this run ...")
-    while is_being_written(path) and time.monotonic() < end and not launch.has_ended():
-        time.sleep(1)
-
-
-def is_being_written(path: Path) -> bool:
-    """Returns whether a process writes to a run's folder."""
-    try:
-        with lock_folder(path, wait=0):
-            return False
-    except BusyError:
-        return True
-    except ValueError:  # training would be refused, too
-        return False
+        errors = {}
+        for path, console in consoles.items():
+            if isinstance(error := outcomes[path], Exception) and not isinstance(error, Stopped):
+                traceback.print_exception(error, file=console.file)
+                errors[path] = str(error)
+        return errors
 
 
 def log_of(path: Path) -> Path:
     """Returns the log of the run in a folder."""
     return path.with_name(f"{path.name}.log")
-
-
-def _described(outcome: Any, console: Console) -> str:
-    if isinstance(outcome, Stopped):
-        return STOPPED
-    if isinstance(outcome, Exception):
-        traceback.print_exception(outcome, file=console.file)
-        return f"failed: {outcome}"
-    return DONE
 
 
 def _begin(threads: int) -> None:

@@ -24,7 +24,7 @@ from agents.sweeps.grids import GRIDS, Grid, Options
 from agents.sweeps.launcher import launch
 from helpers import small_runs
 from helpers.paths import ROOT
-from helpers.refusal import refused
+from helpers.refusal import assert_refused, refused
 from trap_tube_jax.interruptions import Stopped
 
 SETTINGS = [
@@ -58,8 +58,8 @@ def end(path):
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
     """A run is done only if its files say so."""
 
-    def train_runs(runs, options, *, consoles, stop):
-        del options, consoles, stop
+    def train_runs(runs, options, *, consoles, stop, wait):
+        del options, consoles, stop, wait
         ((path, _),) = runs.items()
         if path.name == "b[red]":
             return {path: ValueError("no such luck")}
@@ -90,8 +90,8 @@ def test_workers_may_run_in_another_folder(monkeypatch, tmp_path):
 def test_a_signal_stops_all_runs_and_they_go_on_with_the_next_launch(monkeypatch, tmp_path):
     begun = []
 
-    def train_runs(runs, options, *, consoles, stop):
-        del options, consoles
+    def train_runs(runs, options, *, consoles, stop, wait):
+        del options, consoles, wait
         begun.extend(path.name for path in runs)
         os.kill(os.getpid(), signal.SIGTERM)  # asks the launcher, in the main thread
         while not stop():
@@ -138,16 +138,6 @@ def test_workers_obey_the_present_launch(tmp_path):
     assert (first.has_ended(), second.has_ended()) == (True, False)
     second.end()
     assert second.has_ended()
-
-
-def test_a_worker_waits_for_that_of_an_earlier_launch(tmp_path, monkeypatch):
-    asked = iter([True, True, True, False])
-    monkeypatch.setattr(workers, "is_being_written", lambda path: next(asked))
-    monkeypatch.setattr(workers.time, "sleep", lambda _: None)
-    console = Console(record=True)
-    workers.wait_for_earlier_launch(tmp_path / "a", workers.Launch.begin(tmp_path), console)
-    assert console.export_text().count("Waiting") == 1
-    assert not list(asked)
 
 
 @pytest.mark.parametrize(
@@ -398,7 +388,7 @@ def test_a_run_of_a_lost_launcher_goes_on_with_the_next(tmp_path, cluster):
     lost.kill()
     lost.communicate()
     folder = tmp_path / "x" / "fast-seed0"
-    assert workers.is_being_written(folder)
+    assert_refused(["is being written"], lock_folder(folder).__enter__)
     process = start_endless(tmp_path, *arguments)
     log = workers.log_of(folder)
     while log.read_text().count("Compiling") < 2:

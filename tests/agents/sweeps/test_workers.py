@@ -8,7 +8,6 @@ from multiprocessing import resource_tracker
 import pytest
 
 from agents.config import Config
-from agents.files import lock_folder
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import workers
 from trap_tube_jax.interruptions import Stopped
@@ -31,15 +30,15 @@ def test_signals_do_not_reach_the_processes():
 
 
 @pytest.mark.parametrize(
-    ("ends", "outcome", "logged"),
+    ("ends", "error", "logged"),
     [
-        (None, "done", "training [b]x[/b]\n"),
-        (Stopped(15), "stopped", "training [b]x[/b]\n"),
-        (ValueError("no [red]luck"), "failed: no [red]luck", "ValueError: no [red]luck\n"),
+        (None, None, "training [b]x[/b]\n"),
+        (Stopped(15), None, "training [b]x[/b]\n"),
+        (ValueError("no [red]luck"), "no [red]luck", "ValueError: no [red]luck\n"),
     ],
 )
-def test_runs_are_logged_next_to_their_folders(tmp_path, monkeypatch, ends, outcome, logged):
-    def train_runs(runs, options, *, consoles, stop):
+def test_runs_are_logged_next_to_their_folders(tmp_path, monkeypatch, ends, error, logged):
+    def train_runs(runs, options, *, consoles, stop, wait):
         for console in consoles.values():
             console.print("training [b]x[/b]", markup=False)
         return {path: ends if path.name == "a" else None for path in runs}
@@ -48,17 +47,18 @@ def test_runs_are_logged_next_to_their_folders(tmp_path, monkeypatch, ends, outc
     launch = workers.Launch.begin(tmp_path)
     runs = {tmp_path / name: Run(Config(), seed) for seed, name in enumerate("ab")}
     found = workers.train_logged(runs, RunOptions(), launch)
-    assert found == {tmp_path / "a": outcome, tmp_path / "b": "done"}
+    assert found == ({} if error is None else {tmp_path / "a": error})
     assert (tmp_path / "a.log").read_text().endswith(logged)
     launch.end()
-    assert set(workers.train_logged(runs, RunOptions(), launch).values()) == {"stopped"}
+    assert workers.train_logged(runs, RunOptions(), launch) == {}
 
 
 def test_a_program_that_cannot_be_made_fails_all_its_runs(tmp_path):
     runs = {tmp_path / name: Run(Config(), seed) for seed, name in enumerate("ab")}
     launch = workers.Launch.begin(tmp_path)
     found = workers.train_logged(runs, RunOptions(devices=2), launch)
-    assert all(text.startswith("failed: runs of one program must") for text in found.values())
+    assert list(found) == list(runs)
+    assert all(text.startswith("runs of one program must") for text in found.values())
 
 
 def test_devices_are_split_before_modules_are_imported(tmp_path, monkeypatch):
@@ -69,12 +69,6 @@ def test_devices_are_split_before_modules_are_imported(tmp_path, monkeypatch):
     with contextlib.suppress(TypeError):  # no outcomes
         workers.train_logged({tmp_path / "a": Run(Config())}, RunOptions(devices=2), launch)
     assert order == ["split_cpu", "import_modules", "train_runs"]
-
-
-def test_a_writer_is_noticed(tmp_path):
-    with lock_folder(tmp_path / "b"):
-        assert workers.is_being_written(tmp_path / "b")
-    assert not workers.is_being_written(tmp_path / "b")
 
 
 def test_dask_is_an_extra(monkeypatch):
