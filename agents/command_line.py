@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import inspect
-import itertools
 import re
 import types
 from collections.abc import Callable, Sequence
@@ -45,10 +44,22 @@ def parse(cls: type[Options], arguments: Sequence[str] | None, prog: str) -> Opt
     return parse_all([cls], arguments, prog)[0]
 
 
-def parse_all(
-    declared: Sequence[Any], arguments: Sequence[str] | None, prog: str, *, partly: bool = False
-) -> list[Any]:
+def parse_all(declared: Sequence[Any], arguments: Sequence[str] | None, prog: str) -> list[Any]:
     """Reads a command line into several dataclasses; first imports the modules of `--import`.
+
+    Arguments as in `read`.
+
+    Raises:
+      SystemExit: the command line is invalid, or asks for help.
+      ValueError: a value is not allowed.
+    """
+    values = read(declared, arguments, prog)
+    import_modules(values.get("imports", ()))  # they register names that the classes check
+    return [build(options, values) for options in declared]
+
+
+def read(declared: Sequence[Any], arguments: Sequence[str] | None, prog: str) -> dict[str, Any]:
+    """Reads a command line; returns the values that it gives by the names of their fields.
 
     Fields without a default are positional.
 
@@ -57,11 +68,9 @@ def parse_all(
         describes the command.
       arguments: the command line after the program, by default the arguments of the process.
       prog: the command.
-      partly: ignores unknown options and --help, and imports nothing.
 
     Raises:
       SystemExit: the command line is invalid, or asks for help.
-      ValueError: a value is not allowed.
     """
     positional = [f.name for cls in declared for f in dataclasses.fields(cls) if _is_required(f)]
     parser = argparse.ArgumentParser(
@@ -70,7 +79,6 @@ def parse_all(
         description=(inspect.getdoc(declared[0]) or "").partition("\n\nAttributes:")[0],
         formatter_class=_Help,
         allow_abbrev=False,
-        add_help=not partly,
     )
     groups: dict[Any, Any] = {None: parser}
     for options in declared:
@@ -83,22 +91,23 @@ def parse_all(
             text = documents[field.name].replace("%", "%%")
             _add(groups[group], field, getattr(options, field.name, None), text, kinds[field.name])
     known, unknown = parser.parse_known_args(arguments)
-    if unknown and not partly:
+    if unknown:
         options = [name for action in parser._actions for name in action.option_strings]
         near = did_you_mean(unknown[0], options) if unknown[0].startswith("-") else ""
         parser.error(f"unknown arguments: {' '.join(unknown)}{near}")
     found = vars(known)
-    for field in itertools.chain(*map(dataclasses.fields, declared)):
+    for field in (field for options in declared for field in dataclasses.fields(options)):
         if found.get(field.name) == [] and not field.metadata.get("may_be_empty"):
             parser.error(f"argument {_flag(field.name)}: expected at least one argument")
-    values = {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
-    if not partly:
-        import_modules(values.get("imports", ()))  # they register names that the classes check
-    return [_replaced(options, values) for options in declared]
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
 
 
-def _replaced(declared: Any, values: dict[str, Any]) -> Any:
-    """Returns an instance of the declared options with the values that the command line gives."""
+def build(declared: Any, values: dict[str, Any]) -> Any:
+    """Returns an instance of a dataclass, or a changed copy, with its fields among the values.
+
+    Raises:
+      ValueError: a value is not allowed.
+    """
     given = {f.name: values[f.name] for f in dataclasses.fields(declared) if f.name in values}
     is_class = isinstance(declared, type)
     return declared(**given) if is_class else dataclasses.replace(declared, **given)

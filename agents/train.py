@@ -4,11 +4,12 @@ import dataclasses
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
 import trap_tube_jax as tt
-from agents.command_line import option, parse_all
+from agents.command_line import build, option, read
 from agents.config import Config
 from agents.parallel import processes
 from agents.parallel.devices import split_cpu
@@ -17,9 +18,10 @@ from agents.runs.console import CommandConsole
 from agents.runs.folder import RunFolder, check_name
 from agents.runs.loading import load, short_name
 from agents.runs.metrics import read_rows
-from agents.runs.run import DeviceOptions, Run, RunOptions
+from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run
 from trap_tube_jax.command_line import plain_errors
+from trap_tube_jax.imports import import_modules
 from trap_tube_jax.interruptions import exit_when_stopped, run_command
 
 PROGRAM = "python -m agents.train"
@@ -59,10 +61,14 @@ class Options:
 @plain_errors()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line; `arguments` defaults to `sys.argv[1:]`."""
-    # Some options decide how the others are read.
-    first, devices = parse_all([Options, DeviceOptions], arguments, PROGRAM, partly=True)
-    start_devices(first, devices)
-    options, run, run_options = parse(first, arguments)
+    values = read([Options, Config.preset(DEFAULT_PRESET), RunOptions()], arguments, PROGRAM)
+    options = build(Options, values)
+    # Before modules of --import start JAX.
+    stored = None if options.resume is None else RunFolder(options.resume).devices()
+    split_cpu(values.get("devices") or stored)
+    processes.join(options.distributed)
+    import_modules(options.imports)
+    run, run_options = configure(options, values)
     folder = RunFolder(run_path(options, run))
     if options.resume is None:
         folder.check_free()
@@ -70,45 +76,37 @@ def main(arguments: Sequence[str] | None = None) -> None:
     train(folder, run, run_options)
 
 
-def start_devices(first: Options, devices: DeviceOptions) -> None:
-    """Splits the CPU and joins the other processes, before modules of --import start JAX."""
-    stored = None if first.resume is None else RunFolder(first.resume).devices()
-    split_cpu(devices.devices or stored)
-    processes.join(first.distributed)
+def configure(options: Options, values: dict[str, Any]) -> tuple[Run, RunOptions]:
+    """Returns the run of a command line and its options.
 
+    Those that are not among `values` have the preset's values, or those of the agent to fine-tune
+    or of the stored run.
 
-def parse(first: Options, arguments: Sequence[str] | None) -> tuple[Options, Run, RunOptions]:
-    """Reads a command line; preset, agent to fine-tune or stored run have the defaults."""
-    new = Options()
-    if first.resume is None:
-        config = Config.preset(first.preset or DEFAULT_PRESET)
-        if first.finetune is not None:
-            if first.preset is not None:
-                raise ValueError("--finetune begins with the agent's settings; leave out --preset")
-            config = load(first.finetune, imports=first.imports).config
-        run = Run(config, finetune=first.finetune)
-        run_options = RunOptions()
-        defaults = new
-    else:
-        fixed = ("name", "out", "preset", "finetune")
-        if any(getattr(first, name) != getattr(new, name) for name in fixed):
+    Raises:
+      ValueError: a value is not allowed, or contradicts another one.
+    """
+    if options.resume is not None:
+        if {"name", "out", "preset", "finetune"} & values.keys():
             raise ValueError(
                 "--resume continues a run as it is; leave out --name, --out, --preset and "
                 "--finetune"
             )
-        run, run_options = RunFolder(first.resume).read(first.imports)
-        defaults = Options(seed=run.seed)
-    options, config, run_options = parse_all(
-        [defaults, run.config, run_options], arguments, PROGRAM
-    )
+        run, run_options = RunFolder(options.resume).read(options.imports)
+    else:
+        config = Config.preset(options.preset or DEFAULT_PRESET)
+        if options.finetune is not None:
+            if options.preset is not None:
+                raise ValueError("--finetune begins with the agent's settings; leave out --preset")
+            config = load(options.finetune, imports=options.imports).config
+        run, run_options = Run(config, finetune=options.finetune), RunOptions()
     run = dataclasses.replace(
         run,
-        config=config,
-        seed=options.seed,
+        config=build(run.config, values),
+        seed=values.get("seed", run.seed),
         imports=tuple(dict.fromkeys((*run.imports, *options.imports))),
-        algorithm=run.algorithm if first.resume else "",  # "": named after the settings
+        algorithm=run.algorithm if options.resume else "",  # "": named after the settings
     )
-    return options, run, run_options
+    return run, build(run_options, values)
 
 
 def train(folder: RunFolder, run: Run, run_options: RunOptions) -> None:

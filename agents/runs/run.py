@@ -14,7 +14,6 @@ from trap_tube_jax.checks import MAX_TASKS, check_integer, check_seed
 # Settings that may change when a run is resumed: they decide only where it ends.
 EXTENDABLE = ("iterations", "max_transitions", "stop_when_solved")
 EVALUATION = ("evaluate_every", "sets", "test_tasks")  # options that a resumed run keeps
-MAX_DEVICES = 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,30 +103,14 @@ def check_algorithm(name: str) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class DeviceOptions:
-    """Options that take effect before JAX starts.
+class RunOptions:
+    """Options for carrying out a run; on one device, none of them changes what it learns.
+
+    A resumed run keeps `evaluate_every`, `sets` and `test_tasks`, so that its evaluations can be
+    compared.
 
     Attributes:
       devices: devices that share the run, by default one, or all if distributed.
-    """
-
-    devices: int | None = option(None, "devices and hosts")
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for a number of devices that no job has."""
-        if self.devices is not None:
-            devices = check_integer("devices", self.devices, maximum=MAX_DEVICES)
-            object.__setattr__(self, "devices", devices)
-
-
-@dataclasses.dataclass(frozen=True)
-class RunOptions(DeviceOptions):
-    """Options for carrying out a run; on one device, none of them changes what it learns.
-
-    `devices` share the run: by default one, or all if several processes train it. A resumed run
-    keeps `evaluate_every`, `sets` and `test_tasks`, so that its evaluations can be compared.
-
-    Attributes:
       checkpoint_every: iterations between checkpoints.
       evaluate_every: iterations between evaluations on `sets`, 0 for none. The best evaluation,
         of equal ones the first, selects the parameters that the run reports.
@@ -142,6 +125,7 @@ class RunOptions(DeviceOptions):
       10
     """
 
+    devices: int | None = option(None, "devices and hosts")
     checkpoint_every: int = option(10, "run")
     evaluate_every: int = option(0, "run")
     sets: tuple[str, ...] | None = option(None, "run")
@@ -152,9 +136,9 @@ class RunOptions(DeviceOptions):
 
     def __post_init__(self) -> None:
         """Raises ValueError for a number that is not allowed or an unknown set."""
-        super().__post_init__()
         bounds = {"checkpoint_every": (1, None), "evaluate_every": (0, None)}
-        bounds |= {} if self.test_tasks is None else {"test_tasks": (1, MAX_TASKS)}
+        optional = {"devices": (1, None), "test_tasks": (1, MAX_TASKS)}
+        bounds |= {name: x for name, x in optional.items() if getattr(self, name) is not None}
         for name, limits in bounds.items():
             object.__setattr__(self, name, check_integer(name, getattr(self, name), *limits))
         if self.sets is None:

@@ -9,8 +9,7 @@ from concurrent import futures
 import pytest
 
 import agents
-from agents import evaluate
-from agents.command_line import parse_all
+from agents import command_line, evaluate
 from agents.config import PRESETS, Config
 from agents.files import read_json
 from agents.runs import program
@@ -19,7 +18,7 @@ from agents.runs.loading import save
 from agents.runs.metrics import append_rows
 from agents.runs.provenance import commit
 from agents.runs.run import Run, RunOptions
-from agents.train import Options, main, parse, run_path, summary
+from agents.train import Options, configure, main, run_path, summary
 from helpers.refusal import refused
 from helpers.small_runs import (
     final_state,
@@ -266,8 +265,9 @@ def test_an_unknown_training_set_is_refused_before_anything_is_played(capsys, tm
 
 
 def read(arguments):
-    (first,) = parse_all([Options], arguments.split(), "", partly=True)
-    return parse(first, arguments.split())
+    values = command_line.read([Options, Config(), RunOptions()], arguments.split(), "")
+    found = command_line.build(Options, values)
+    return found, *configure(found, values)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
