@@ -17,11 +17,8 @@ from trap_tube_jax.objects import AGENT, FOOD
 from trap_tube_jax.transfers import parts_of
 
 MAX_INT32 = 2**31 - 1  # the largest i32, in which training counts
-KEEP_COLORS = {
-    tt.perceptual,
-    tt.structural,
-    tt.symbolic,
-}  # transfers after which agent and food look the same
+# Transfers after which agent and food look the same.
+KEEP_COLORS = {tt.perceptual, tt.structural, tt.symbolic}
 
 
 def _setting(
