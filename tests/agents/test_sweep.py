@@ -17,7 +17,6 @@ from agents import experiments, sweep
 from agents.config import Config
 from agents.files import lock_folder
 from agents.runs.folder import RunFolder
-from agents.runs.metrics import append_rows
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import launcher, overview, workers
 from agents.sweeps.grids import GRIDS, Grid, Options
@@ -47,13 +46,10 @@ def launch_three(monkeypatch, tmp_path, train_runs, names=("a", "b", "c")):
 
 def end(path):
     """Writes the files of a run that has ended."""
-    folder = RunFolder(path)
-    folder.path.mkdir(exist_ok=True)
-    costs = {"iteration": 250, "episodes": 9, "transitions": 5, "seconds": 1.0}
-    append_rows(folder.metrics, [{**costs, "validation_success": 0.0}])
     tested = {"purpose": "test", "task_set": "base", "tasks": 1, "solved": 0}
     few = {"layouts": "", "layouts_total": ""}
-    append_rows(folder.evaluations, [{"iteration": 250, **tested, **few}])
+    evaluations = [{"iteration": 250, **tested, **few}]
+    small_runs.stored_run(path, Run(Config()), [small_runs.metrics_row(250)], evaluations)
 
 
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):

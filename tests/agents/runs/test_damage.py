@@ -13,11 +13,12 @@ from agents.arrays import to_arrays
 from agents.runs import checkpoint
 from agents.runs.folder import STORED, RunFolder
 from agents.runs.loading import load, save
-from agents.runs.metrics import COLUMNS, append_rows, read_rows, rewind_rows
+from agents.runs.metrics import COLUMNS, read_rows, rewind_rows
 from agents.runs.provenance import note_provenance
 from agents.runs.results import metrics, results
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import records
+from helpers.small_runs import stored_run
 from helpers.tiny_policy import CONFIG, random_params, random_policy
 
 
@@ -72,12 +73,9 @@ READERS: dict[str, list[Any]] = {
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """A folder with every file of a run and of a grid."""
-    folder = RunFolder(tmp_path_factory.mktemp("runs") / "whole")
-    folder.path.mkdir()
-    folder.write_config(Run(CONFIG), RunOptions(evaluate_every=2))
+    path = tmp_path_factory.mktemp("runs") / "whole"
+    folder = stored_run(path, Run(CONFIG), [METRICS], [EVALUATION], RunOptions(evaluate_every=2))
     note_provenance(folder.provenance, "cpu")
-    append_rows(folder.metrics, [METRICS])
-    append_rows(folder.evaluations, [EVALUATION])
     checkpoint.save(folder.checkpoints, 4, {"params": random_params()}, METRICS)
     save(folder.best, random_policy().replace(iteration=4))
     (folder.path / "curves.csv").write_bytes(csv_file(CURVE))
