@@ -178,10 +178,6 @@ def test_impossible_settings_are_refused_and_write_no_run(capsys, tmp_path, argu
     assert not list(tmp_path.rglob("*.json"))
 
 
-def test_a_missing_run_is_not_resumed(capsys):
-    assert "no/such holds no run; runs in no: none" in refused(capsys, main, "--resume", "no/such")
-
-
 def test_a_folder_of_other_files_is_not_written_to(capsys, tmp_path):
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "metrics.csv").write_text("mine")
