@@ -320,20 +320,6 @@ def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     assert wanted == [run, dataclasses.replace(how, checkpoint_every=2)]
 
 
-def test_help_documents_every_setting(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit) as exit_info:
-        main(["--help"])
-    assert exit_info.value.code == 0
-    output = capsys.readouterr().out
-    assert len(output.splitlines()) <= 100
-    text = " ".join(output.split())
-    for field in dataclasses.fields(Config):
-        assert f"--{field.name.replace('_', '-')}" in text
-    assert "largest global norm of a gradient" in text
-    assert "(fast, best or paper)" in text
-
-
 @pytest.mark.parametrize(
     ("settings", "episodes", "expected"),
     [
