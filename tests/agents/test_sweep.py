@@ -186,22 +186,17 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
     ("arguments", "words"),
     [
         (["--settings", "clip_eps"], "NAME=VALUE,VALUE, got 'clip_eps'"),
-        (["--settings", "clip_eps="], "NAME=VALUE,VALUE, got 'clip_eps='"),
-        (["--settings", "clip_eps=1", "clip_eps=2"], "give a setting only once"),
         (["--settings", "clip_eps=1", "--settings", "clip_eps=2"], "give a setting only once"),
-        (["--settings", "clp_eps=1,2"], "did you mean 'clip_eps'"),
-        (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
         (["--settings", "max_transitions=5"], "max_transitions must allow an iteration"),
-        (["--only", "fst"], "no point 'fst'; allowed: fast"),
-        ([*NEAR_FOOD, "--only", "x"], "no point 'x'"),  # the module registers the set first
+        (
+            [*NEAR_FOOD, "--only", "x"],
+            "no point 'x'; allowed: fast",
+        ),  # it registers the set
         (["--seeds", "0"], "seeds must be an integer >= 1 and <= 10000, got 0"),
-        (["--seeds", "2000000000"], "seeds must be an integer >= 1 and <= 10000"),
         (["--seeds", "9", "--settings", MANY], "a grid has at most 10,000 runs, got 18,000"),
-        (["--seed", "-1"], "seed must be an integer >= 0"),
         (["--processes", "0"], "processes must be an integer >= 1, got 0"),
         (["--seeds-per-program", "0"], "seeds_per_program must be an integer"),
         (["--name", "a/b"], "folder's name"),
-        (["--env", "nowhere"], "nowhere"),
         (
             ["--env", "sy", "--settings", "env_id=p"],
             "give --env or --settings env_id=..., not both",

@@ -158,19 +158,9 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--preset slow", f"unknown preset 'slow'; allowed: {', '.join(PRESETS)}"),
-        ("--env q", "unknown task set 'q'; allowed: base, p, "),
         ("--env q", "as by --import MODULE"),
-        ("--minibatch-size 3", "minibatch_size must divide episodes_per_iteration=256, got 3"),
-        ("--episodess 8", "--episodess"),
-        ("--curiosity icmm", "unknown curiosity 'icmm' (did you mean 'icm'?); allowed: icm, "),
-        ("--discount 2", "discount must be a finite number from 0 to 1, got 2"),
-        ("--max-gradient-norm inf", "max_gradient_norm must be a finite number"),
-        ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),
         ("--max-transitions 5", "must allow an iteration, which takes up to 12,800"),
         ("--name a/b", "name must be a folder's name without a path"),
-        ("--resume x", "--resume continues a run as it is; leave out --name, --out, --preset and"),
-        ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
 )
 def test_impossible_settings_are_refused_and_write_no_run(capsys, tmp_path, arguments, message):
