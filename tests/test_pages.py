@@ -135,10 +135,13 @@ def test_commands_exist_with_their_options(command):
 
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
 @pytest.mark.parametrize("module", sorted({command.split()[0] for command in commands()}))
-def test_help_fits_80_columns(module):
+def test_help_fits_80_columns_and_100_lines(module):
     if module.startswith(("agents.examples.rejax", "agents.examples.sb3")):
         pytest.skip("needs other libraries")
-    assert max(map(len, help_of(module).splitlines())) < 80
+    shown = help_of(module)
+    assert "usage:" in shown
+    assert max(map(len, shown.splitlines())) < 80
+    assert len(shown.splitlines()) <= 100
 
 
 def test_agent_md_states_every_setting_that_a_preset_changes():

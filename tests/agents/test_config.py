@@ -38,7 +38,6 @@ def test_a_preset_trains_in_a_custom_environment_without_curiosity_and_previous_
         ({"discount": 1.5}, ["discount", "1.5", "from 0 to 1"]),
         ({"recurrent": "no"}, ["recurrent must be True or False", "'no'"]),
         ({"env_id": None}, ["env_id must be a name", "None"]),
-        ({"hidden": (64, 32)}, ["hidden must be an integer from 1", "(64, 32)"]),
         ({"replay_fractions": 0.5}, ["replay_fractions must be a tuple of numbers", "0.5"]),
         ({"max_gradient_norm": 0.0}, ["max_gradient_norm", "from 1e-12", "0.0"]),
         ({"gae_lambda": -0.1}, ["gae_lambda", "-0.1"]),
@@ -51,7 +50,6 @@ def test_a_preset_trains_in_a_custom_environment_without_curiosity_and_previous_
         ({"replay_fractions": (0.6, 0.4)}, ["replay_fractions must leave", "(0.6, 0.4)"]),
         ({"adam_epsilon": 0.0}, ["adam_epsilon", "1e-12", "0.0"]),
         ({"learning_rate": "fast"}, ["learning_rate", "finite number", "fast"]),
-        ({"learning_rate": math.inf}, ["learning_rate", "finite number", "inf"]),
         ({"value_coef": math.nan}, ["value_coef", "finite number", "nan"]),
         ({"bootstrap": "none"}, ["bootstrap", "none", "value, baseline"]),
         (
@@ -61,9 +59,7 @@ def test_a_preset_trains_in_a_custom_environment_without_curiosity_and_previous_
         ({"object_colors": True}, ["object_colors needs encoder='objects', got 'paper'"]),
         ({"intrinsic_coef_init": 0.01}, ["intrinsic_coef_init", "at least intrinsic_coef", "0.01"]),
         ({"intrinsic_coef_init": 1.0, "intrinsic_coef": 0.0}, ["> 0", "intrinsic_coef=0.0"]),
-        ({"max_steps": 5.0}, ["max_steps", "integer", "5.0"]),
         ({"epsiodes_per_iteration": 3}, ["did you mean 'episodes_per_iteration'", "epochs"]),
-        ({"name": "x"}, ["unknown setting 'name'"]),
     ],
 )
 def test_refusals_name_the_value_and_what_is_allowed(settings, words):

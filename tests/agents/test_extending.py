@@ -59,7 +59,8 @@ def test_a_run_records_the_module_and_needs_leave_to_import_it(here):
     assert 6 < float(row["episode_length"]) <= 30
     assert float(row["intrinsic_reward"]) > 0 or not HAS_DEFAULT_DRAWS
 
-    assert_refused(["my_module", "--import"], agents.load, folder)
+    words = ["unknown curiosity 'tool-moved'", "--import my_module"]
+    assert_refused(words, agents.load, folder)
     assert "my_module" not in sys.modules
     policy = agents.load(folder, imports=("my_module",))
     assert (policy.config.curiosity, policy.config.encoder) == ("tool-moved", "flat")

@@ -17,7 +17,6 @@ from agents import experiments, sweep
 from agents.config import Config
 from agents.files import lock_folder
 from agents.runs.folder import RunFolder
-from agents.runs.metrics import append_rows
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import launcher, overview, workers
 from agents.sweeps.grids import GRIDS, Grid, Options
@@ -46,13 +45,10 @@ def launch_three(monkeypatch, tmp_path, train_runs, names=("a", "b", "c")):
 
 def end(path):
     """Writes the files of a run that has ended."""
-    folder = RunFolder(path)
-    folder.path.mkdir(exist_ok=True)
-    costs = {"iteration": 250, "episodes": 9, "transitions": 5, "seconds": 1.0}
-    append_rows(folder.metrics, [{**costs, "validation_success": 0.0}])
     tested = {"purpose": "test", "task_set": "base", "tasks": 1, "solved": 0}
     few = {"layouts": "", "layouts_total": ""}
-    append_rows(folder.evaluations, [{"iteration": 250, **tested, **few}])
+    evaluations = [{"iteration": 250, **tested, **few}]
+    small_runs.stored_run(path, Run(Config()), [small_runs.metrics_row(250)], evaluations)
 
 
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
@@ -179,20 +175,16 @@ def test_the_progress_of_a_grid_fits_a_terminal(tmp_path):
     ("arguments", "words"),
     [
         (["--settings", "clip_eps"], "NAME=VALUE,VALUE, got 'clip_eps'"),
-        (["--settings", "clip_eps="], "NAME=VALUE,VALUE, got 'clip_eps='"),
-        (["--settings", "clip_eps=1", "clip_eps=2"], "give a setting only once"),
         (["--settings", "clip_eps=1", "--settings", "clip_eps=2"], "give a setting only once"),
-        (["--settings", "clp_eps=1,2"], "did you mean 'clip_eps'"),
-        (["--settings", "curiosity=rnd,rdn"], "unknown curiosity 'rdn'"),
         (["--settings", "max_transitions=5"], "max_transitions must allow an iteration"),
-        (["--only", "fst"], "no point 'fst'; allowed: fast"),
-        ([*NEAR_FOOD, "--only", "x"], "no point 'x'"),  # the module registers the set first
+        (
+            [*NEAR_FOOD, "--only", "x"],
+            "no point 'x'; allowed: fast",
+        ),  # it registers the set
         (["--seeds", "0"], "seeds must be an integer >= 1, got 0"),
-        (["--seed", "-1"], "seed must be an integer >= 0"),
         (["--processes", "0"], "processes must be an integer >= 1, got 0"),
         (["--seeds-per-program", "0"], "seeds_per_program must be an integer"),
         (["--name", "a/b"], "folder's name"),
-        (["--env", "nowhere"], "nowhere"),
         (
             ["--env", "sy", "--settings", "env_id=p"],
             "give --env or --settings env_id=..., not both",

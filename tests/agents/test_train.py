@@ -157,28 +157,14 @@ def test_evaluate_writes_before_it_prints(whole, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--preset slow", f"unknown preset 'slow'; allowed: {', '.join(PRESETS)}"),
-        ("--env q", "unknown task set 'q'; allowed: base, p, "),
         ("--env q", "as by --import MODULE"),
-        ("--minibatch-size 3", "minibatch_size must divide episodes_per_iteration=256, got 3"),
-        ("--episodess 8", "--episodess"),
-        ("--curiosity icmm", "unknown curiosity 'icmm' (did you mean 'icm'?); allowed: icm, "),
-        ("--discount 2", "discount must be a finite number from 0 to 1, got 2"),
-        ("--max-gradient-norm inf", "max_gradient_norm must be a finite number"),
-        ("--episodes-per-iteration 1000000000", "episodes_per_iteration must be an integer from 1"),
         ("--max-transitions 5", "must allow an iteration, which takes up to 12,800"),
         ("--name a/b", "name must be a folder's name without a path"),
-        ("--resume x", "--resume continues a run as it is; leave out --name, --out, --preset and"),
-        ("--import no_such_module", "cannot import 'no_such_module'"),
     ],
 )
 def test_impossible_settings_are_refused_and_write_no_run(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, main, *arguments.split(), "--out", tmp_path)
     assert not list(tmp_path.rglob("*.json"))
-
-
-def test_a_missing_run_is_not_resumed(capsys):
-    assert "no/such holds no run; runs in no: none" in refused(capsys, main, "--resume", "no/such")
 
 
 def test_a_folder_of_other_files_is_not_written_to(capsys, tmp_path):
@@ -311,20 +297,6 @@ def test_resumed_runs_keep_their_settings_and_options(tmp_path):
     expected = dataclasses.replace(stored.config, iterations=999)
     run = dataclasses.replace(stored, config=expected)
     assert wanted == [run, dataclasses.replace(how, checkpoint_every=2)]
-
-
-def test_help_documents_every_setting(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit) as exit_info:
-        main(["--help"])
-    assert exit_info.value.code == 0
-    output = capsys.readouterr().out
-    assert len(output.splitlines()) <= 100
-    text = " ".join(output.split())
-    for field in dataclasses.fields(Config):
-        assert f"--{field.name.replace('_', '-')}" in text
-    assert "largest global norm of a gradient" in text
-    assert "(fast, best or paper)" in text
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,8 @@ import sys
 
 from agents.config import Config
 from agents.runs import checkpoint
+from agents.runs.folder import RunFolder
+from agents.runs.metrics import append_rows
 from helpers.paths import ROOT
 
 SETTINGS = {
@@ -84,6 +86,15 @@ def final_state(folder):
     """Returns the iteration and the bytes of the arrays of the newest checkpoint."""
     arrays, record = checkpoint.load(folder / "checkpoints")
     return record["iteration"], {name: array.tobytes() for name, array in arrays.items()}
+
+
+def stored_run(path, run, metrics=(), evaluations=(), options=None):
+    """Writes the settings of a run, and rows of its files; returns its folder."""
+    folder = RunFolder(path)
+    folder.write_config(run, options)
+    append_rows(folder.metrics, metrics)
+    append_rows(folder.evaluations, evaluations)
+    return folder
 
 
 def metrics_row(iteration, **values):

@@ -43,12 +43,6 @@ def test_log_prob_and_entropy_of_actions(cases):
     np.testing.assert_allclose(actions.entropy(), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_mode_is_the_most_probable_action(cases):
-    mode = distribution(jnp.asarray(cases["logits"])).mode()
-    best = cases["logits"].argmax(-1)
-    np.testing.assert_array_equal(mode, np.stack([best, CHOICES - 1 - best], axis=-1))
-
-
 def test_samples_have_the_joint_frequencies():
     logits = jnp.broadcast_to(jnp.log(jnp.array([0.1, 0.2, 0.3, 0.4])), (20_000, CHOICES))
     action = distribution(logits).sample(jax.random.key(0))

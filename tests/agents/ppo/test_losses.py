@@ -1,4 +1,4 @@
-"""The clipped objective, and means over padded steps."""
+"""The clipped objective."""
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +26,3 @@ def test_clipping_stops_the_gradient_only_where_it_would_go_further(
     value, gradient = surrogate(log_ratio, old, advantage, 0.2)
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     assert bool(gradient != 0) == moves
-
-
-def test_padding_counts_as_zeros_in_means():
-    x = jnp.array([[1.0, 2.0], [4.0, 100.0]])
-    mask = jnp.array([[1.0, 1.0], [1.0, 0.0]])
-    assert losses.padded_mean(x, mask) == 7 / 4

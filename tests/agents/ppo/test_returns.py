@@ -1,19 +1,14 @@
-"""Normalisation against float64 NumPy on random episodes with masks, and the rules of bootstrap."""
+"""The rules of bootstrap at the end of an episode."""
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from agents.acting.episodes import Episodes
 from agents.config import Config
-from agents.ppo import advantages, returns
-
-CASES = 1_000
-STEPS = 23
-
+from agents.ppo import advantages
 
 TERMINATED = ([1, 0, 0], [1, 1, 0])
 TRUNCATED = ([1, 1, 1], [1, 1, 1])
@@ -40,18 +35,3 @@ def test_the_rules_of_bootstrap_differ_at_the_end(bootstrap, end, advantage, tar
     found = advantages.advantages_and_targets(config, mask, episodes, value)
     np.testing.assert_allclose(found[0][0], advantage)
     np.testing.assert_allclose(found[1][0, : len(target)], target)
-
-
-def test_normalized_steps_have_mean_0_and_deviation_1():
-    """Episodes have different lengths, from 3 to STEPS steps, and are masked after their end."""
-    rng = np.random.default_rng(0)
-    length = rng.integers(3, STEPS + 1, CASES)
-    mask = (np.arange(STEPS)[None] < length[:, None]).astype(np.float32)
-    value = rng.normal(size=mask.shape).astype(np.float32)
-    arrays = jnp.asarray(value), jnp.asarray(mask)
-    normalized = np.asarray(jax.vmap(returns.normalize)(*arrays))
-    for case, count in enumerate(length):
-        chosen = value[case, :count].astype(np.float64)
-        want = (chosen - chosen.mean()) / chosen.std()
-        np.testing.assert_allclose(normalized[case, :count], want, rtol=1e-3, atol=1e-3)
-        assert np.all(normalized[case, count:] == 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trap_tube_jax as tt
-from agents.profiles.subgoals import SUBGOALS, last_subgoals, replay, tool_moves
+from agents.profiles.subgoals import SUBGOALS, last_subgoals, replay
 
 UP, DOWN, LEFT, RIGHT = range(4)
 # The shortest plan of the base task, in pairs of grasp and move.
@@ -38,9 +38,3 @@ def test_last_subgoal_of_an_episode_in_a_batch(cells, actions, expected):
     batch = np.array([AWAY * len(actions), actions], np.int32)
     found = last_subgoals(tasks, batch, replay(tasks, batch))
     assert [SUBGOALS[index] for index in found] == ["none", expected]
-
-
-def test_a_tool_that_returns_to_its_cell_has_moved():
-    tasks = jax.tree.map(lambda x: np.stack([x, x]), tt.base_state())
-    actions = np.array([[*PLAN[:2], (UP, LEFT)], [PLAN[0], *AWAY * 2]], np.int32)
-    assert tool_moves(replay(tasks, actions)).tolist() == [True, False]

@@ -122,19 +122,6 @@ def test_a_run_that_is_not_found_is_answered_with_those_near(tmp_path, monkeypat
         assert_refused([f"{path} holds no run; {words}"], RunFolder(Path(path)).read)
 
 
-def test_reading_a_run_imports_nothing_that_it_names(tmp_path, monkeypatch):
-    (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
-    monkeypatch.chdir(tmp_path)
-    RunFolder(tmp_path / "x").path.mkdir()
-    RunFolder(tmp_path / "x").write_config(Run(Config(), imports=("evil",)))
-    values = read_json(tmp_path / "x" / "config.json")
-    values["config"]["curiosity"] = "evil-curiosity"
-    write_json(tmp_path / "x" / "config.json", values)
-    assert_refused(
-        ["unknown curiosity 'evil-curiosity'", "--import evil"], RunFolder(tmp_path / "x").read
-    )
-
-
 def test_files_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "new" / "x.json"
     write = Path.write_bytes

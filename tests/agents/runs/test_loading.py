@@ -109,6 +109,8 @@ def header(iteration: int | str = 1, **settings):
     [
         *(({"json": text}, {}, "cannot be read: ") for text in ("{", "[]", '{"config": []}')),
         ({}, {}, "lacks 'json'"),
+        ({"json": '{"iteration": 1}'}, {}, "lacks 'config'"),
+        ({"json": json.dumps({"config": CONFIG.to_dict()})}, {}, "lacks 'iteration'"),
         (header(clip=0.2), {}, "unknown setting 'clip'"),
         (header(hidden=5), {}, r"core/params/bias is float32\[2, 12\], not float32\[2, 15\]"),
         (header(encoder="own"), {}, "unknown encoder 'own'.*--import MODULE"),
@@ -124,6 +126,7 @@ def test_files_of_other_content_are_refused(stored, changes, message, tmp_path):
     with pytest.raises(ValueError, match=message) as error:
         read_policy(path)
     assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 PRESETS_OF = {

@@ -53,20 +53,6 @@ def test_a_full_disk_leaves_no_part_of_a_row(begun, tmp_path):
     assert list(read_rows(path)["iteration"]) == [1, 2][not begun :]
 
 
-def test_names_that_pandas_takes_for_missing_are_names(tmp_path):
-    path = tmp_path / "evaluations.csv"
-    names = ["NA", "null", "nan", "None"]
-    values = {"iteration": 1, "purpose": "test", "tasks": 2, "solved": 1}
-    values |= {"layouts": "", "layouts_total": ""}
-    append_rows(path, [{**values, "task_set": name} for name in names])
-    assert list(read_rows(path)["task_set"]) == names
-
-
-def test_a_missing_folder_is_an_error_of_the_file_system(tmp_path):
-    with pytest.raises(OSError, match="none"):
-        append_rows(tmp_path / "none" / "metrics.csv", [row(1)])
-
-
 def test_other_columns_are_refused(tmp_path):
     path = tmp_path / "metrics.csv"
     append_rows(path, [row(1)])

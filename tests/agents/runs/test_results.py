@@ -7,9 +7,9 @@ import pytest
 import agents
 from agents.runs import results as module
 from agents.runs.folder import RunFolder
-from agents.runs.metrics import append_rows
 from agents.runs.run import Run
 from helpers.refusal import assert_refused
+from helpers.small_runs import stored_run
 from helpers.tiny_policy import CONFIG
 
 EVALUATION = {
@@ -22,10 +22,7 @@ EVALUATION = {
 def runs(tmp_path) -> Path:
     """A folder of the runs a and deep/b, which have one evaluation."""
     for name in ("a", "deep/b"):
-        folder = RunFolder(tmp_path / "runs" / name)
-        folder.path.mkdir(parents=True)
-        folder.write_config(Run(CONFIG))
-        append_rows(folder.evaluations, [EVALUATION])
+        stored_run(tmp_path / "runs" / name, Run(CONFIG), evaluations=[EVALUATION])
     return tmp_path / "runs"
 
 

@@ -9,10 +9,10 @@ from agents.runs import program
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
-from agents.runs.metrics import append_rows, read_rows
+from agents.runs.metrics import read_rows
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_run, train_runs
-from helpers.small_runs import final_state, small_config, untimed
+from helpers.small_runs import final_state, metrics_row, small_config, stored_run, untimed
 from helpers.training import PLAIN, TRACKED, count_up, replace_training, small_run
 from helpers.trees import assert_same
 from trap_tube_jax.interruptions import Stopped
@@ -87,9 +87,7 @@ def test_a_seed_that_fails_or_is_solved_ends_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(Evaluator, "__call__", record)
     config = small_config(iterations=3, stop_when_solved=1.0)
     runs = {tmp_path / f"{seed}": Run(config, seed) for seed in range(5)}
-    RunFolder(tmp_path / "0").checkpoints.mkdir(parents=True)
-    costs = {"iteration": 1, "episodes": 8, "transitions": 48, "seconds": 1.0}
-    append_rows(tmp_path / "0" / "metrics.csv", [{**costs, "validation_success": 0.0}])
+    stored_run(tmp_path / "0", Run(config), [metrics_row(1)], options=PLAIN)
     (tmp_path / "4").mkdir()
     (tmp_path / "4" / "provenance.json").write_text("{")
     failed, diverged, solved, other, damaged = train_runs(runs, PLAIN).values()

@@ -15,7 +15,7 @@ from rich.console import Console
 import agents
 import trap_tube_jax as tt
 from agents.arrays import read_arrays, write_arrays
-from agents.runs import checkpoint, history, program, progress, session
+from agents.runs import history, program, progress, session
 from agents.runs.folder import RunFolder
 from agents.runs.loading import read_policy
 from agents.runs.metrics import append_rows, read_rows
@@ -254,26 +254,20 @@ def forget(key):
         ),
     ],
 )
-@pytest.mark.parametrize("more", [0, 1])
-def test_a_run_with_missing_files_is_refused_unchanged(copy, name, damage, message, more):
-    """Resumed as it is, and extended."""
+def test_a_run_with_missing_files_is_refused_unchanged(copy, name, damage, message):
     damage(copy / name)
     before = contents(copy)
     with pytest.raises(ValueError, match=message):
-        train_run(copy, small_run(iterations=ITERATIONS + more), TRACKED)
+        train_run(copy, small_run(iterations=ITERATIONS + 1), TRACKED)
     assert contents(copy) == before
 
 
 @pytest.mark.parametrize("changed", [{"sets": ("st",)}, {"evaluate_every": 0}, {"test_tasks": 9}])
-@pytest.mark.parametrize("more", [0, 1])
-def test_a_resumed_run_keeps_its_evaluation(copy, changed, more):
+def test_a_resumed_run_keeps_its_evaluation(copy, changed):
     before = contents(copy)
+    options = dataclasses.replace(TRACKED, **changed)
     with pytest.raises(ValueError, match="sets, test_tasks may not change in a run; to play other"):
-        train_run(
-            copy,
-            small_run(iterations=ITERATIONS + more),
-            dataclasses.replace(TRACKED, **changed),
-        )
+        train_run(copy, small_run(iterations=ITERATIONS + 1), options)
     assert contents(copy) == before
 
 
@@ -311,12 +305,6 @@ def test_a_run_on_a_mixture_is_scored_on_it_and_goes_on(tmp_path, monkeypatch):
     assert len(untimed(tmp_path / "x")) == 2
     assert set(results(tmp_path)["task_set"]) == {"base+p"}
     assert agents.load(tmp_path / "x").config.env_id == "TrapTube-v0+PerceptualTrapTube-v0"
-
-
-def test_a_path_may_begin_at_home(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    train_run("~/x", small_run(iterations=1), PLAIN)
-    assert len(untimed(tmp_path / "x")) == 1
 
 
 @pytest.mark.parametrize(
@@ -367,18 +355,6 @@ def test_a_run_stops_after_the_iteration_in_which_it_is_asked_to(tmp_path, monke
     with pytest.raises(Stopped):
         train_run(tmp_path / "x", small_run(), PLAIN, stop=lambda: True)
     assert final_state(tmp_path / "x")[0] == len(untimed(tmp_path / "x")) == 1
-
-
-def test_a_full_disk_is_an_error_and_the_run_goes_on_later(tmp_path, monkeypatch):
-    def full(*args, **kwargs):
-        raise OSError("cannot write checkpoint 2: no space")
-
-    monkeypatch.setattr(checkpoint, "save", full)
-    with pytest.raises(OSError, match="no space"):
-        train_run(tmp_path / "x", small_run(), PLAIN)
-    monkeypatch.undo()
-    train_run(tmp_path / "x", small_run(), PLAIN)
-    assert final_state(tmp_path / "x")[0] == ITERATIONS
 
 
 def test_speed_is_steps_over_the_seconds_of_an_iteration(tmp_path, monkeypatch):

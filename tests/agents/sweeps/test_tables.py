@@ -10,14 +10,13 @@ from PIL import Image
 
 import trap_tube_jax as tt
 from agents.files import read_json, write_json
-from agents.runs.folder import RunFolder
-from agents.runs.metrics import append_rows, read_rows
+from agents.runs.metrics import read_rows
 from agents.runs.provenance import note_provenance
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import figures, records, tables
 from helpers.paths import ROOT
 from helpers.refusal import assert_refused
-from helpers.small_runs import small_config
+from helpers.small_runs import small_config, stored_run
 
 RESULTS = ROOT / "benchmarks" / "results"
 RECORDS = (
@@ -59,6 +58,14 @@ def curves(algorithm="ppo", evaluations=((0, 1), (0, 0, 1))):
         for seed, shares in enumerate(evaluations)
         for i, share in enumerate(shares, 1)
     )  # fmt: skip
+
+
+def of_a_run(table):
+    """Returns the rows of a table as the file of a run has them."""
+    return pd.DataFrame(table).drop(columns=["algorithm", "seed"]).to_dict("records")
+
+
+CURVE = of_a_run(curves(evaluations=((0, 1),)))
 
 
 @pytest.mark.parametrize(
@@ -142,92 +149,80 @@ def test_holms_factors_never_let_a_larger_p_pass_a_smaller_one(p, corrected):
     np.testing.assert_allclose(tables.holm_factors(np.array(p)) * p, corrected)
 
 
-def test_seeds_that_do_not_vary_have_no_test():
-    given = {"a": [3] * 5, "b": [3] * 10, "c": [4] * 5, "d": [3, 3, 3, 3, 4]}
-    results = pd.DataFrame([row for name in given for row in rows(name, given[name])])
-    found = tables.differences(tables.reported(results)).set_index(["task_set", "algorithm"])
-    columns = ["difference", "low", "high", "p"]
-    for name, difference in {"b": 0, "c": 10}.items():
-        np.testing.assert_allclose(
-            found.loc[("p", name), columns].tolist(), [difference, *3 * [np.nan]]
-        )
-    assert found.loc[("p", "d"), "p"] == pytest.approx(0.3739, abs=1e-4)  # t = 1 at 4
-    shown = tables.tables(results, curves(), ABOUT)["Difference from a, points"]
-    assert shown.loc["{P}"].tolist() == ["+0.0", "+10.0", "+2.0 [-3.6, 7.6]"]
-    figures.draw_differences(found.reset_index(), ABOUT)
-
-
-def test_means_that_differ_by_rounding_alone_do_not_vary():
-    solved = {"a": [(1, 3, 2), (2, 2, 1), (3, 1, 3)], "b": [(1, 4, 2), (2, 2, 4), (4, 1, 1)]}
-    results = pd.DataFrame(
-        [
-            row
-            for name, counts in solved.items()
-            for task_set, of_seeds in zip(("p", "pst", "psy"), counts, strict=True)
-            for row in rows(name, of_seeds, task_set=task_set, tasks=1000)
-        ]
-    )
-    found = tables.differences(tables.reported(results)).set_index("task_set")
-    assert found.loc[tables.MEAN, "difference"] == pytest.approx(1 / 30)
-    assert np.isnan(found.loc[tables.MEAN, "p"])
-    shown = tables.difference_table(found.reset_index())
-    assert shown.loc[tables.MEAN].tolist() == ["+0.0"]
-
-
-def test_an_algorithm_that_lacks_a_set_leaves_its_differences_to_others():
-    given = [row for name in "abc" for row in rows(name, [5, 6, 7], task_set="st")]
-    results = pd.DataFrame(given + rows("a", [5, 6, 7]) + rows("b", [1, 2, 3]))
-    tested = tables.reported(results)
-    shown = tables.tables(results, curves(), ABOUT)["Difference from a, points"]
-    assert shown.loc["{P}"].tolist() == ["-40.0 [-62.7, -17.3]*", "–"]
-    assert "–" in tables.markdown(shown)
-    figure = figures.draw_differences(tables.differences(tested), ABOUT)
-    assert [axis.get_title() for axis in figure.axes] == ["{P}", "{St}", tables.MEAN]
-
-
-def test_a_grid_tested_on_base_alone_has_no_mean_without_base():
-    tested = tables.reported(
-        pd.DataFrame(rows("a", [5, 6], task_set="base") + rows("b", [5, 7], task_set="base"))
-    )
-    assert list(tables.by_set(tested)) == ["base"]
-    assert set(tables.differences(tested)["task_set"]) == {"base"}
-
-
-def test_seeds_that_lack_a_set_are_left_out_of_its_comparison():
-    base = [row for name in "abc" for row in rows(name, [5, 6, 7], task_set="st")]
-    given = rows("a", [5, 6, 7]) + rows("b", [1, 2]) + rows("c", [1])
-    found = tables.differences(tables.reported(pd.DataFrame(base + given)))
-    found = found.set_index(["task_set", "algorithm"])
-    assert found.loc[("p", "b"), "difference"] == pytest.approx(15 - 60)
-    assert ("p", "c") not in found.index
-    assert found.notna().all(axis=None)
-
-
-def test_a_seed_that_lacks_a_set_has_no_mean_and_leaves_the_bars_of_others():
-    given = rows("a", [5, 6]) + rows("a", [9], task_set="st")
+@pytest.mark.parametrize(
+    ("solved", "means", "shown"),
+    [
+        (  # seeds that do not vary have no test
+            {"p": {"a": [300] * 5, "b": [300] * 10, "c": [400] * 5, "d": [300] * 4 + [400]}},
+            {"{P}": [30, 30, 40, 32], tables.MEAN: [30, 30, 40, 32]},
+            {x: ["+0.0", "+10.0", "+2.0 [-3.6, 7.6]"] for x in ("{P}", tables.MEAN)},
+        ),
+        (  # nor have means over sets that differ by rounding alone
+            {
+                "p": {"a": [1, 3, 2], "b": [1, 4, 2]},
+                "st": {"a": [2, 2, 1], "b": [2, 2, 4]},
+                "sy": {"a": [3, 1, 3], "b": [4, 1, 1]},
+            },
+            {"{P}": [0.2, 0.7 / 3], "{St}": [0.5 / 3, 0.8 / 3], "{Sy}": [0.7 / 3, 0.2],
+             tables.MEAN: [0.2, 0.7 / 3]},
+            {"{P}": ["+0.0 [-0.3, 0.3]"], "{St}": ["+0.1 [-0.1, 0.3]"],
+             "{Sy}": ["+0.0 [-0.4, 0.3]"], tables.MEAN: ["+0.0"]},
+        ),
+        (  # the mean leaves out base
+            {"p": {"a": [500, 700], "b": [100, 100]}, "base": {"a": [900] * 2, "b": [1000] * 2}},
+            {"base": [90, 100], "{P}": [60, 10], tables.MEAN: [60, 10]},
+            {"base": ["+10.0"], **{x: ["-50.0 [-177.1, 77.1]"] for x in ("{P}", tables.MEAN)}},
+        ),
+        (  # and there is none of base alone
+            {"base": {"a": [500, 600], "b": [500, 700]}},
+            {"base": [55, 60]},
+            {"base": ["+5.0 [-64.2, 74.2]"]},
+        ),
+        (  # seeds and algorithms that lack a set leave it to the others
+            {
+                "st": {name: [500, 600, 700] for name in "abcd"},
+                "p": {"a": [500, 600, 700], "b": [100, 200], "c": [100]},
+            },
+            {"{P}": [60, 15, 10, np.nan], "{St}": [60] * 4, tables.MEAN: [60] * 4},
+            {"{P}": ["-45.0 [-69.9, -20.1]*", "–", "–"],
+             **{x: 3 * ["+0.0 [-32.3, 32.3]"] for x in ("{St}", tables.MEAN)}},
+        ),
+        (  # a seed that lacks a set has no mean
+            {"p": {"a": [500, 600], "b": [700, 800]}, "st": {"a": [900], "b": [700] * 2}},
+            {"{P}": [55, 75], "{St}": [90, 70], tables.MEAN: [70, 72.5]},
+            {"{P}": ["+20.0 [-10.4, 50.4]"]},
+        ),
+        (  # with one seed there is nothing to compare; a set that one lacks is not in the mean
+            {"p": {"a": [500], "b": [600, 700], "c": [700] * 2}, "mine": {"b": [0, 200]}},
+            {"{P}": [50, 65, 70], "mine": [np.nan, 10, np.nan], tables.MEAN: [50, 65, 70]},
+            {},
+        ),
+    ],
+)  # fmt: skip
+def test_scores_may_be_missing_or_not_vary(solved, means, shown):
+    """Of 1,000 tasks: solved by set, algorithm and seed; percents by set and algorithm."""
+    given = [
+        row
+        for task_set, by_algorithm in solved.items()
+        for name, counts in by_algorithm.items()
+        for row in rows(name, counts, task_set=task_set, tasks=1000)
+    ]
     tested = tables.reported(pd.DataFrame(given))
     table = tables.success_table(tested, with_paper=False)
-    assert table.loc[["{St}", tables.MEAN], "a"].tolist() == ["90.0", "70.0"]
-    figure = figures.draw_success(tested, {**ABOUT, "train_set": "st"})
-    widths = {axis.get_title(): axis.patches[0].get_width() for axis in figure.axes}
-    assert widths == {"{P}": 55, "{St}": 90, tables.MEAN: 70}
-
-
-def test_the_mean_is_over_the_sets_of_all_algorithms_without_base():
-    given = [row for name in ("p", "st", "base") for row in rows("a", [5, 7], task_set=name)]
-    given += rows("a", [0, 2], task_set="mine")  # only its training set
-    given += [row for name in ("p", "st") for row in rows("b", [6], task_set=name)]
-    tested = tables.reported(pd.DataFrame(given))
-    table = tables.success_table(tested, with_paper=False)
-    assert table.loc[tables.MEAN].tolist() == ["60.0 [0.0, 100.0]", "60.0"]
-    figure = figures.draw_success(tested, ABOUT)  # with no bar where nothing is known
-    (mine,) = (axis for axis in figure.axes if axis.get_title() == "mine")
-    assert [mine.patches[0].get_width(), np.isnan(mine.patches[1].get_width())] == [10, True]
-
-
-def test_algorithms_of_one_seed_are_not_compared():
-    tested = pd.DataFrame(rows("ppo", [5]) + rows("ppo+icm", [6, 7]))
-    assert len(tables.differences(tables.reported(tested))) == 0
+    numbers = [[float(text.replace("–", "nan").split()[0]) for text in row] for row in table.values]
+    assert list(table.index) == list(means)
+    np.testing.assert_allclose(numbers, list(means.values()), atol=0.05)
+    axes = figures.draw_success(tested, {**ABOUT, "train_set": "st"}).axes
+    assert [axis.get_title() for axis in axes] == list(means)
+    widths = [[bar.get_width() for bar in axis.patches] for axis in axes]
+    np.testing.assert_allclose(widths, list(means.values()))
+    compared = tables.differences(tested)
+    assert bool(len(compared)) == bool(shown)
+    if shown:
+        found = tables.difference_table(compared)
+        assert {name: list(row) for name, row in found.iterrows()} == shown
+        figure = figures.draw_differences(compared, ABOUT)
+        assert [axis.get_title() for axis in figure.axes] == list(found.index)
 
 
 def test_training_is_summed_up_with_the_papers_trials():
@@ -318,12 +313,8 @@ def test_sets_of_equal_transfers_are_told_apart_and_one_may_be_named_na(tmp_path
 
 def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
     for seed, iterations in ((0, 2), (1, 3)):
-        folder = RunFolder(tmp_path / f"seed{seed}")
-        folder.write_config(Run(small_config(iterations=iterations, stop_when_solved=0), seed))
-        done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
-        append_rows(folder.metrics, done.to_dict("records"))
-        tested = pd.DataFrame(rows("ppo", [1])).drop(columns=["algorithm", "seed"])
-        append_rows(folder.evaluations, tested.to_dict("records"))
+        run = Run(small_config(iterations=iterations, stop_when_solved=0), seed)
+        stored_run(tmp_path / f"seed{seed}", run, CURVE, of_a_run(rows("ppo", [1])))
     launched = {tmp_path / "seed2": Run(small_config(), 2)}  # which left no settings
     for command in ("first", "second", "first"):
         records.collect(tmp_path, command, launched, [])
@@ -337,10 +328,8 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
 
 def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
     for name, threshold in (("base", 0.5), ("sy", 0.9)):
-        folder = RunFolder(tmp_path / name)
-        folder.write_config(Run(small_config(env_id=name, stop_when_solved=threshold)))
-        metrics = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
-        append_rows(folder.metrics, metrics.to_dict("records"))
+        run = Run(small_config(env_id=name, stop_when_solved=threshold))
+        stored_run(tmp_path / name, run, CURVE)
     records.collect(tmp_path, "sweep", {}, [])
     about = read_json(tmp_path / "grid.json")
     assert about["title"].endswith(": trained on base or {Sy}")
@@ -350,9 +339,7 @@ def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):
 
 
 def test_what_others_have_written_is_plain_text(tmp_path):
-    folder = RunFolder(tmp_path / "seed0")
-    folder.write_config(Run(small_config()))
-    append_rows(folder.metrics, curves().drop(columns=["algorithm", "seed"]).to_dict("records"))
+    folder = stored_run(tmp_path / "seed0", Run(small_config()), CURVE)
     note_provenance(folder.provenance, "cpu")
     (machine,) = read_json(folder.provenance)
     write_json(folder.provenance, [{**machine, "processor": "<b>[x](y)`"}])
@@ -366,10 +353,7 @@ def test_what_others_have_written_is_plain_text(tmp_path):
 def test_what_cannot_be_made_again_is_kept(tmp_path):
     """A note that is written by hand, and rows of runs whose folders are gone."""
     for seed in (0, 1):
-        folder = RunFolder(tmp_path / f"seed{seed}")
-        folder.write_config(Run(small_config(), seed))
-        done = curves(evaluations=((0, 1),)).drop(columns=["algorithm", "seed"])
-        append_rows(folder.metrics, done.to_dict("records"))
+        stored_run(tmp_path / f"seed{seed}", Run(small_config(), seed), CURVE)
     records.check(tmp_path, {}, RunOptions())
     records.collect(tmp_path, "first", {}, [])
     about = read_json(tmp_path / "grid.json")
@@ -398,8 +382,8 @@ def test_seeds_of_other_settings_or_evaluations_are_not_averaged(
     settings, options, words, tmp_path
 ):
     config = small_config(iterations=2, learning_rate=0.001)
-    RunFolder(tmp_path / "seed0").write_config(Run(config))
-    RunFolder(tmp_path / "other").write_config(Run(config, algorithm="other"))
+    stored_run(tmp_path / "seed0", Run(config))
+    stored_run(tmp_path / "other", Run(config, algorithm="other"))
     other = Run(dataclasses.replace(config, **settings), 1)
     later = {tmp_path / "seed1": other}
     assert_refused([words, "another --name"], records.check, tmp_path, later, RunOptions(**options))
@@ -408,8 +392,7 @@ def test_seeds_of_other_settings_or_evaluations_are_not_averaged(
 
 
 def test_an_unknown_set_of_a_stored_run_is_refused_before_training(tmp_path):
-    folder = RunFolder(tmp_path / "seed0")
-    folder.write_config(Run(small_config()))
+    folder = stored_run(tmp_path / "seed0", Run(small_config()))
     folder.config.write_text(folder.config.read_text().replace("TrapTube-v0", "Gone-v0"))
     words = ["seed0/config.json", "unknown task set 'Gone-v0'", "--import"]
     assert_refused(words, records.check, tmp_path, {}, RunOptions())
@@ -418,11 +401,8 @@ def test_an_unknown_set_of_a_stored_run_is_refused_before_training(tmp_path):
 def test_tables_follow_the_order_of_the_points(tmp_path):
     """So that the first one is what the others are compared with."""
     for name in ("a", "b", "c", "d"):
-        folder = RunFolder(tmp_path / name)
-        folder.write_config(Run(small_config(), algorithm=name))
-        append_rows(folder.metrics, curves().drop(columns=["algorithm", "seed"]).to_dict("records"))
-        tested = pd.DataFrame(rows(name, [1])).drop(columns=["algorithm", "seed"])
-        append_rows(folder.evaluations, tested.to_dict("records"))
+        run = Run(small_config(), algorithm=name)
+        stored_run(tmp_path / name, run, CURVE, of_a_run(rows(name, [1])))
     records.collect(tmp_path, "sweep", {}, ["d", "b", "c"])
     for name in ("results", "curves"):
         found = read_rows(tmp_path / f"{name}.csv")["algorithm"]
