@@ -5,7 +5,6 @@ Source: the paper's Tables 1 and 2; Student's t for the interval of a mean of fe
 """
 
 import re
-from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
@@ -47,17 +46,14 @@ def tables(results: Table, curves: Table, about: Mapping[str, Any]) -> dict[str,
       results: rows of `agents.results`.
       curves: rows of metrics, with the columns of `records.CURVES`.
       about: `train_set`, which decides the paper's table to compare with, `threshold`, the share of
-        its validation tasks that counts as solved, and `unfinished`, algorithm and seed of runs.
+        its validation tasks that counts as solved.
     """
     tested = reported(results)
     train_set = about["train_set"]
-    unfinished = defaultdict(set)
-    for algorithm, seed in about["unfinished"]:
-        unfinished[algorithm].add(seed)
     with_paper = train_set == "base"
     threshold = about["threshold"]
     share = "" if threshold == 1 else f"; solved: {100 * threshold:g} % of the tasks"
-    found = {f"Training{share}": training_table(curves, threshold, with_paper, unfinished)}
+    found = {f"Training{share}": training_table(curves, threshold, with_paper)}
     if len(tested):
         found["Test tasks solved, %"] = success_table(tested, train_set == "pstsy")
     compared = differences(tested)
@@ -96,27 +92,20 @@ def by_set(tested: Table) -> Table:
     return table.reindex(tested["algorithm"].unique(), level="algorithm")
 
 
-def training_table(
-    curves: Table, threshold: float, with_paper: bool, unfinished: Mapping[Any, set[int]]
-) -> Table:
-    """Returns seeds that solved their training set, episodes until they did, and means of costs.
-
-    `unfinished` holds the seeds that have not reached their end, by algorithm. Some have no curve.
-    """
+def training_table(curves: Table, threshold: float, with_paper: bool) -> Table:
+    """Returns seeds that solved their training set, episodes until they did, and means of costs."""
     columns = ("solved", "episodes to solve", "steps", "minutes")
     rows: dict[Any, tuple[str, ...]] = {}
-    for name in dict.fromkeys([*curves["algorithm"], *unfinished]):
-        found = curves[curves["algorithm"] == name]
-        left = unfinished.get(name, set())
+    for name, found in curves.groupby("algorithm", sort=False):
         solving = found[found["validation_success"] >= threshold]
         episodes = solving.groupby("seed")["episodes"].min().to_numpy()
         ends = found.groupby("seed")[["transitions", "seconds"]].max()
-        solved = f"{len(episodes)} of {len(left | set(ends.index))}"
-        solved += f", {len(left)} unfinished" if left else ""
-        costs = (NOTHING, NOTHING)
-        if len(ends):
-            costs = (f"{ends['transitions'].mean():,.0f}", f"{ends['seconds'].mean() / 60:,.1f}")
-        rows[name] = (solved, mean_text(episodes, ",.0f"), *costs)
+        rows[name] = (
+            f"{len(episodes)} of {len(ends)}",
+            mean_text(episodes, ",.0f"),
+            f"{ends['transitions'].mean():,.0f}",
+            f"{ends['seconds'].mean() / 60:,.1f}",
+        )
     rows |= PAPER_SOLVED if with_paper else {}
     return pd.DataFrame(rows, columns).T
 

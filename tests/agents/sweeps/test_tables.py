@@ -228,12 +228,11 @@ def test_scores_may_be_missing_or_not_vary(solved, means, shown):
 def test_training_is_summed_up_with_the_papers_trials():
     three = ((0, 1), (0, 0, 1), (0, 0, 0))
     made = pd.concat([curves("ppo+icm", three), curves("<b>", ((0.5,),))])
-    table = tables.training_table(made, 1.0, True, {"<b>": {0, 1}, "lost": {5}})
+    table = tables.training_table(made, 1.0, True)
     assert table.loc["ppo+icm"].tolist() == ["2 of 3", "250 [0, 885]", "2,667", "2.7"]
-    assert table.loc["<b>"].tolist() == ["0 of 2, 2 unfinished", "–", "1,000", "1.0"]
-    assert table.loc["lost"].tolist() == ["0 of 1, 1 unfinished", "–", "–", "–"]
+    assert table.loc["<b>"].tolist() == ["0 of 1", "–", "1,000", "1.0"]
     assert table.loc["PPO + ICM, paper"].tolist()[:2] == ["5 of 5", "102,000 ± 60,000"]
-    assert tables.training_table(made, 0.5, False, {}).loc["<b>", "solved"] == "1 of 1"
+    assert tables.training_table(made, 0.5, False).loc["<b>", "solved"] == "1 of 1"
 
 
 def test_runs_that_have_tested_nothing_yet_have_a_table_and_curves(tmp_path):
@@ -319,7 +318,7 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
     for command in ("first", "second", "first"):
         records.collect(tmp_path, command, launched, [])
     shown = records.write_tables(tmp_path)
-    assert "2 of 3, 2 unfinished" in shown
+    assert "2 of 2" in shown
     note = "Unfinished, so the table may change: ppo+effects seed 1, ppo+effects seed 2."
     assert note in " ".join(shown.split())
     text = (tmp_path / "table.md").read_text()
