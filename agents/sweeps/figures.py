@@ -12,7 +12,6 @@ from agents.sweeps import tables
 from trap_tube_jax.scoring.tasks import label
 
 DPI = 150
-UNITS = {"transitions": "environment steps", "episodes": "episodes"}
 MAX_RANGES = 3  # of seeds that a panel can show
 LOOKS = [{"color": color, "linestyle": style} for style in ("-", "--", ":") for color in COLORS]
 
@@ -44,9 +43,7 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
     train_set = about["train_set"]
     greedy = results[results["purpose"] == "validation"]
     greedy = greedy.assign(value=greedy["solved"] / greedy["tasks"])
-    # Records of the first versions count no environment steps.
-    unit = "transitions" if curves["transitions"].notna().all() else "episodes"
-    curves = curves.assign(progress=curves[unit] / 1e6)
+    curves = curves.assign(progress=curves["transitions"] / 1e6)
     progress = curves[["algorithm", "seed", "iteration", "progress"]]
     greedy = greedy.merge(progress, on=["algorithm", "seed", "iteration"])
     panels = {
@@ -67,7 +64,7 @@ def draw_curves(results: Table, curves: Table, about: Mapping[str, Any]) -> Any:
                 shown.add(_draw_seeds(axis, curves_of_name, look, name, has_ranges))
         axis.set_ylim(-3, 103)
     for axis in axes[-min(3, len(axes)) :]:
-        axis.set_xlabel(f"{UNITS[unit]}, millions")
+        axis.set_xlabel("environment steps, millions")
     figure.supylabel(f"solved, %: {' or '.join(sorted(shown))}", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
