@@ -86,18 +86,6 @@ def test_the_limit_changes_without_compiling_again(easy):
     assert ends[0] == ends[1]
 
 
-def test_the_final_observation_on_request(easy_env):
-    env, params = to_gymnax.make(easy_env, final_observation=True)
-    key = jax.random.key(0)
-    _, state = env.reset(key, params)
-    _, state, *_ = env.step(key, state, 3, params)
-    observation, _, _, done, info = env.step(key, state, 1, params)
-    assert done
-    food = tt.base_palette()[5]
-    assert not (info["final_observation"] == food).all(axis=-1).any()
-    assert (observation == food).all(axis=-1).any()
-
-
 def test_a_finished_episode_stays_without_the_reset(easy):
     env, params = easy
     key = jax.random.key(0)
