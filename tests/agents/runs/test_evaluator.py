@@ -82,7 +82,7 @@ def test_scores_use_the_papers_notation():
     (score,) = evaluator.suite.scores({"pst": outcome}, shortest={"pst": np.array([11, 12])}).sets
     assert (score.label, score.tasks, score.solved, score.percent) == ("{P, St}", 2, 1, 50.0)
     assert score.mean_steps == 11
-    assert score.optimality == Optimality(2, 50.0, 1.0, 1.0)
+    assert score.optimality == Optimality(2, 50.0, 1.0)
 
 
 def test_a_custom_training_set_is_evaluated_after_the_papers(fresh_task_sets):
