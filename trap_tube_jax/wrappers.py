@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_own_state, names_adapters
+from trap_tube_jax.checks import check_own_state
 from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import TimeStep
 
@@ -94,7 +94,6 @@ class AutoReset:
                 "episode; allowed: EpisodeStatistics(AutoReset(env))"
             )
 
-    @names_adapters
     def reset(self, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
         """Starts the first episode. See `Environment.reset`."""
         reset_key, next_key = jax.random.split(threefry_key(key))
@@ -104,7 +103,6 @@ class AutoReset:
         first = auto_reset_timestep(timestep, timestep.observation, final)
         return AutoResetState(inner, next_key), first
 
-    @names_adapters
     def step(
         self, state: AutoResetState, action: jax.Array
     ) -> tuple[AutoResetState, AutoResetTimeStep]:
@@ -190,7 +188,6 @@ class EpisodeStatistics:
         """The step in which the wrapped environment resets: "SameStep", "NextStep" or None."""
         return _auto_resets(self.env)
 
-    @names_adapters
     def reset(self, key: jax.Array) -> tuple[EpisodeStatisticsState, TimeStep]:
         """Starts the first episode with all counts at zero."""
         inner, timestep = self.env.reset(key)
@@ -205,7 +202,6 @@ class EpisodeStatistics:
             over=jnp.zeros(shape, bool),
         ), timestep
 
-    @names_adapters
     def step(
         self, state: EpisodeStatisticsState, action: jax.Array
     ) -> tuple[EpisodeStatisticsState, TimeStep]:

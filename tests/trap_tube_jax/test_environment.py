@@ -15,7 +15,6 @@ from helpers.easy_task import DOWN, EASY, RIGHT
 from helpers.jax_settings import enable_x64
 from helpers.refusal import assert_refused
 from helpers.trees import assert_same, rows
-from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 OPTIMISED = False  # few steps
 SETS = ("base", "sy", "pstsy")  # the first draws one task, the second five
@@ -354,39 +353,3 @@ def test_invalid_actions_are_refused(action, words):
         vector = tt.VectorEnvironment(tt.Environment())
         state, _ = vector.reset(jax.random.split(jax.random.key(0), 2))
         assert_refused(words, vector.step, state, np.stack([np.zeros_like(action), action]))
-
-
-KEY = jax.random.key(0)
-ACTION = np.zeros(2, np.int32)
-STYLES: dict[str, Any] = {
-    "Gymnasium's reset": lambda env, state: env.reset(),
-    "Gymnasium's reset with a seed": lambda env, state: env.reset(seed=3),
-    "gymnax's reset": lambda env, state: env.reset(KEY, env),
-    "Gymnasium's step": lambda env, state: env.step(ACTION),
-    "gymnax's step": lambda env, state: env.step(KEY, state, ACTION),
-    "gymnax's step with parameters": lambda env, state: env.step(KEY, state, ACTION, env),
-}
-
-
-@pytest.mark.parametrize("call", STYLES.values(), ids=STYLES)
-@pytest.mark.parametrize(
-    "env",
-    [
-        tt.Environment(),
-        *(
-            wrap(tt.Environment())
-            for wrap in (
-                tt.AutoReset,
-                tt.EpisodeStatistics,
-                tt.VectorEnvironment,
-                NextStepVectorEnvironment,
-            )
-        ),
-    ],
-    ids=lambda env: type(env).__name__,
-)
-def test_a_call_in_the_style_of_another_library_is_answered_with_its_adapter(env, call):
-    for form in (call, jax.jit(call, static_argnums=0)):
-        with pytest.raises(TypeError, match=r"reset\(key\) and step\(state, action\)") as error:
-            form(env, tt.base_state())
-        assert "trap_tube_jax.adapters.to_gymnasium or to_gymnax" in str(error.value)

@@ -5,7 +5,6 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from trap_tube_jax.checks import names_adapters
 from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoResetTimeStep, auto_reset_timestep
 
@@ -18,7 +17,6 @@ class NextStepVectorEnvironment(VectorEnvironment):
 
     auto_resets: ClassVar = "NextStep"
 
-    @names_adapters
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes actions i32[B, 2], or starts the next episode where one has ended."""
         stepped, timestep, final_picture = self._advance(state, actions)
