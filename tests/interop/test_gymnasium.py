@@ -169,36 +169,12 @@ def test_episode_statistics_count_over_the_batch(easy_env):
     assert infos["episode"]["l"].tolist() == [0, 6]
 
 
-@pytest.mark.parametrize("mode", AUTORESET_MODES)
-def test_masks_and_missing_seeds_reset_as_in_gymnasiums_batch(mode):
-    options = {"task_set": "p", "max_steps": 3}
-    ours = TrapTubeVectorEnv(num_envs=3, autoreset_mode=mode, **options)
-    theirs = SyncVectorEnv([functools.partial(TrapTubeEnv, **options)] * 3, autoreset_mode=mode)
-    ours.action_space.seed(0)
-    for seed, mask in (
-        (4, None),
-        ([1, None, 2], None),
-        (None, [True, False, True]),
-        ([None, 6, 7], [False, True, False]),
-        ([8, None, None], [True, True, False]),
-    ):
-        resets = []
-        for envs in (ours, theirs):
-            masked = None if mask is None else {"reset_mask": np.array(mask)}
-            resets.append(envs.reset(seed=seed, options=masked)[0])
-        np.testing.assert_array_equal(*resets)
-        for _ in range(4):
-            actions = ours.action_space.sample()
-            assert_same(ours.step(actions), theirs.step(actions))
-
-
 def test_batches_reset_again_under_any_kind_of_key_and_use_none_twice():
     def observations():
         envs = TrapTubeVectorEnv("p", 2)
         envs.reset(seed=3)
         again = envs.reset()[0]
-        mask = np.array([True, False])
-        return [again, envs.reset(seed=[None, 5])[0], envs.reset(options={"reset_mask": mask})[0]]
+        return [again, envs.reset(seed=[4, 5])[0], envs.reset()[0]]
 
     expected = observations()
     for setting in (jax.default_prng_impl("rbg"), jax.debug_key_reuse(True)):
@@ -206,23 +182,20 @@ def test_batches_reset_again_under_any_kind_of_key_and_use_none_twice():
             np.testing.assert_array_equal(observations(), expected)
 
 
-def test_masks_and_seeds_are_checked():
+def test_seeds_and_options_are_checked():
     envs = TrapTubeVectorEnv("p", 2)
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        envs.reset(options={"reset_mask": [True, False]})
     pair = envs.reset(seed=[5, 9])[0]
     np.testing.assert_array_equal(pair[1], envs.reset(seed=9)[0][0])
-    assert not np.array_equal(*TrapTubeVectorEnv("p", 2).reset(seed=[None, None])[0])
+    assert not np.array_equal(*TrapTubeVectorEnv("p", 2).reset()[0])
     # Those that Gymnasium draws without a seed are as large as these.
     np.testing.assert_array_equal(envs.reset(seed=[2**32 + 5, 2**96 + 9])[0], pair)
     one: Any = np.int64(9)
     np.testing.assert_array_equal(envs.reset(seed=one)[0][0], pair[1])
-    for mask in ([True], [False, False], [0, 1]):
-        with pytest.raises(ValueError, match=r"bool\[2\] with at least one true, got \["):
-            envs.reset(options={"reset_mask": mask})
+    with pytest.raises(ValueError, match=r"takes no options.*reset_mask"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(ValueError, match="one or 2 integers, got 3"):
         envs.reset(seed=[1, 2, 3])
-    wrong_seeds: list[Any] = [[1, -1], -1, 1.5, True, "9"]
+    wrong_seeds: list[Any] = [[1, None], [1, -1], -1, 1.5, True, "9"]
     for seed in wrong_seeds:
         wrong = seed[1] if isinstance(seed, list) else seed
         with pytest.raises(ValueError, match=f"seed must be an integer >= 0, got {wrong!r}"):
