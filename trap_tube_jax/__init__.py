@@ -22,7 +22,7 @@ them. The examples assume these two imports, `import jax.numpy as jnp` and `impo
                    compose, Transfer
     observations   observe, visible_objects
     pictures       render, render_ascii, episode_frames, save_gif
-    oracle         solve, solve_batch, Plan, distances, Distances
+    oracle         solve, solve_batch, Plan, distances
     scores         score, score_gymnasium, Score, Scores, evaluation_tasks
 
 Pages in this folder: environment.md, own_tasks.md, graded.md, controls.md, protocol.md.
@@ -48,7 +48,7 @@ from trap_tube_jax.rendering import episode_frames, render, save_gif
 from trap_tube_jax.scoring.benchmark import score, score_gymnasium
 from trap_tube_jax.scoring.scores import Score, Scores
 from trap_tube_jax.scoring.tasks import evaluation_tasks
-from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
+from trap_tube_jax.solver import Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import compose, perceptual, structural, symbolic
 from trap_tube_jax.vector import VectorEnvironment, VectorState
@@ -59,7 +59,6 @@ __all__ = [
     "PAPER_TASK_SETS",
     "ArraySpec",
     "AutoReset",
-    "Distances",
     "Environment",
     "EpisodeStatistics",
     "Plan",

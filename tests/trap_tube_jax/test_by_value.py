@@ -54,7 +54,7 @@ def public(environments: dict[str, Any]) -> list[Any]:
     return [
         *(*environments.values(), *transfers, *tt.PAPER_TASK_SETS, *tt.CONTROL_TASK_SETS),
         *(*itertools.chain(*states), tt.base_state(), environments["base"].observation_spec),
-        *(tt.solve(EASY), tt.solve(tt.base_state()), tt.distances(EASY)),
+        *(tt.solve(EASY), tt.solve(tt.base_state())),
     ]
 
 

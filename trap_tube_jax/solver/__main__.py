@@ -116,10 +116,9 @@ def _distances(options: argparse.Namespace) -> None:
     announce("Exploring up to two million states, which takes seconds")
     found = distances(state)
     print(f"length of the plan: {plan.length if plan.solvable else 'unsolvable'}")
-    print(f"reachable states: {found.num_reachable}")
-    print(f"with a way to the goal: {np.count_nonzero(found.to_goal >= 0)}")
+    print(f"states with a way to the goal: {np.count_nonzero(found >= 0)}")
     if plan.solvable:
-        print(f"farthest from the goal: {found.to_goal.max()}")
+        print(f"farthest from the goal: {found.max()}")
     with _drawing(options, "distances.png") as path:
         from trap_tube_jax.solver.pictures import save_distances  # noqa: PLC0415
 

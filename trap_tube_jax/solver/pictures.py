@@ -11,7 +11,6 @@ from trap_tube_jax.figures import default_style
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import BOARD_SIZE
 from trap_tube_jax.rendering import render
-from trap_tube_jax.solver.distance import Distances
 from trap_tube_jax.solver.search import Plan
 from trap_tube_jax.state import State, take
 
@@ -26,7 +25,7 @@ MOMENTS = 4  # pictures of distances along a plan
 
 @default_style()
 def save_distances(
-    state: State, plan: Plan, distances: Distances, path: str | os.PathLike[str]
+    state: State, plan: Plan, distances: np.ndarray, path: str | os.PathLike[str]
 ) -> None:
     """Writes a PNG of the distance to the goal over the board, at moments of a plan.
 
@@ -37,13 +36,13 @@ def save_distances(
     Args:
       state: the task's first state.
       plan: the task's plan; an unsolvable task has one picture.
-      distances: the task's distances.
+      distances: i16[12, 12, 12, 12, 12, 12], the distances of the task's states.
       path: the file to write.
     """
     states = jax.device_get(replay(state, plan.actions))
     last = max(len(plan.actions) - 1, 0)
     times = np.unique(np.linspace(0, last, MOMENTS).round().astype(int))
-    boards = [distances.to_goal[(*states.food[time], *states.tool[time])] for time in times]
+    boards = [distances[(*states.food[time], *states.tool[time])] for time in times]
     scale = Normalize(0, max(np.max(boards), 1))
     rows = -(-len(times) // 2)
     columns = min(len(times), 2)

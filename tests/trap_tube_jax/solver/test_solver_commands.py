@@ -97,7 +97,7 @@ def test_command_line_draws_distances(tmp_path, capsys):
     picture = tmp_path / "distances.png"
     main(["--distances", "base", "--output", str(picture)])
     lines = capsys.readouterr().out.splitlines()
-    assert {"length of the plan: 11", "reachable states: 1547184"} < set(lines)
+    assert {"length of the plan: 11", "states with a way to the goal: 1547184"} < set(lines)
     with Image.open(picture) as image:
         assert image.format == "PNG"
 
