@@ -6,7 +6,6 @@ whole frontier at a time, so there is one set of rules.
 
     search.py      breadth-first search; shortest plans
     distance.py    distances to the goal, for every reachable state
-    pictures.py    distances and histograms as PNG
     __main__.py    the command line: python -m trap_tube_jax.solver --help
 """
 

@@ -13,7 +13,6 @@ from trap_tube_jax.dynamics import replay
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.scoring.knowledge import first_push
-from trap_tube_jax.solver import pictures
 from trap_tube_jax.solver.search import levels, validate_on_host
 from trap_tube_jax.state import take
 from trap_tube_jax.transfers import swap_with_tool
@@ -264,27 +263,3 @@ def test_finished_and_invalid_states_are_refused():
     assert_refused([words], tt.solve_batch, stack([base, solved]))
     assert_refused(["one leading axis"], tt.solve_batch, base)
     assert_refused(["must be"], tt.solve, stack([base, base]))
-
-
-def test_pictures_of_distances_count_the_steps_that_are_left(
-    workshop, workshop_distances, tmp_path, monkeypatch
-):
-    drawn = []
-
-    def draw(axis, state, steps, scale):
-        drawn.append((axis, state, steps))
-        pictures_draw(axis, state, steps, scale)
-
-    pictures_draw = pictures._draw_distances
-    monkeypatch.setattr(pictures, "_draw_distances", draw)
-    monkeypatch.setattr(pictures.Figure, "savefig", lambda *_, **__: None)
-    plan = tt.solve(workshop)
-    pictures.save_distances(workshop, plan, workshop_distances, tmp_path / "none.png")
-    assert len(drawn) == pictures.MOMENTS
-    for axis, state, steps in drawn:
-        agent = tuple(np.asarray(state.agent).tolist())
-        assert axis.get_title() == f"steps left: {steps[agent]}"
-        numbers = {text.get_position()[::-1]: int(text.get_text()) for text in axis.texts}
-        cells = {tuple(cell) for cell in np.argwhere(steps >= 0).tolist()}
-        assert numbers == {cell: steps[cell] for cell in cells - {agent}}
-    assert drawn[0][0].get_title() == f"steps left: {plan.length}"
