@@ -15,8 +15,8 @@ them. The examples assume these two imports, `import jax.numpy as jnp` and `impo
 
     task sets      make, task_set, register, registered_ids, TaskSet, PAPER_TASK_SETS,
                    CONTROL_TASK_SETS
-    environments   Environment, ArraySpec, AutoReset, EpisodeStatistics, VectorEnvironment,
-                   VectorState, action_from_index, action_to_index
+    environments   Environment, ArraySpec, AutoReset, VectorEnvironment, VectorState,
+                   action_from_index, action_to_index
     states         State, TimeStep, base_state, base_palette, validate
     transfers      perceptual, structural, symbolic, graded_perceptual, graded_structural,
                    compose, Transfer
@@ -52,7 +52,7 @@ from trap_tube_jax.solver import Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import compose, perceptual, structural, symbolic
 from trap_tube_jax.vector import VectorEnvironment, VectorState
-from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
+from trap_tube_jax.wrappers import AutoReset
 
 __all__ = [
     "CONTROL_TASK_SETS",
@@ -60,7 +60,6 @@ __all__ = [
     "ArraySpec",
     "AutoReset",
     "Environment",
-    "EpisodeStatistics",
     "Plan",
     "Score",
     "Scores",

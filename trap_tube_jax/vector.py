@@ -14,7 +14,7 @@ fast:
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +83,6 @@ class VectorEnvironment:
     """
 
     env: Environment
-    auto_resets: ClassVar = "SameStep"
 
     def __post_init__(self):
         if type(self.env) is not Environment:

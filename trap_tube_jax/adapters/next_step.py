@@ -1,7 +1,5 @@
 """Batches of environments whose reset takes a step, as is Gymnasium's default."""
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 
@@ -14,8 +12,6 @@ class NextStepVectorEnvironment(VectorEnvironment):
 
     The reset step ignores its action, pays 0 and returns the new episode's first observation.
     """
-
-    auto_resets: ClassVar = "NextStep"
 
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes actions i32[B, 2], or starts the next episode where one has ended."""
