@@ -1,7 +1,7 @@
 """The task sets as gymnax environments, with the step of gymnax 0.x or of gymnax >= 1.0.
 
-A step of gymnax 0.x returns five values, which PureJaxRL, rejax and Stoa expect with any
-gymnax: `make` and `FiveValueTrapTube`. A step of gymnax 1.0 returns six values:
+A step of gymnax 0.x returns five values, which PureJaxRL and rejax expect with any gymnax:
+`make` and `FiveValueTrapTube`. A step of gymnax 1.0 returns six values:
 `SixValueTrapTube`, which importing this module registers.
 
     env, params = to_gymnax.make("TrapTube-v0")
