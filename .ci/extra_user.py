@@ -11,7 +11,6 @@ import sys
 
 ADAPTERS = "trap_tube_jax/adapters/README.md"
 PDOC = ["-W", "error", "-m", "pdoc", "--docformat", "google", "-o", "reference"]
-SOLVE = ["-m", "trap_tube_jax.solver"]
 TRAIN = ["-m", "agents.train", "--iterations", "1", "--episodes-per-iteration", "64"]
 SWEEP_ON_A_CLUSTER = """
 import subprocess, sys
@@ -30,6 +29,12 @@ options = peers.Options(sets=("base",), num_envs=(2,), num_steps=2, repeats=1)
 _, skipped = peers.measure(options, [task_set_subject("base")])
 assert not skipped, skipped
 """
+SAVE_PLAN = """
+import trap_tube_jax as tt
+
+state = tt.base_state()
+tt.save_gif(tt.episode_frames(state, tt.solve(state).actions), "plan.gif")
+"""
 WHEEL_ALONE = ("pictures", "gymnasium", "gymnax")
 
 
@@ -41,11 +46,7 @@ def block(page: str, mark: str) -> str:
 
 
 USES = {
-    "pictures": [
-        ["-m", "trap_tube_jax.gallery"],
-        [*SOLVE, "--show", "base", "--output", "plan.gif"],
-        [*SOLVE, "--sets", "base", "--tasks", "1", "--output", "histogram.png"],
-    ],
+    "pictures": [["-c", SAVE_PLAN]],
     "gymnasium": [["-c", block(ADAPTERS, "import gymnasium")]],
     "gymnax": [["-c", block(ADAPTERS, "to_gymnax")]],
     "agents": [["-c", block("README.md", "from agents")]],

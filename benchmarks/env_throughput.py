@@ -210,38 +210,25 @@ def use_devices(number: int) -> None:
         )
 
 
-def copy_bandwidth(num_bytes: int = 2**28, passes: int = 8) -> float:
-    """Returns the bytes per second that a loop over a large array writes, reading as many."""
-    source = jnp.zeros(num_bytes // 4, jnp.uint32)
-
-    def rewrite(array: jax.Array) -> jax.Array:
-        return jax.lax.fori_loop(0, passes, lambda i, old: old ^ i.astype(jnp.uint32), array)
-
-    return passes * num_bytes / harness.measure(rewrite, source).median_s
-
-
 def main(options: Options) -> list[Throughput]:
     """Measures, prints a table and writes the record."""
     console = harness.begin(options)
     subjects = [task_set_subject(name, plain=options.plain) for name in options.sets]
-    bandwidth = copy_bandwidth()
-    console.print(f"copy: {bandwidth / 1e9:.1f} GB/s written")
     results = [
         measure_throughput(subject, num_envs, options)
         for subject in subjects
         for num_envs in options.num_envs
     ]
-    table = Table("set", "environments", "M steps/s", "of copy", "compile, s")
+    table = Table("set", "environments", "M steps/s", "compile, s")
     for result in results:
         table.add_row(
             result.name,
             f"{result.num_envs:,}",
             f"{result.steps_per_s / 1e6:.3f}",
-            f"{result.bytes_per_s / bandwidth:.0%}",
             f"{result.timing.compile_s:.1f}",
         )
     console.print(table)
-    harness.write_record("env_throughput", options, results, copy_bytes_per_s=bandwidth)
+    harness.write_record("env_throughput", options, results)
     return results
 
 

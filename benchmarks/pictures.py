@@ -9,20 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 import agents
 import trap_tube_jax as tt
-from agents.runs.drawing import COLORS, make_panels
+from agents.runs.drawing import COLORS, default_style, make_panels
 from agents.sweeps import tables
+from benchmarks.task_pictures import draw_distances, draw_gallery
 from trap_tube_jax.command_line import path_argument, plain_errors
-from trap_tube_jax.figures import default_style
-from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.interruptions import run_command
 from trap_tube_jax.scoring.tasks import label
 from trap_tube_jax.state import take
-
-with needs_extra("pictures"):
-    from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).parent / "results"
 FIGURES = RESULTS / "figures"
@@ -202,7 +199,13 @@ def _recolored(state: tt.State) -> tt.State:
     return state.replace(palette=PALETTE[is_color.argmax(axis=1)])
 
 
-PICTURES = {"board": draw_board, "symbolic": draw_symbolic, "table2": draw_table_2}
+PICTURES = {  # by file: the figure and its pixels per inch
+    "board": (draw_board, DPI),
+    "distances": (draw_distances, 100),
+    "gallery": (draw_gallery, 160),
+    "symbolic": (draw_symbolic, DPI),
+    "table2": (draw_table_2, DPI),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -217,8 +220,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with plain_errors(), default_style():
         options.output.mkdir(parents=True, exist_ok=True)
-        for name, draw in PICTURES.items():
-            draw().savefig(options.output / f"{name}.png", dpi=DPI)
+        for name, (draw, dpi) in PICTURES.items():
+            draw().savefig(options.output / f"{name}.png", dpi=dpi)
             print(options.output / f"{name}.png")
         for name, episode in GIFS.items():
             tt.save_gif(draw_episode(*episode), options.output / f"{name}.gif", fps=4)

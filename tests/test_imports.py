@@ -21,9 +21,9 @@ ENVIRONMENT = (
     ("dynamics", "layouts", "transfers", "graded", "observation"),
     ("environment", "wrappers", "vector"),
     ("controls", "registry"),
-    ("figures", "rendering", "solver"),
+    ("rendering", "solver"),
     ("scoring",),
-    ("adapters", "gallery", "play"),
+    ("adapters", "play"),
 )
 AGENTS = (
     ("arrays", "command_line", "files", "registry"),

@@ -15,14 +15,14 @@ them. The examples assume these two imports, `import jax.numpy as jnp` and `impo
 
     task sets      make, task_set, register, registered_ids, TaskSet, PAPER_TASK_SETS,
                    CONTROL_TASK_SETS
-    environments   Environment, ArraySpec, AutoReset, EpisodeStatistics, VectorEnvironment,
-                   VectorState, action_from_index, action_to_index
+    environments   Environment, ArraySpec, AutoReset, VectorEnvironment, VectorState,
+                   action_from_index, action_to_index
     states         State, TimeStep, base_state, base_palette, validate
     transfers      perceptual, structural, symbolic, graded_perceptual, graded_structural,
                    compose, Transfer
     observations   observe, visible_objects
     pictures       render, render_ascii, episode_frames, save_gif
-    oracle         solve, solve_batch, Plan, distances, Distances
+    oracle         solve, solve_batch, Plan, distances
     scores         score, score_gymnasium, Score, Scores, evaluation_tasks
 
 Pages in this folder: environment.md, own_tasks.md, graded.md, controls.md, protocol.md.
@@ -48,20 +48,18 @@ from trap_tube_jax.rendering import episode_frames, render, save_gif
 from trap_tube_jax.scoring.benchmark import score, score_gymnasium
 from trap_tube_jax.scoring.scores import Score, Scores
 from trap_tube_jax.scoring.tasks import evaluation_tasks
-from trap_tube_jax.solver import Distances, Plan, distances, solve, solve_batch
+from trap_tube_jax.solver import Plan, distances, solve, solve_batch
 from trap_tube_jax.state import State, TimeStep, base_state, validate
 from trap_tube_jax.transfers import compose, perceptual, structural, symbolic
 from trap_tube_jax.vector import VectorEnvironment, VectorState
-from trap_tube_jax.wrappers import AutoReset, EpisodeStatistics
+from trap_tube_jax.wrappers import AutoReset
 
 __all__ = [
     "CONTROL_TASK_SETS",
     "PAPER_TASK_SETS",
     "ArraySpec",
     "AutoReset",
-    "Distances",
     "Environment",
-    "EpisodeStatistics",
     "Plan",
     "Score",
     "Scores",

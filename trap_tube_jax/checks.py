@@ -1,21 +1,16 @@
 """Shared checks of arguments."""
 
 import difflib
-import functools
-import inspect
 import os
 import re
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
 
 MAX_SEED = 2**32 - 1  # `jax.random.key` keeps the low 32 bits only
 MAX_TASKS = 1_000_000  # at a time; their states and keys take 0.3 GB
@@ -105,30 +100,6 @@ def check_seed(seed: Any) -> int:
       ValueError: naming the seed and the bounds.
     """
     return check_integer("seed", seed, 0, MAX_SEED)
-
-
-def names_adapters(
-    method: Callable[Arguments, Result],
-) -> Callable[Arguments, Result]:
-    """Decorates `reset` or `step`: a call in Gymnasium's or gymnax's style names their adapters.
-
-    Raises:
-      TypeError: the number or names of the arguments are wrong.
-    """
-    signature = inspect.signature(method)
-
-    @functools.wraps(method)
-    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        try:
-            signature.bind(*args, **kwargs)
-        except TypeError as error:
-            raise TypeError(
-                f"{method.__name__}: {error}; call reset(key) and step(state, action), or use "
-                "trap_tube_jax.adapters.to_gymnasium or to_gymnax for their interfaces"
-            ) from None
-        return method(*args, **kwargs)
-
-    return checked
 
 
 def check_own_state(state: Any, kind: type) -> None:

@@ -15,7 +15,7 @@ from jax.core import Tracer
 
 from trap_tube_jax import dynamics
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_integer, describe_array, integer_array, names_adapters
+from trap_tube_jax.checks import check_integer, describe_array, integer_array
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     DIRECTION_NAMES,
@@ -142,7 +142,6 @@ class Environment(ByValue):
         vars(env)["max_steps"] = check_integer("max_steps", max_steps, maximum=MAX_TIME)
         return env
 
-    @names_adapters
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """Draws a task.
 
@@ -160,7 +159,6 @@ class Environment(ByValue):
         state = compose(*self.transfers)(key, jax.tree.map(jnp.copy, self.base))
         return state, _timestep(state, reward=jnp.zeros((), jnp.float32))
 
-    @names_adapters
     def step(self, state: State, action: jax.Array) -> tuple[State, TimeStep]:
         """Takes one action, deterministically. A finished state does not change and pays 0.
 

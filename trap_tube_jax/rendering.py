@@ -49,8 +49,6 @@ TOOL_BAR_RADIUS = 0.16  # in cells, like the next two
 TOOL_BAR_OVERHANG = 0.18  # beyond the centres of the outer cells
 HAND_RADIUS = 0.2
 FPS_RANGE = (1, 50)  # browsers slow down GIFs with shorter frames
-MAX_HOLD = 100  # seconds
-MAX_DURATION = 2**16 - 1  # hundredths of a second for which a GIF can show a picture
 
 
 def render(
@@ -147,19 +145,14 @@ def episode_frames(state: State, actions: Any, cell_size: int = 20) -> np.ndarra
     return np.asarray(_episode_frames(state, actions.astype(np.int32), cell_size=cell_size))
 
 
-def save_gif(
-    frames: Any, path: str | os.PathLike[str], fps: float = 8, *, hold: float = 1.0
-) -> None:
-    """Writes an endlessly looping GIF. Runs on the host.
+def save_gif(frames: Any, path: str | os.PathLike[str], fps: float = 8) -> None:
+    """Writes an endlessly looping GIF, whose last frame stays a second longer. Runs on the host.
 
     Args:
       frames: u8[T, height, width, 3], or a sequence of T pictures; T >= 1. Pictures of at most
         256 colours are stored exactly.
       path: the file to write.
-      fps: frames per second, 1 to 50. GIF counts hundredths of a second; durations alternate where
-        a frame takes a fraction, so that an episode keeps its length.
-      hold: seconds by which the last frame stays longer, 0 to 100. A picture held for longer
-        than 655 seconds is shown for 655 seconds.
+      fps: frames per second, 1 to 50. A frame takes whole hundredths of a second, as GIF counts.
 
     Raises:
       ValueError: an argument is invalid; the message says what is allowed.
@@ -180,31 +173,14 @@ def save_gif(
         raise ValueError(f"{allowed}, got {describe_array(pictures)}")
     if not isinstance(fps, numbers.Real) or not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         raise ValueError(f"fps must be from {FPS_RANGE[0]} to {FPS_RANGE[1]}, got {fps!r}")
-    if not isinstance(hold, numbers.Real) or not 0 <= hold <= MAX_HOLD:
-        raise ValueError(f"hold must be from 0 to {MAX_HOLD} seconds, got {hold!r}")
     with needs_extra("pictures"):
         from PIL import Image  # noqa: PLC0415  importing the environment must stay light
 
-    pictures, durations = _distinct_pictures(pictures, _durations(len(pictures), fps, hold))
+    durations = [10 * round(100 / fps)] * len(pictures)  # milliseconds
+    durations[-1] += 1000
     first, *rest = map(Image.fromarray, pictures)
     options: dict[str, Any] = {"save_all": True, "append_images": rest, "optimize": True}
-    first.save(expand(path), format="GIF", duration=(10 * durations).tolist(), loop=0, **options)
-
-
-def _durations(num_frames: int, fps: float, hold: float) -> np.ndarray:
-    """Returns i64[T] in hundredths of a second; the sums up to every frame are rounded."""
-    ends = np.arange(1, num_frames + 1) * 100 / fps
-    ends[-1] += 100 * hold
-    return np.diff(np.rint(ends).astype(int), prepend=0)
-
-
-def _distinct_pictures(
-    pictures: np.ndarray, durations: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Merges runs of equal pictures; a duration is at most the longest that a GIF can store."""
-    is_new = np.append(True, np.any(pictures[1:] != pictures[:-1], axis=(1, 2, 3)))
-    durations = np.add.reduceat(durations, np.flatnonzero(is_new))
-    return pictures[is_new], durations.clip(max=MAX_DURATION)
+    first.save(expand(path), format="GIF", duration=durations, loop=0, **options)
 
 
 @functools.partial(jax.jit, static_argnames="cell_size")

@@ -14,7 +14,7 @@ fast:
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_own_state, describe_array, names_adapters
+from trap_tube_jax.checks import check_own_state, describe_array
 from trap_tube_jax.environment import Environment, check_actions
 from trap_tube_jax.objects import AGENT, BOARD_SIZE, FOOD, GROUND, STATIC_OBJECTS, TOOL
 from trap_tube_jax.prng import raw_shape
@@ -83,7 +83,6 @@ class VectorEnvironment:
     """
 
     env: Environment
-    auto_resets: ClassVar = "SameStep"
 
     def __post_init__(self):
         if type(self.env) is not Environment:
@@ -93,7 +92,6 @@ class VectorEnvironment:
                 + (hint if isinstance(self.env, Environment) else "")
             )
 
-    @names_adapters
     def reset(self, keys: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Starts the first episodes, one for each of the keys [B], B >= 1.
 
@@ -104,7 +102,6 @@ class VectorEnvironment:
         episodes, timestep = jax.vmap(AutoReset(self.env).reset)(keys)
         return VectorState(episodes, jax.vmap(draw_static)(episodes.inner)), timestep
 
-    @names_adapters
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes one action in every environment and starts the next episode where one ended.
 

@@ -1,28 +1,23 @@
-"""Wrappers around an environment: pure, with the same `reset` and `step`.
+"""The wrapper that starts the next episode: pure and unbatched, with the same `reset` and `step`.
 
-Wrappers are unbatched; `EpisodeStatistics` also wraps a `VectorEnvironment`. The wrapped `env`
-holds the specs.
+The wrapped `env` holds the specs.
 """
 
 import dataclasses
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from trap_tube_jax.by_value import ByValue
-from trap_tube_jax.checks import check_own_state, names_adapters
+from trap_tube_jax.checks import check_own_state
 from trap_tube_jax.prng import threefry_key
 from trap_tube_jax.state import TimeStep
 
 
 class EnvironmentLike(Protocol):
-    """An environment with a state of any type: wrapped by wrappers, and implemented by them.
-
-    An environment that resets itself has an attribute `auto_resets`: "SameStep" if it does so in
-    the step that ends an episode, "NextStep" if in the next step, which ignores its action.
-    """
+    """An environment with a state of any type, which may be a wrapper."""
 
     def reset(self, key: jax.Array, /) -> tuple[Any, TimeStep]:
         """Starts an episode."""
@@ -70,7 +65,7 @@ class AutoReset:
       env: an environment that does not reset itself.
 
     Raises:
-      ValueError: `env` resets itself, is an `EpisodeStatistics`, or is not an environment.
+      ValueError: `env` resets itself, or is not an environment.
 
     Example:
       >>> env = tt.AutoReset(tt.make("base", max_steps=1))
@@ -83,18 +78,16 @@ class AutoReset:
     """
 
     env: EnvironmentLike
-    auto_resets: ClassVar = "SameStep"
 
     def __post_init__(self):
-        _check_environment(self.env)
-        self._check_reset(bool(_auto_resets(self.env)))
-        if isinstance(self.env, EpisodeStatistics):
+        methods = (getattr(self.env, "reset", None), getattr(self.env, "step", None))
+        if isinstance(self.env, type) or not all(map(callable, methods)):
             raise ValueError(
-                "AutoReset cannot wrap EpisodeStatistics, whose counts would start anew with every "
-                "episode; allowed: EpisodeStatistics(AutoReset(env))"
+                "env must be an environment with reset(key) and step(state, action), got "
+                f"{self.env!r}"
             )
+        self._check_reset(isinstance(self.env, AutoReset))
 
-    @names_adapters
     def reset(self, key: jax.Array) -> tuple[AutoResetState, AutoResetTimeStep]:
         """Starts the first episode. See `Environment.reset`."""
         reset_key, next_key = jax.random.split(threefry_key(key))
@@ -104,7 +97,6 @@ class AutoReset:
         first = auto_reset_timestep(timestep, timestep.observation, final)
         return AutoResetState(inner, next_key), first
 
-    @names_adapters
     def step(
         self, state: AutoResetState, action: jax.Array
     ) -> tuple[AutoResetState, AutoResetTimeStep]:
@@ -132,117 +124,6 @@ class AutoReset:
                 f"{type(self.env).__name__} resets itself already; allowed: an environment that "
                 "does not, such as a trap_tube_jax.Environment"
             )
-
-
-class EpisodeStatisticsState(ByValue, struct.PyTreeNode, eq=False):
-    """The state of an environment that counts its episodes.
-
-    Around a `VectorEnvironment` of B environments all counts have shape [B].
-
-    Attributes:
-      inner: state of the wrapped environment.
-      running_return: f32[], rewards of the current episode so far.
-      running_length: i32[], steps of the current episode so far.
-      last_return: f32[], the undiscounted return of the last finished episode.
-      last_length: i32[], the number of steps of the last finished episode.
-      episodes: i32[], finished episodes since the reset.
-      over: bool[], the last step ended an episode without starting another, so the next step is
-        not counted.
-    """
-
-    inner: Any
-    running_return: jax.Array
-    running_length: jax.Array
-    last_return: jax.Array
-    last_length: jax.Array
-    episodes: jax.Array
-    over: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class EpisodeStatistics:
-    """Records the return and length of every episode. Also wraps a `VectorEnvironment`.
-
-    Steps after the end of a bare environment's episode do not count, nor do steps that only reset.
-    For several episodes use `EpisodeStatistics(AutoReset(env))`, not the reverse.
-
-    Attributes:
-      env: an environment, wrapped or not.
-
-    Raises:
-      ValueError: `env` is no environment.
-
-    Example:
-      >>> env = tt.EpisodeStatistics(tt.AutoReset(tt.make("base", max_steps=1)))
-      >>> state, timestep = env.reset(jax.random.key(0))
-      >>> state, timestep = env.step(state, jnp.array([0, 0]))
-      >>> int(state.episodes), int(state.last_length), float(state.last_return)
-      (1, 1, 0.0)
-    """
-
-    env: EnvironmentLike
-
-    def __post_init__(self):
-        _check_environment(self.env)
-
-    @property
-    def auto_resets(self) -> str | None:
-        """The step in which the wrapped environment resets: "SameStep", "NextStep" or None."""
-        return _auto_resets(self.env)
-
-    @names_adapters
-    def reset(self, key: jax.Array) -> tuple[EpisodeStatisticsState, TimeStep]:
-        """Starts the first episode with all counts at zero."""
-        inner, timestep = self.env.reset(key)
-        shape = timestep.reward.shape
-        return EpisodeStatisticsState(
-            inner=inner,
-            running_return=jnp.zeros(shape, jnp.float32),
-            running_length=jnp.zeros(shape, jnp.int32),
-            last_return=jnp.zeros(shape, jnp.float32),
-            last_length=jnp.zeros(shape, jnp.int32),
-            episodes=jnp.zeros(shape, jnp.int32),
-            over=jnp.zeros(shape, bool),
-        ), timestep
-
-    @names_adapters
-    def step(
-        self, state: EpisodeStatisticsState, action: jax.Array
-    ) -> tuple[EpisodeStatisticsState, TimeStep]:
-        """Takes one action and updates the counts.
-
-        Raises:
-          ValueError: `state` is not an `EpisodeStatisticsState`.
-        """
-        check_own_state(state, EpisodeStatisticsState)
-        inner, timestep = self.env.step(state.inner, action)
-        is_counted = ~state.over
-        running_return = state.running_return + jnp.where(is_counted, timestep.reward, 0.0)
-        running_length = state.running_length + is_counted.astype(jnp.int32)
-        finished = timestep.done & is_counted
-        # By the timestep, since a user's wrapper may hide the attribute.
-        has_reset = isinstance(timestep, AutoResetTimeStep) and self.auto_resets != "NextStep"
-        return EpisodeStatisticsState(
-            inner=inner,
-            running_return=jnp.where(timestep.done, 0.0, running_return),
-            running_length=jnp.where(timestep.done, 0, running_length),
-            last_return=jnp.where(finished, running_return, state.last_return),
-            last_length=jnp.where(finished, running_length, state.last_length),
-            episodes=state.episodes + finished.astype(jnp.int32),
-            over=jnp.zeros_like(timestep.done) if has_reset else timestep.done,
-        ), timestep
-
-
-def _check_environment(env: Any) -> None:
-    methods = (getattr(env, "reset", None), getattr(env, "step", None))
-    if isinstance(env, type) or not all(map(callable, methods)):
-        raise ValueError(
-            f"env must be an environment with reset(key) and step(state, action), got {env!r}"
-        )
-
-
-def _auto_resets(env: Any) -> str | None:
-    return getattr(env, "auto_resets", None)
 
 
 def auto_reset_timestep(

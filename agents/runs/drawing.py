@@ -9,12 +9,25 @@ from pathlib import Path
 from typing import Any
 
 from trap_tube_jax.command_line import one_line
-from trap_tube_jax.figures import default_style
 
 # Okabe and Ito's palette, which is colour-blind safe.
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 
 WIDTH = 8.3  # inches, as in a page 830 pixels wide
+
+
+@contextlib.contextmanager
+def default_style() -> Iterator[None]:
+    """Draws under Matplotlib's defaults in the `with` block, alike on every machine.
+
+    Ignores the user's settings, such as a matplotlibrc, and treats `$` as plain text.
+    """
+    import matplotlib as mpl  # noqa: PLC0415  slow to import
+
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams["text.parse_math"] = False
+        yield
 
 
 @contextlib.contextmanager

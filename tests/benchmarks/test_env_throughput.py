@@ -28,7 +28,6 @@ def counter(name, *, plain=False):
 
 
 def test_throughput_measures_every_set_and_batch(timed, monkeypatch):
-    monkeypatch.setattr(env_throughput, "copy_bandwidth", lambda: 1e9)
     monkeypatch.setattr(env_throughput, "task_set_subject", counter)
     options = env_throughput.Options(sets=("base", "sy"), num_envs=(2, 4), num_steps=3, repeats=3)
     results = env_throughput.main(options)

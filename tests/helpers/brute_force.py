@@ -26,7 +26,7 @@ class Level(NamedTuple):
 
 
 class Graph(NamedTuple):
-    """All positions i64[n, 3] that can be reached, the start first, and fewest steps between them.
+    """All positions i64[n, 3] that can be reached, the start first, and fewest steps to the goal.
 
     The successors i32[n, 16] are indices of positions, -1 for a solved position, which has none. A
     distance f64[n] is infinite where there is no way.
@@ -34,7 +34,6 @@ class Graph(NamedTuple):
 
     positions: np.ndarray
     successors: np.ndarray
-    from_start: np.ndarray
     to_goal: np.ndarray
 
 
@@ -66,17 +65,16 @@ def graph(state) -> Graph:
     starts = np.repeat(np.arange(len(found), dtype=np.int32), 16)
     edges = starts, successors[: len(found)].ravel()
     matrix = csr_array((np.ones(len(edges[0])), edges), (len(positions), len(positions)))
-    from_start = dijkstra(matrix, unweighted=True, indices=0)
     to_goal = np.full(len(positions), np.inf)
     if len(goals):
         ends = np.arange(len(found), len(positions))
         to_goal = dijkstra(matrix.T, unweighted=True, indices=ends, min_only=True)
-    return Graph(positions, successors, from_start, to_goal)
+    return Graph(positions, successors, to_goal)
 
 
 def first_plan(state) -> list[list[int]] | None:
     """The shortest plan whose actions (grasp, move) come first, step by step, or None."""
-    _, successors, _, to_goal = graph(state)
+    _, successors, to_goal = graph(state)
     if np.isinf(to_goal[0]):
         return None
     position = 0

@@ -46,12 +46,6 @@ def test_spaces_and_parameters_are_gymnaxs(easy):
     assert env.observation_space(params).shape == (12, 12, 5)
 
 
-def test_an_environment_that_is_given_stays_as_it_is():
-    env = tt.Environment(max_steps=6)
-    to_gymnax.make(env)
-    assert env.max_steps == 6
-
-
 def test_five_values_equal_those_of_the_wrapped_environment(easy, easy_env):
     env, params = easy
     observation, state = env.reset(jax.random.PRNGKey(0), params)
@@ -84,18 +78,6 @@ def test_the_limit_changes_without_compiling_again(easy):
             assert float(info["discount"]) == 1.0
         ends.append(type(env).step._cache_size())
     assert ends[0] == ends[1]
-
-
-def test_the_final_observation_on_request(easy_env):
-    env, params = to_gymnax.make(easy_env, final_observation=True)
-    key = jax.random.key(0)
-    _, state = env.reset(key, params)
-    _, state, *_ = env.step(key, state, 3, params)
-    observation, _, _, done, info = env.step(key, state, 1, params)
-    assert done
-    food = tt.base_palette()[5]
-    assert not (info["final_observation"] == food).all(axis=-1).any()
-    assert (observation == food).all(axis=-1).any()
 
 
 def test_a_finished_episode_stays_without_the_reset(easy):
@@ -157,40 +139,6 @@ def test_a_pair_in_place_of_an_index_is_answered_with_the_option(easy):
         env.step(jax.random.key(0), state, np.array([0, 3]), params)
 
 
-def test_batches_of_purejaxrls_wrappers_scan(easy, easy_env):
-    """As PureJaxRL trains: vmap over environments, scan over steps, `info` stacked over both."""
-    env, params = easy
-    if to_gymnax.HAS_SIX_VALUES:
-        env = to_gymnax.SixValueTrapTube(easy_env)
-    env = wrappers.purerl.LogWrapper(wrappers.purerl.FlattenObservationWrapper(env))
-    key = jax.random.key(0)
-    observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, 2), params)
-    assert observation.shape == (2, 432)
-
-    def step(state, action):
-        following = jax.vmap(env.step, (0, 0, 0, None))(
-            jax.random.split(key, 2), state, action, params
-        )
-        return following[1], following[2:]
-
-    actions = jnp.array([[3, 0], [1, 0], *[[0, 0]] * 4])
-    _, (reward, *_, info) = jax.jit(lambda state: jax.lax.scan(step, state, actions))(state)
-    assert reward.sum(0).tolist() == [1, 0]
-    assert info["returned_episode_returns"][1:].tolist() == [[1, 0]] * 5
-    assert info["returned_episode_lengths"][1].tolist() == [2, 0]
-    assert info["returned_episode_lengths"][5, 1] == 6
-
-
-def test_stoa_steps_it(easy):
-    stoa = pytest.importorskip("stoa.env_adapters.gymnax").GymnaxToStoa(*easy)
-    state, timestep = stoa.reset(jax.random.PRNGKey(0))
-    for index in (3, 1):
-        state, timestep = stoa.step(state, jnp.int32(index))
-    assert float(timestep.reward) == 1.0
-    assert float(timestep.discount) == 0.0
-    assert stoa.observation_space().shape == (12, 12, 3)
-
-
 @needs_six_values
 def test_a_custom_set_may_be_registered_again(fresh_task_sets):
     for limit in (7, 9):
@@ -200,8 +148,8 @@ def test_a_custom_set_may_be_registered_again(fresh_task_sets):
 
 
 @needs_six_values
-@pytest.mark.parametrize("name", [entry.id for entry in tt.PAPER_TASK_SETS])
-def test_gymnax_makes_every_task_set(name):
+def test_gymnax_makes_a_task_set():
+    name = "PerceptualTrapTube-v0"
     env, params = gymnax.make(name)
     assert isinstance(env, to_gymnax.SixValueTrapTube)
     assert (env.name, params.max_steps_in_episode) == (name, 50)

@@ -15,7 +15,6 @@ from helpers.easy_task import DOWN, EASY, RIGHT
 from helpers.jax_settings import enable_x64
 from helpers.refusal import assert_refused
 from helpers.trees import assert_same, rows
-from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 OPTIMISED = False  # few steps
 SETS = ("base", "sy", "pstsy")  # the first draws one task, the second five
@@ -194,6 +193,7 @@ def test_custom_transfers_apply_in_order():
     assert state.agent.tolist() == [5, 4]
     assert state.palette.shape == (8, 2)
     assert repr(env) == "Environment(transfers=(clear, into_the_tube), base=..., max_steps=50)"
+    assert "(perceptual + (perceptual, structural))" in repr(tt.make("p+pst"))
     assert_refused(["into_the_tube", "stands on trap"], tt.Environment, (into_the_tube, clear))
 
 
@@ -220,13 +220,6 @@ def test_an_environment_is_constant():
             setattr(env, name, getattr(env, name))
     assert env.with_max_steps(7) == tt.make("p", max_steps=7) != env == tt.make("p")
     assert_refused(["max_steps", ">= 1", "0"], env.with_max_steps, 0)
-
-
-def test_unequal_environments_print_differently():
-    both = tt.compose(tt.perceptual, tt.structural)
-    env = tt.Environment((both, tt.symbolic))
-    assert repr(env) == "Environment(transfers=((perceptual, structural), symbolic), max_steps=50)"
-    assert "(perceptual + (perceptual, structural))" in repr(tt.make("p+pst"))
 
 
 def test_action_numbers_are_four_times_grasp_plus_move():
@@ -322,14 +315,9 @@ BAD_ENVIRONMENTS: list[tuple[dict[str, Any], list[str]]] = [
     ({"transfers": (branching,)}, ["branching", "runs under jax.jit", "TracerBool"]),
     ({"transfers": (by_mask,)}, ["by_mask", "runs under jax.jit", "NonConcreteBooleanIndex"]),
     (
-        {"transfers": (broken(agent=jnp.array((0, 0))), broken(food=jnp.array((0, 0))))},
-        ["invalid", "share cell (0, 0)"],
-    ),
-    (
         {"transfers": (broken(agent=jnp.zeros(2, jnp.float32)),)},
         ["invalid", "state.agent", "int32[2]", "float32[2]"],
     ),
-    ({"transfers": (broken(tool=jnp.array((12, 0))),)}, ["invalid", "tool", "(12, 0)", "0 to 11"]),
 ]
 
 
@@ -354,39 +342,3 @@ def test_invalid_actions_are_refused(action, words):
         vector = tt.VectorEnvironment(tt.Environment())
         state, _ = vector.reset(jax.random.split(jax.random.key(0), 2))
         assert_refused(words, vector.step, state, np.stack([np.zeros_like(action), action]))
-
-
-KEY = jax.random.key(0)
-ACTION = np.zeros(2, np.int32)
-STYLES: dict[str, Any] = {
-    "Gymnasium's reset": lambda env, state: env.reset(),
-    "Gymnasium's reset with a seed": lambda env, state: env.reset(seed=3),
-    "gymnax's reset": lambda env, state: env.reset(KEY, env),
-    "Gymnasium's step": lambda env, state: env.step(ACTION),
-    "gymnax's step": lambda env, state: env.step(KEY, state, ACTION),
-    "gymnax's step with parameters": lambda env, state: env.step(KEY, state, ACTION, env),
-}
-
-
-@pytest.mark.parametrize("call", STYLES.values(), ids=STYLES)
-@pytest.mark.parametrize(
-    "env",
-    [
-        tt.Environment(),
-        *(
-            wrap(tt.Environment())
-            for wrap in (
-                tt.AutoReset,
-                tt.EpisodeStatistics,
-                tt.VectorEnvironment,
-                NextStepVectorEnvironment,
-            )
-        ),
-    ],
-    ids=lambda env: type(env).__name__,
-)
-def test_a_call_in_the_style_of_another_library_is_answered_with_its_adapter(env, call):
-    for form in (call, jax.jit(call, static_argnums=0)):
-        with pytest.raises(TypeError, match=r"reset\(key\) and step\(state, action\)") as error:
-            form(env, tt.base_state())
-        assert "trap_tube_jax.adapters.to_gymnasium or to_gymnax" in str(error.value)

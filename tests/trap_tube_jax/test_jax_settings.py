@@ -36,8 +36,8 @@ STEPS = 4
 def play() -> Any:
     """Episodes of two steps, alone and in a batch, and a picture; keys as their bits."""
     env = tt.Environment(TRANSFERS, base=BASE, max_steps=2)
-    alone = tt.EpisodeStatistics(tt.AutoReset(tt.make("p", max_steps=2)))
-    batch = tt.EpisodeStatistics(tt.VectorEnvironment(env))
+    alone = tt.AutoReset(tt.make("p", max_steps=2))
+    batch = tt.VectorEnvironment(env)
     keys = jax.random.split(jax.random.key(5), 3)
     record: list[Any] = []
     for wrapped, key, shape in ((alone, jax.random.key(6), (2,)), (batch, keys, (3, 2))):

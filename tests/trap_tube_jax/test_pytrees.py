@@ -20,11 +20,8 @@ ENVIRONMENTS: dict[str, Any] = {
     "plain": SHORT,
     "without transfers": tt.Environment(),
     "auto-reset": tt.AutoReset(SHORT),
-    "statistics": tt.EpisodeStatistics(tt.AutoReset(SHORT)),
-    "statistics of one episode": tt.EpisodeStatistics(SHORT),
     "vector": tt.VectorEnvironment(SHORT),
     "next-step vector": NextStepVectorEnvironment(SHORT),
-    "statistics of a vector": tt.EpisodeStatistics(tt.VectorEnvironment(SHORT)),
 }
 
 

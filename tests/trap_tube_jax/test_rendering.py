@@ -87,15 +87,6 @@ def test_a_horizontal_tool_is_the_vertical_one_turned():
     assert (lying != objects.BASE_COLORS[objects.TOOL]).any()
 
 
-def test_the_exits_sign_is_a_ring():
-    exit = cells(tt.render(tt.base_state(), CELL, grid=False))[5, 7]
-    inked = (exit != objects.BASE_COLORS[objects.EXIT]).any(-1)
-    middle = CELL // 2
-    assert not inked[middle - 1 : middle + 1, middle - 1 : middle + 1].any()
-    assert inked[middle, middle + 4]
-    assert not inked[0].any()
-
-
 def test_grid_lines_surround_the_cells():
     state = tt.base_state()
     changed = np.asarray(tt.render(state, 8) != tt.render(state, 8, grid=False)).any(-1)
@@ -161,7 +152,7 @@ def test_gif_holds_the_frames(tmp_path):
     agents = jnp.array([[9, 1], [9, 2], [9, 3]], jnp.int32)
     frames = [np.asarray(tt.render(state.replace(agent=agent), 8)) for agent in agents]
     path = tmp_path / "episode.gif"
-    tt.save_gif(frames, path, fps=10, hold=0.5)
+    tt.save_gif(frames, path, fps=10)
     with Image.open(path) as gif:
         assert gif.info["loop"] == 0
         durations = []
@@ -169,7 +160,7 @@ def test_gif_holds_the_frames(tmp_path):
             gif.seek(index)
             durations.append(gif.info["duration"])
             np.testing.assert_array_equal(np.asarray(gif.convert("RGB")), frame)
-    assert durations == [100, 100, 600]
+    assert durations == [100, 100, 1100]
 
 
 def durations_of(path):
@@ -182,32 +173,21 @@ def durations_of(path):
     return found
 
 
-@pytest.mark.parametrize("fps", [1, 7, 12, 15, 24, 29.97, 30, 40, 45, 50])
-def test_a_gif_plays_at_its_rate(fps, tmp_path):
-    flicker = np.zeros((61, 4, 4, 3), np.uint8)
+@pytest.mark.parametrize(("fps", "duration"), [(1, 1000), (4, 250), (29.97, 30), (50, 20)])
+def test_a_gif_plays_at_its_rate(fps, duration, tmp_path):
+    flicker = np.zeros((5, 4, 4, 3), np.uint8)
     flicker[1::2] = 255
-    tt.save_gif(flicker, tmp_path / "flicker.gif", fps, hold=0)
-    durations = durations_of(tmp_path / "flicker.gif")
-    np.testing.assert_allclose(np.cumsum(durations), np.arange(1, 62) * 1000 / fps, atol=5.001)
-    assert np.ptp(durations) <= 10
+    tt.save_gif(flicker, tmp_path / "flicker.gif", fps)
+    assert durations_of(tmp_path / "flicker.gif") == [*[duration] * 4, duration + 1000]
 
 
-def test_a_still_picture_lasts_as_long_as_a_gif_can_show_it(tmp_path):
-    still = np.zeros((700, 4, 4, 3), np.uint8)
-    tt.save_gif(still, tmp_path / "still.gif", 1)
-    assert durations_of(tmp_path / "still.gif") == [655_350]
-    still[600:] = 255
-    tt.save_gif(still, tmp_path / "two.gif", 1)
-    assert durations_of(tmp_path / "two.gif") == [600_000, 101_000]
-
-
-def test_gif_of_more_colors_than_it_can_hold(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3)).astype(np.uint8)
-    tt.save_gif(noise, tmp_path / "noise.gif")
-    with Image.open(tmp_path / "noise.gif") as gif:
-        assert getattr(gif, "n_frames", 1) == 2
-        difference = abs(np.asarray(gif.convert("RGB")).astype(int) - noise[0])
-        assert 0 < difference.mean() < 40
+def test_a_picture_that_stays_the_same_stays_as_long(tmp_path):
+    still = np.zeros((6, 4, 4, 3), np.uint8)
+    tt.save_gif(still, tmp_path / "still.gif", 4)
+    assert durations_of(tmp_path / "still.gif") == [2500]
+    still[4:] = 255
+    tt.save_gif(still, tmp_path / "two.gif", 4)
+    assert durations_of(tmp_path / "two.gif") == [1000, 1500]
 
 
 @pytest.mark.parametrize(
@@ -221,8 +201,6 @@ def test_gif_of_more_colors_than_it_can_hold(tmp_path):
         (FRAMES, {"fps": 0}, "from 1 to 50, got 0"),
         (FRAMES, {"fps": 51}, "from 1 to 50, got 51"),
         (FRAMES, {"fps": "4"}, "from 1 to 50, got '4'"),
-        (FRAMES, {"hold": -1}, "from 0 to 100 seconds, got -1"),
-        (FRAMES, {"hold": np.inf}, "got inf"),
     ],
 )
 def test_a_gif_of_impossible_frames_is_refused(frames, options, message, tmp_path):

@@ -157,17 +157,6 @@ def test_colours_are_uniform_on_the_sphere(num_features):
     np.testing.assert_array_less(abs(error), five_sigma * deviation)
 
 
-@pytest.mark.parametrize("num_features", [2, 3, 8])
-def test_structural_points_have_no_preferred_axis(num_features):
-    """Along any direction the distribution is the one along a coordinate."""
-    directions = np.random.default_rng(3).normal(size=(4, num_features))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    chances = np.append(spec.sphere_feature_chances(num_features)[:255], 0).reshape(16, 16)
-    for projection in (_points(num_features)[:, 0] @ directions.T).T:
-        bins = np.floor((projection + 1) / 2 * 255).clip(0, 254).astype(int) // 16
-        assert_fits(np.bincount(bins, minlength=16), chances.sum(axis=1))
-
-
 @pytest.mark.parametrize("num_features", FEATURES)
 def test_structural_leaves_agent_and_food_and_the_tubes_alike(num_features):
     start = tt.base_state(num_features)

@@ -1,4 +1,4 @@
-"""Starting over and counting: the wrappers `AutoReset` and `EpisodeStatistics`."""
+"""Starting over: the wrapper `AutoReset`."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,6 @@ import trap_tube_jax as tt
 from helpers.easy_task import DOWN, EASY, RIGHT
 from helpers.refusal import assert_refused
 from helpers.trees import assert_same, rows
-from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
 
 LIMIT = 6
 TURNS = 40
@@ -19,30 +18,28 @@ ROWS = 256
 
 
 class Turns(NamedTuple):
-    """An auto-resetting environment with statistics: NumPy arrays [time, row, ...]."""
+    """Steps of an auto-resetting environment: NumPy arrays [time, row, ...]."""
 
     before: tt.State
     action: np.ndarray
     after: tt.State
     timestep: Any
-    statistics: Any
 
 
 @pytest.fixture(scope="module")
 def auto_reset() -> Turns:
     """Many short episodes [time, row], of which some succeed and every one looks different."""
     env = tt.Environment((tt.structural,), base=EASY, max_steps=LIMIT)
-    counted = tt.EpisodeStatistics(tt.AutoReset(env))
+    wrapped = tt.AutoReset(env)
 
     def turn(state, action):
-        after, timestep = jax.vmap(counted.step)(state, action)
-        statistics = after.replace(inner=None)
-        return after, Turns(state.inner.inner, action, after.inner.inner, timestep, statistics)
+        after, timestep = jax.vmap(wrapped.step)(state, action)
+        return after, Turns(state.inner, action, after.inner, timestep)
 
     @jax.jit
     def run(key):
         reset_key, action_key = jax.random.split(key)
-        state, first = jax.vmap(counted.reset)(jax.random.split(reset_key, ROWS))
+        state, first = jax.vmap(wrapped.reset)(jax.random.split(reset_key, ROWS))
         actions = jax.random.randint(action_key, (TURNS, ROWS, 2), 0, 4)
         return first, jax.lax.scan(turn, state, actions)[1]
 
@@ -80,57 +77,6 @@ def test_auto_reset_shows_the_next_episode_where_one_ended(auto_reset):
     assert len(np.unique(looks, axis=0)) == done.sum()
 
 
-def test_episode_statistics_count_returns_and_lengths(auto_reset):
-    done = auto_reset.timestep.done
-    reward = auto_reset.timestep.reward
-    for row in range(ROWS):
-        length = 0
-        total = 0.0
-        episodes = 0
-        last = (0, 0.0)
-        for time in range(TURNS):
-            length = length + 1
-            total = total + reward[time, row]
-            if done[time, row]:
-                episodes = episodes + 1
-                last = (length, total)
-                length = 0
-                total = 0.0
-            counted = rows(auto_reset.statistics, (time, row))
-            assert (counted.last_length, counted.last_return) == last
-            assert (counted.running_length, counted.running_return) == (length, total)
-            assert counted.episodes == episodes
-
-
-def test_episode_statistics_around_a_bare_environment_count_one_episode():
-    env = tt.EpisodeStatistics(tt.Environment(base=EASY, max_steps=9))
-    step = jax.jit(env.step)
-    state, _ = env.reset(jax.random.key(0))
-    for _ in range(5):
-        state, _ = step(state, RIGHT)
-    assert (state.episodes, state.last_length, state.last_return) == (1, 2, 1)
-
-
-@pytest.mark.parametrize(
-    ("vector", "num_steps"), [(tt.VectorEnvironment, 6), (NextStepVectorEnvironment, 8)]
-)
-def test_episode_statistics_of_a_vector_count_its_environments_without_resets(vector, num_steps):
-    """Two steps solve the task of the first, three end that of the second; a reset may take one."""
-    fast = tt.EpisodeStatistics(vector(tt.Environment(base=EASY, max_steps=3)))
-
-    @jax.jit
-    def run(keys):
-        state, _ = fast.reset(keys)
-        actions = jnp.broadcast_to(jnp.stack([RIGHT, DOWN]), (num_steps, 2, 2))
-        return jax.lax.scan(fast.step, state, actions)[0]
-
-    state = run(jax.random.split(jax.random.key(0), 2))
-    np.testing.assert_array_equal(state.episodes, [3, 2])
-    np.testing.assert_array_equal(state.last_length, [2, 3])
-    np.testing.assert_array_equal(state.last_return, [1, 0])
-    np.testing.assert_array_equal(state.running_length, [0, 0])
-
-
 class Shaped:
     """A user's wrapper."""
 
@@ -145,38 +91,21 @@ class Shaped:
         return state, timestep.replace(reward=timestep.reward - 0.5)
 
 
-def test_a_users_wrapper_does_not_hide_auto_reset():
-    inner = Shaped(tt.AutoReset(tt.Environment(base=EASY, max_steps=9)))
-    env = tt.EpisodeStatistics(inner)
-    step = jax.jit(env.step)
-    state, _ = env.reset(jax.random.key(0))
-    for _ in range(4):
-        state, _ = step(state, RIGHT)
-    assert (state.episodes, state.last_length, state.last_return) == (2, 2, 0)
+def test_auto_reset_refuses_environments_that_reset_themselves():
+    inner = tt.AutoReset(tt.Environment())
+    assert_refused(["AutoReset resets itself", "trap_tube_jax.Environment"], tt.AutoReset, inner)
     words = ["Shaped resets itself", "trap_tube_jax.Environment"]
-    assert_refused(words, tt.AutoReset(inner).reset, jax.random.key(0))
+    assert_refused(words, tt.AutoReset(Shaped(inner)).reset, jax.random.key(0))
 
 
-@pytest.mark.parametrize("wrapper", [tt.VectorEnvironment, tt.AutoReset])
-def test_auto_reset_refuses_environments_that_reset_themselves_or_count(wrapper):
-    env = wrapper(tt.Environment())
-    words = [wrapper.__name__, "resets itself", "trap_tube_jax.Environment"]
-    assert_refused(words, tt.AutoReset, env)
-    assert_refused(["resets itself"], tt.AutoReset, tt.EpisodeStatistics(env))
-    counting = tt.EpisodeStatistics(tt.Environment())
-    assert_refused(["allowed: EpisodeStatistics(AutoReset(env))"], tt.AutoReset, counting)
-
-
-@pytest.mark.parametrize("wrap", [tt.AutoReset, tt.EpisodeStatistics])
 @pytest.mark.parametrize("env", [None, "base", tt.Environment, tt.base_state()])
-def test_what_is_no_environment_is_refused(wrap, env):
-    assert_refused(["reset(key) and step(state, action)"], wrap, env)
+def test_what_is_no_environment_is_refused(env):
+    assert_refused(["reset(key) and step(state, action)"], tt.AutoReset, env)
 
 
-@pytest.mark.parametrize("wrap", [tt.AutoReset, tt.EpisodeStatistics])
-def test_a_state_of_another_kind_is_refused(wrap):
-    env = wrap(tt.make("base"))
+def test_a_state_of_another_kind_is_refused():
+    env = tt.AutoReset(tt.make("base"))
     _, timestep = env.reset(jax.random.key(0))
     for state in (timestep, tt.base_state()):
-        words = [f"{wrap.__name__}State, got {type(state).__name__}", "return (state, timestep)"]
+        words = [f"AutoResetState, got {type(state).__name__}", "return (state, timestep)"]
         assert_refused(words, env.step, state, jnp.array([DOWN, RIGHT]))

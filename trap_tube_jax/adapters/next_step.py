@@ -1,11 +1,8 @@
 """Batches of environments whose reset takes a step, as is Gymnasium's default."""
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 
-from trap_tube_jax.checks import names_adapters
 from trap_tube_jax.vector import VectorEnvironment, VectorState
 from trap_tube_jax.wrappers import AutoResetTimeStep, auto_reset_timestep
 
@@ -16,9 +13,6 @@ class NextStepVectorEnvironment(VectorEnvironment):
     The reset step ignores its action, pays 0 and returns the new episode's first observation.
     """
 
-    auto_resets: ClassVar = "NextStep"
-
-    @names_adapters
     def step(self, state: VectorState, actions: jax.Array) -> tuple[VectorState, AutoResetTimeStep]:
         """Takes actions i32[B, 2], or starts the next episode where one has ended."""
         stepped, timestep, final_picture = self._advance(state, actions)

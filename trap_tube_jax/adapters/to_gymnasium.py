@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.adapters.next_step import NextStepVectorEnvironment
@@ -22,7 +21,7 @@ from trap_tube_jax.checks import check_integer, integer_array
 from trap_tube_jax.environment import Environment, pairs_of
 from trap_tube_jax.imports import needs_extra
 from trap_tube_jax.objects import NUM_ACTIONS, NUM_DIRECTIONS
-from trap_tube_jax.observation import observe, render_ascii
+from trap_tube_jax.observation import render_ascii
 from trap_tube_jax.registry import make, registered_ids
 from trap_tube_jax.rendering import render
 from trap_tube_jax.state import take
@@ -39,8 +38,6 @@ NAMESPACE = "trap_tube_jax"
 RENDER_MODES = ("rgb_array", "ansi")
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}
 AUTORESET_MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
-
-_observe = jax.jit(jax.vmap(observe))
 
 
 class _Programs(NamedTuple):
@@ -233,36 +230,24 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Draws the next task of every environment, or of those in a mask.
+        """Draws the next task of every environment.
 
         Args:
           seed: restarts the sequences of tasks, modulo 2**32. Environment i takes `seed + i`, or
-            the i-th of several, where None continues its sequence.
-          options: `options["reset_mask"]`, bool[num_envs], selects the environments to reset;
-            the others keep their episodes.
+            the i-th of several.
+          options: none are known.
 
         Raises:
-          ValueError: the number of seeds is not `num_envs`, one is not an integer >= 0, or the
-            mask is not bool[num_envs] with at least one true.
-          gymnasium.error.ResetNeeded: a mask is given before the first reset.
+          ValueError: the number of seeds is not `num_envs`, one is not an integer >= 0, or there
+            are options, such as a `reset_mask`.
         """
-        mask = (options or {}).get("reset_mask")
-        if mask is None:
-            keys = self._next_keys(seed)
-            self._state, timestep = self._programs.reset(keys)
-            return np.array(timestep.observation), {}
-        mask = np.asarray(mask)
-        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(
-                f"reset_mask must be bool[{self.num_envs}] with at least one true, got {mask}"
-            )
-        state = _started(self._state)
-        fresh, _ = self._programs.reset(self._next_keys(seed))
-        self._state = state = jax.tree.map(functools.partial(_select, mask), fresh, state)
-        return np.array(_observe(state.episodes.inner)), {}
+        if options:
+            raise ValueError(f"reset takes no options and resets all environments, got {options}")
+        self._state, timestep = self._programs.reset(self._next_keys(seed))
+        return np.array(timestep.observation), {}
 
     def step(
         self, actions: Any
@@ -301,23 +286,18 @@ class TrapTubeVectorEnv(_Compiled, gymnasium.vector.VectorEnv):
     def _next_keys(self, seed: Any) -> jax.Array:
         """Returns one key per environment: from its seed, or the next one of its sequence."""
         if seed is None:
-            seeds = [None] * self.num_envs
-        elif np.ndim(seed) == 0:
+            if self._state is not None:
+                return self._state.episodes.key
+            return _keys(self.np_random.integers(2**32, size=self.num_envs).tolist())
+        if np.ndim(seed):
+            seeds = [check_integer("seed", one, minimum=0) for one in seed]
+        else:
             first = check_integer("seed", seed, minimum=0)
             seeds = [first + index for index in range(self.num_envs)]
-        else:
-            seeds = [x if x is None else check_integer("seed", x, 0) for x in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must be one or {self.num_envs} integers, got {len(seeds)}")
-        super().reset(seed=next((x for x in seeds if x is not None), None))
-        if self._state is None:
-            drawn = self.np_random.integers(2**32, size=self.num_envs).tolist()
-            seeds = [new if x is None else x for x, new in zip(seeds, drawn, strict=True)]
-        keys = _keys([x or 0 for x in seeds])
-        if self._state is None:
-            return keys
-        is_seeded = np.array([x is not None for x in seeds])
-        return _select(is_seeded, keys, self._state.episodes.key)
+        super().reset(seed=seeds[0])
+        return _keys(seeds)
 
 
 def register() -> None:
@@ -341,14 +321,6 @@ def _keys(seeds: Sequence[Any]) -> jax.Array:
     """Returns one Threefry key per seed, modulo 2**32, such as `AutoReset` keeps."""
     numbers = np.array([seed % 2**32 for seed in seeds], np.uint32)
     return jax.vmap(functools.partial(jax.random.key, impl="threefry2x32"))(numbers)
-
-
-def _select(mask: np.ndarray, new: jax.Array, old: jax.Array) -> jax.Array:
-    """Selects rows of `new` [B, ...] where `mask` bool[B], else of `old`; consumes no keys."""
-    if jnp.issubdtype(new.dtype, jax.dtypes.prng_key):
-        data = _select(mask, jax.random.key_data(new), jax.random.key_data(old))
-        return jax.random.wrap_key_data(data, impl="threefry2x32")
-    return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _started(state: Any) -> Any:

@@ -1,7 +1,7 @@
 """The task sets as gymnax environments, with the step of gymnax 0.x or of gymnax >= 1.0.
 
-A step of gymnax 0.x returns five values, which PureJaxRL, rejax and Stoa expect with any
-gymnax: `make` and `FiveValueTrapTube`. A step of gymnax 1.0 returns six values:
+A step of gymnax 0.x returns five values, which PureJaxRL and rejax expect with any gymnax:
+`make` and `FiveValueTrapTube`. A step of gymnax 1.0 returns six values:
 `SixValueTrapTube`, which importing this module registers.
 
     env, params = to_gymnax.make("TrapTube-v0")
@@ -151,29 +151,8 @@ class FiveValueTrapTube(_TrapTube):
     """The environment of gymnax 0.x: (observation, state, reward, done, info).
 
     `done` is true where the episode terminates or is truncated; state and observation then start
-    the next episode. `info` holds the scalars discount, terminated and truncated, and on request
-    final_observation, u8[12, 12, N].
+    the next episode. `info` holds the scalars discount, terminated and truncated.
     """
-
-    def __init__(
-        self,
-        task_set: str | Environment = "TrapTube-v0",
-        *,
-        final_observation: bool = False,
-        **options: Any,
-    ):
-        """Checks the arguments.
-
-        Args:
-          task_set: registered id, short name or label, or an `Environment`.
-          final_observation: adds the observation before any reset to `info`.
-          **options: flat_actions and num_features, see `SixValueTrapTube`.
-
-        Raises:
-          ValueError: an argument is invalid; the message says what is allowed.
-        """
-        super().__init__(task_set, **options)
-        self.final_observation = final_observation
 
     @functools.partial(jax.jit, static_argnames=("self",))
     def step(
@@ -184,8 +163,6 @@ class FiveValueTrapTube(_TrapTube):
         step_key, reset_key = jax.random.split(key)
         stepped = self.step_env(step_key, state, action, params)
         observation, state, reward, done, info = stepped
-        if self.final_observation:
-            info["final_observation"] = observation
         observation, state = jax.tree.map(
             lambda new, old: jnp.where(done, new, old),
             self.reset_env(reset_key, params),

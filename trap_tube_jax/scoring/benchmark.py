@@ -51,7 +51,7 @@ class Policy(Protocol):
 
         Returns:
           Actions integer[B, 2], (grasp, move), and the next carry of the same structure, shapes
-          and types, without NaN.
+          and types.
         """
         ...
 
@@ -65,7 +65,6 @@ class _Episodes(NamedTuple):
       observation: u8[B, 12, 12, N].
       carry: the policy's memory.
       in_range: bool[B], all actions of the unfinished episode were in range.
-      is_number: bool[], the memory held no NaN.
     """
 
     time: jax.Array
@@ -73,7 +72,6 @@ class _Episodes(NamedTuple):
     observation: jax.Array
     carry: Any
     in_range: jax.Array
-    is_number: jax.Array
 
 
 def score(
@@ -99,8 +97,7 @@ def score(
       The scores by set; printed, a table.
 
     Raises:
-      ValueError: an argument is invalid; the policy returns an action out of range, or its memory
-        becomes NaN.
+      ValueError: an argument is invalid, or the policy returns an action out of range.
 
     Example:
       >>> class Still:
@@ -128,16 +125,11 @@ def score(
         def play_block(block: State, start: int) -> tuple[jax.Array, ...]:
             return program(env, block, jax.random.fold_in(key, start))
 
-        solved, length, in_range, is_number = play_blocks(play_block, states)
+        solved, length, in_range = play_blocks(play_block, states)
         if not np.all(in_range):
             raise ValueError(
                 f"the policy's act returned an invalid action on {entry.label}; allowed: "
                 f"(grasp, move), each in 0 to {NUM_DIRECTIONS - 1}"
-            )
-        if not np.all(is_number):
-            raise ValueError(
-                f"the policy's act returned a carry with NaN on {entry.label}; check that its "
-                "parameters are finite"
             )
         return _Ends(np.asarray(solved), np.asarray(length))
 
@@ -215,19 +207,18 @@ def _scores(
 
 def _play(
     policy: Policy, env: Environment, states: State, key: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Plays B tasks in lockstep until all are over.
 
     Returns:
       Solved bool[B]; steps taken i32[B]; bool[B], all actions of the unfinished episode were in
-      range; bool[B], the same in every row: the policy's memory held no NaN.
+      range.
     """
     batch = len(states.time)
 
     def step(now: _Episodes) -> _Episodes:
         step_key = jax.random.fold_in(key, now.time)
         action, carry = _pair(policy.act(now.observation, now.carry, step_key), batch)
-        _check_carry(now.carry, carry)
         states, timestep = jax.vmap(env.step)(now.states, action)
         in_range = jnp.all((action >= 0) & (action < NUM_DIRECTIONS), axis=-1)
         return _Episodes(
@@ -236,7 +227,6 @@ def _play(
             observation=timestep.observation,
             carry=carry,
             in_range=now.in_range & (in_range | now.states.done),
-            is_number=now.is_number & ~_has_nan(carry),
         )
 
     first = _Episodes(
@@ -245,29 +235,9 @@ def _play(
         observation=jax.vmap(observe)(states),
         carry=policy.initial(batch),
         in_range=jnp.ones(batch, bool),
-        is_number=jnp.array(True),
     )
     last = jax.lax.while_loop(lambda now: ~jnp.all(now.states.done), step, first)
-    is_number = jnp.broadcast_to(last.is_number, (batch,))
-    return last.states.terminated, last.states.time, last.in_range, is_number
-
-
-def _check_carry(before: Any, after: Any) -> None:
-    """Raises ValueError unless two carries have the same structure, shapes and dtypes."""
-    expected, got = (jax.tree.map(jax.typeof, tree) for tree in (before, after))
-    same = jax.tree.structure(expected) == jax.tree.structure(got) and all(
-        old.shape == new.shape and (old.dtype == new.dtype or old.weak_type)
-        for old, new in zip(*map(jax.tree.leaves, (expected, got)), strict=True)
-    )
-    if not same:
-        raise ValueError(
-            f"the policy's act must return a carry like that of initial, {expected}, got {got}"
-        )
-
-
-def _has_nan(tree: Any) -> jax.Array:
-    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
-    return jnp.any(jnp.array([jnp.any(jnp.isnan(leaf)) for leaf in leaves], bool))
+    return last.states.terminated, last.states.time, last.in_range
 
 
 def _pair(returned: Any, batch: int) -> tuple[jax.Array, Any]:

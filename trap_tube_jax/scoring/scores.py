@@ -21,13 +21,11 @@ class Optimality:
       solvable: number of tasks that some plan within the step limit solves.
       percent_of_solvable: percent of the solvable tasks that are solved; None without any.
       mean: mean of shortest length / steps taken over solved tasks; None without any.
-      worst: smallest of these ratios; None without any.
     """
 
     solvable: int
     percent_of_solvable: float | None
     mean: float | None
-    worst: float | None
 
     @classmethod
     def of(
@@ -40,7 +38,6 @@ class Optimality:
             solvable=int(solvable.sum()),
             percent_of_solvable=100 * float(solved[solvable].mean()) if solvable.any() else None,
             mean=float(ratio.mean()) if len(ratio) else None,
-            worst=float(ratio.min()) if len(ratio) else None,
         )
 
 

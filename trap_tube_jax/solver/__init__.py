@@ -5,12 +5,11 @@ edges the 16 actions. The search runs on the host, and `dynamics.step` computes 
 whole frontier at a time, so there is one set of rules.
 
     search.py      breadth-first search; shortest plans
-    distance.py    distances from the start and to the goal, for every reachable state
-    pictures.py    distances and histograms as PNG
+    distance.py    distances to the goal, for every reachable state
     __main__.py    the command line: python -m trap_tube_jax.solver --help
 """
 
-from trap_tube_jax.solver.distance import Distances, distances
+from trap_tube_jax.solver.distance import distances
 from trap_tube_jax.solver.search import Plan, solve, solve_batch
 
-__all__ = ["Distances", "Plan", "distances", "solve", "solve_batch"]
+__all__ = ["Plan", "distances", "solve", "solve_batch"]

@@ -235,7 +235,7 @@ def test_a_suite_plays_all_sets_in_equal_blocks_up_to_their_limits(near, monkeyp
     ]
     assert (scores["p"].mean_steps, scores.seed, scores.protocol) == (5, 7, PROTOCOL)
     found: Any = scores["p"].optimality
-    assert dataclasses.astuple(found) == pytest.approx((3, 100, 7 / 15, 1 / 5))
+    assert dataclasses.astuple(found) == pytest.approx((3, 100, 7 / 15))
     assert_refused(["name at least one"], Suite.of_sets, [], 6)
 
 
@@ -273,7 +273,7 @@ def test_optimality_compares_solved_tasks_with_shortest_plans(near):
     assert 0 < near_ones < 6
     score = tt.score(Rightward(UP, DOWN), ["Far-v0"], tasks=8, optimality=6)["Far-v0"]
     assert score.mean_steps == 5
-    assert score.optimality == Optimality(near_ones, 100, 3 / 5, 3 / 5)
+    assert score.optimality == Optimality(near_ones, 100, 3 / 5)
 
 
 def test_draws_depend_on_seed_and_set_alone(near):
@@ -388,42 +388,12 @@ class Constant:
         return jnp.broadcast_to(action, (len(observation), 2)), carry + 1
 
 
-class Broken:
-    """A policy whose memory becomes NaN, as under parameters that have diverged."""
-
-    def initial(self, batch):
-        return jnp.ones((batch, 4))
-
-    def act(self, observation, carry, key):
-        return jnp.zeros((len(observation), 2), jnp.int32), carry * jnp.nan
-
-
-class BrokenOnce:
-    """A policy whose second carry holds NaN, and no other."""
-
-    def initial(self, batch):
-        return jnp.int32(0), jnp.zeros(batch)
-
-    def act(self, observation, carry, key):
-        time, memory = carry
-        memory = jnp.where(time == 1, jnp.nan, jnp.zeros_like(memory))
-        return jnp.zeros((len(observation), 2), jnp.int32), (time + 1, memory)
-
-
-@pytest.mark.parametrize("tasks", [2, 3])
-def test_act_must_return_a_carry(near, tasks):
+def test_act_must_return_a_carry(near):
     policy: Any = Random()
     policy.act = lambda observation, carry, key: jnp.zeros((len(observation), 2), int)
     words = ["act must return a pair (actions i32[B, 2], carry)", "got "]
-    assert_refused(words, tt.score, policy, ["near"], tasks)
-    policy.act = lambda observation, carry, key: (jnp.zeros((len(observation), 2), int), (0, 0))
-    words = ["act must return a carry like that of initial", "got (ShapedArray(int32[]"]
-    assert_refused(words, tt.score, policy, ["near"], tasks)
-    policy.initial = jnp.zeros
-    half = jnp.zeros(tasks, jnp.float16)
-    policy.act = lambda observation, carry, key: (jnp.zeros((len(observation), 2), int), half)
-    words = ["like that of initial, ", f"float32[{tasks}]", "got ", f"float16[{tasks}]"]
-    assert_refused(words, tt.score, policy, ["near"], tasks)
+    for tasks in (2, 3):
+        assert_refused(words, tt.score, policy, ["near"], tasks)
 
 
 def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
@@ -434,9 +404,6 @@ def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     words = ["an invalid action", "(grasp, move)", "0 to 3"]
     for action in (Constant(first, np.where(over, RIGHT, 4)), Constant([-1, RIGHT])):
         assert_refused(words, tt.score, action, ["near"], 20)
-    for policy in (Broken(), BrokenOnce()):
-        with pytest.raises(ValueError, match="act returned a carry with NaN on near"):
-            tt.score(policy, ["near"], 20)
     tt.register("Far-v0", (), base=near.base.replace(food=jnp.array([9, 9])), max_steps=4)
     assert_refused(words, tt.score, Constant([0, 0], [9, 9]), ["Far-v0"], 20)  # in the last step
     floats = Constant(np.array([0, 3], np.float32))

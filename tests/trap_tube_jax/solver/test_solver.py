@@ -13,7 +13,6 @@ from trap_tube_jax.dynamics import replay
 from trap_tube_jax.objects import EXIT, MAX_STEPS, NUM_ACTIONS, TOOL, TRAP, TUBE1, TUBE2
 from trap_tube_jax.positions import NUM_POSITIONS
 from trap_tube_jax.scoring.knowledge import first_push
-from trap_tube_jax.solver import pictures
 from trap_tube_jax.solver.search import levels, validate_on_host
 from trap_tube_jax.state import take
 from trap_tube_jax.transfers import swap_with_tool
@@ -74,7 +73,7 @@ def workshop() -> tt.State:
 
 
 @pytest.fixture(scope="module")
-def workshop_distances(workshop) -> tt.Distances:
+def workshop_distances(workshop) -> np.ndarray:
     return tt.distances(workshop)
 
 
@@ -223,9 +222,7 @@ def test_a_task_that_cannot_be_solved_has_an_empty_plan():
     assert (plan.length, plan.solvable, plan.actions.shape) == (-1, False, (0, 2))
     plans = tt.solve_batch(stack([state]))
     assert plans.actions.shape == (1, 0, 2)
-    found = tt.distances(state)
-    assert found.num_reachable == 2
-    assert (found.to_goal == -1).all()
+    assert (tt.distances(state) == -1).all()
 
 
 def test_plans_are_not_bound_by_the_step_limit():
@@ -241,20 +238,16 @@ def test_a_task_is_solved_from_the_middle_of_an_episode(base_plan):
 
 
 def test_distances_equal_brute_forces_and_count_down_along_the_plan(workshop, workshop_distances):
-    found = workshop_distances
     expected = brute_force.graph(workshop)
-    assert found.num_reachable == len(expected.positions)
-    assert found.from_start.dtype == found.to_goal.dtype == np.int16
+    assert workshop_distances.dtype == np.int16
     index = np.stack(np.divmod(expected.positions[:, [2, 1, 0]], 12), axis=-1).reshape(-1, 6).T
-    np.testing.assert_array_equal(found.from_start[tuple(index)], expected.from_start)
     to_goal = np.where(np.isinf(expected.to_goal), -1, expected.to_goal)
-    np.testing.assert_array_equal(found.to_goal[tuple(index)], to_goal)
-    assert np.count_nonzero(found.to_goal >= 0) == np.count_nonzero(to_goal >= 0)
+    np.testing.assert_array_equal(workshop_distances[tuple(index)], to_goal)
+    assert np.count_nonzero(workshop_distances >= 0) == np.count_nonzero(to_goal >= 0)
     plan = tt.solve(workshop)
     states = replay(workshop, plan.actions)
-    left = list(range(plan.length, -1, -1))
-    assert [int(found.lookup(take(states, time))) for time in range(len(left))] == left
-    assert found.lookup(states).tolist() == left
+    cells = np.concatenate([states.food, states.tool, states.agent], axis=1)
+    assert workshop_distances[tuple(cells.T)].tolist() == list(range(plan.length, -1, -1))
 
 
 def test_finished_and_invalid_states_are_refused():
@@ -270,30 +263,3 @@ def test_finished_and_invalid_states_are_refused():
     assert_refused([words], tt.solve_batch, stack([base, solved]))
     assert_refused(["one leading axis"], tt.solve_batch, base)
     assert_refused(["must be"], tt.solve, stack([base, base]))
-
-
-def test_pictures_of_distances_count_the_steps_that_are_left(
-    workshop, workshop_distances, tmp_path, monkeypatch
-):
-    drawn = []
-
-    def draw(axis, state, steps, scale):
-        drawn.append((axis, state, steps))
-        pictures_draw(axis, state, steps, scale)
-
-    pictures_draw = pictures._draw_distances
-    monkeypatch.setattr(pictures, "_draw_distances", draw)
-    monkeypatch.setattr(pictures.Figure, "savefig", lambda *_, **__: None)
-    plan = tt.solve(workshop)
-    found = workshop_distances
-    pictures.save_distances(workshop, plan, found, tmp_path / "none.png")
-    assert len(drawn) == pictures.MOMENTS
-    for axis, state, steps in drawn:
-        left = found.lookup(state)
-        agent = tuple(np.asarray(state.agent).tolist())
-        assert axis.get_title() == f"steps left: {left}"
-        assert steps[agent] == left
-        numbers = {text.get_position()[::-1]: int(text.get_text()) for text in axis.texts}
-        cells = {tuple(cell) for cell in np.argwhere(steps >= 0).tolist()}
-        assert numbers == {cell: steps[cell] for cell in cells - {agent}}
-    assert found.lookup(drawn[0][1]) == plan.length > found.lookup(drawn[-1][1])
