@@ -44,17 +44,17 @@ def read_json(path: Path) -> Any:
 
 
 @contextlib.contextmanager
-def lock_folder(path: Path, wait: float = 0) -> Iterator[None]:
+def lock_folder(path: Path) -> Iterator[None]:
     """Makes this process the only writer of a folder; makes the folder if missing.
 
     Raises:
-      ValueError: another process writes to the folder, even after `wait` seconds.
+      ValueError: another process writes to the folder.
       OSError: the folder cannot be created or locked.
     """
     path.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(filelock.FileLock(path / ".lock", timeout=wait))
+            stack.enter_context(filelock.FileLock(path / ".lock", timeout=0))
         except filelock.Timeout:
             reason = f"{path} is being written by another process; wait for its end"
             raise ValueError(reason) from None

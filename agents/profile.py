@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.command_line import option, parse
-from agents.files import check_folder, write_bytes, write_json
+from agents.files import check_folder, read_json, write_bytes, write_json
 from agents.profiles import plots
 from agents.profiles.measure import (
     Table,
@@ -39,7 +39,8 @@ class Options:
 
     Attributes:
       runs: runs' folders, files of parameters, or names of shipped agents.
-      output: folder for the files, by default runs/profile-NAMES; an earlier profile is replaced.
+      output: folder for the files, by default runs/profile-NAMES. An earlier profile of these
+        policies is replaced.
       parts: some of structural, perceptual and both (success by strength), symbolic (by the object
         that is the tool), kind and plan-length (of the tasks of {P}), first-push-p and
         first-push-pst (towards the exit or away from it, in {P} and {P, St}), first-grasp-psy and
@@ -73,6 +74,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     check_folder(output)
     if output.is_dir() and any(output.iterdir()) and not (output / TABLE).is_file():
         raise ValueError(f"{output} holds other files than a profile's; give another --output")
+    before = output / PROVENANCE_FILE
+    if before.is_file() and read_json(before)["iterations"].keys() != iterations.keys():
+        raise ValueError(f"{output} holds the profile of other policies; give another --output")
     found = profile(policies, options.parts, options.strengths, options.tasks, announce)
     _print_tables(found)
     output.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,8 @@ DEFAULT_PRESET = "fast"
 class Options:
     """Trains an agent, evaluates it on all task sets and writes a folder of results.
 
-    Ctrl-C saves and stops; --resume continues to the same result.
+    Ctrl-C saves and stops; --resume continues to the same result. Brackets hold the defaults of
+    preset fast.
 
     Attributes:
       preset: initial settings (fast, best or paper), by default fast.

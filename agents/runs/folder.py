@@ -104,6 +104,8 @@ def check_output(path: Path) -> None:
     check_folder(path.parent)
     if run := run_of(path):
         raise ValueError(f"{path} is a file of the run {run.path}; give another path")
+    if path.exists() and (path.parent / GRID_FILE).is_file():
+        raise ValueError(f"{path} may be a file of a grid; give another path")
 
 
 def run_of(path: Path) -> RunFolder | None:

@@ -46,8 +46,8 @@ def check_rows(folder: RunFolder, iteration: int) -> None:
             )
     elif max(rows["iteration"], default=0) < iteration:
         raise ValueError(
-            f"{folder.metrics} ends before the checkpoint of iteration {iteration}; restore it, or "
-            "train under another --name"
+            f"{folder.metrics} ends before the checkpoint of iteration {iteration} (a line "
+            "without its newline does not count); restore it, or train under another --name"
         )
 
 
@@ -91,8 +91,9 @@ def best_iteration(folder: RunFolder) -> int | None:
     """Returns the iteration of the best policy so far; None if there is none."""
     if not folder.best.is_file():
         return None
+    _, about = read_arrays(folder.best)
     with naming_file(folder.best):
-        return read_arrays(folder.best)[1]["iteration"]
+        return about["iteration"]
 
 
 def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:

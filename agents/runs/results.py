@@ -65,11 +65,10 @@ def find_runs(paths: Paths) -> list[RunFolder]:
 
     Raises:
       ValueError: a folder holds no run, or there is no folder.
-      OSError: a folder cannot be opened.
     """
     found: dict[str, Path] = {}
     for path in map(expand, [paths] if isinstance(paths, str | Path) else paths):
-        runs = sorted(file.parent for file in path.rglob(CONFIG_FILE))
+        runs = sorted(runs_below(path))
         if not runs:
             raise ValueError(f"{path} holds no run; {runs_near(path)}")
         for run in runs:
@@ -77,6 +76,18 @@ def find_runs(paths: Paths) -> list[RunFolder]:
     if not found:
         raise ValueError("paths must name at least one folder")
     return list(map(RunFolder, found.values()))
+
+
+def runs_below(path: Path) -> Iterable[Path]:
+    """Yields the folders of the runs in a folder, once even if several links lead to one."""
+    seen = set()
+    for folder, names, files in os.walk(path, followlinks=True):
+        names.sort(key=lambda name: (Path(folder, name).is_symlink(), name))
+        if os.path.realpath(folder) in seen:
+            names.clear()
+        elif CONFIG_FILE in files:
+            yield Path(folder)
+        seen.add(os.path.realpath(folder))
 
 
 def _table(folder: RunFolder, path: Path, stored: dict[str, Any], **about: Any) -> pd.DataFrame:

@@ -82,7 +82,6 @@ def train_runs(
     *,
     consoles: Mapping[Path, Console] | None = None,
     stop: Callable[[], bool] | None = None,
-    wait: float = 0,
 ) -> dict[Path, Outcome]:
     """Trains runs that differ only in their seed, by one program; see `train_run`.
 
@@ -94,7 +93,6 @@ def train_runs(
       options: of all runs; for several runs `devices` is one.
       consoles: where the progress of a run is shown, by its folder.
       stop: see `train_run`.
-      wait: seconds to wait for another process that writes to a run's folder.
 
     Returns:
       The outcomes by folder.
@@ -117,7 +115,7 @@ def train_runs(
             console = (consoles or {}).get(path) or Console(quiet=True)
             with capturing_outcome(outcomes, path):
                 stored = RunFolder(path)
-                folder = stack.enter_context(output_folder(stored, wait))
+                folder = stack.enter_context(output_folder(stored))
                 opened[path] = Progress(run, program, stored, folder, console)
                 opened[path].begin()
         training = {
@@ -172,7 +170,7 @@ def train(
 
 
 @contextlib.contextmanager
-def output_folder(stored: RunFolder, wait: float) -> Iterator[RunFolder]:
+def output_folder(stored: RunFolder) -> Iterator[RunFolder]:
     """Makes this process the writer of a run.
 
     Yields the run's folder; processes other than the first get a temporary folder.
@@ -180,7 +178,7 @@ def output_folder(stored: RunFolder, wait: float) -> Iterator[RunFolder]:
     Raises ValueError if another process writes to the folder, OSError if it cannot be created.
     """
     if jax.process_index() == 0:
-        with lock_folder(stored.path, wait):
+        with lock_folder(stored.path):
             yield stored
     else:
         with tempfile.TemporaryDirectory() as copy:

@@ -4,6 +4,7 @@ A grid's folder holds results.csv (rows of `agents.results`), curves.csv (metric
 grid.json (see `About`). table.md and the figures are made from only these three files.
 """
 
+import contextlib
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -13,11 +14,11 @@ from typing import Any, NotRequired, TypedDict
 import agents
 import trap_tube_jax as tt
 from agents.files import naming_file, read_json, write_bytes, write_json
-from agents.runs.folder import CONFIG_FILE, GRID_FILE, RunFolder, check_name
+from agents.runs.folder import GRID_FILE, RunFolder, check_name
 from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.provenance import read_provenance
-from agents.runs.results import find_runs, metrics
+from agents.runs.results import find_runs, metrics, runs_below
 from agents.runs.run import EVALUATION, Run, RunOptions
 from agents.sweeps import figures, tables
 
@@ -65,8 +66,8 @@ def check(root: Path, launched: Mapping[Path, Run], options: RunOptions) -> None
     _read_about(root)
     points = {run.algorithm: run for run in launched.values()}
     here = set()
-    for path in sorted(root.rglob(CONFIG_FILE)):
-        folder = RunFolder(path.parent)
+    for path in sorted(runs_below(root)):
+        folder = RunFolder(path)
         stored = folder.stored()
         with naming_file(folder.config):
             tt.task_set(stored["config"]["env_id"])
@@ -121,8 +122,7 @@ def collect(root: Path, command: str, launched: Mapping[Path, Run], points: Sequ
     before = _read_about(root)
     commands = [*(before["commands"] if before else []), command]
     about = _about(root.name, folders, commands)
-    missing = [run for path, run in launched.items() if not RunFolder(path).config.is_file()]
-    about["unfinished"] += [[run.algorithm, run.seed] for run in missing]
+    about["unfinished"] = _unfinished(folders, launched)
     if before and "note" in before:
         about["note"] = before["note"]
     results = _ordered(agents.results(root), points)
@@ -159,21 +159,24 @@ def _about(name: str, folders: Sequence[RunFolder], commands: Sequence[str]) -> 
         "threshold": max(config["stop_when_solved"] or 1.0 for config in configs),
         "settings": {k: v for k, v in configs[0].items() if all(c.get(k) == v for c in configs)},
         "machines": list(unique.values()),
-        "unfinished": [
-            [run["algorithm"], run["seed"]]
-            for folder, run in zip(folders, stored, strict=True)
-            if is_unfinished(folder)
-        ],
+        "unfinished": [],
     }
 
 
-def is_unfinished(folder: RunFolder) -> bool:
-    """Returns whether a run has not reached its end, as far as that is known here."""
-    try:
-        run, _ = folder.read()
-    except ValueError:  # its modules are not imported, so its command was another one
-        return False
-    return not has_ended(folder, run)
+def _unfinished(
+    folders: Sequence[RunFolder], launched: Mapping[Path, Run]
+) -> list[list[str | int]]:
+    """Returns algorithm and seed of the runs that have not reached their end, the latest asked for.
+
+    Of runs that another command trained, those whose modules are not imported count as finished.
+    """
+    runs: dict[Path, Run] = {}
+    for folder in folders:
+        with contextlib.suppress(ValueError):
+            runs[folder.path] = folder.read()[0]
+    runs |= launched
+    left = [run for path, run in runs.items() if not has_ended(RunFolder(path), run)]
+    return [[run.algorithm, run.seed] for run in left]
 
 
 def read(root: Path) -> tuple[Table, Table, About]:

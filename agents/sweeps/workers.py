@@ -6,6 +6,7 @@ import logging
 import multiprocessing
 import os
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -17,17 +18,18 @@ from uuid import uuid4
 import jax
 from rich.console import Console
 
-from agents.files import write_bytes
+from agents.files import lock_folder, write_bytes
 from agents.parallel.devices import split_cpu
 from agents.runs.compilation import enable_cache
 from agents.runs.provenance import cores
 from agents.runs.run import Run, RunOptions
 from agents.runs.session import train_runs
+from trap_tube_jax.command_line import one_line
 from trap_tube_jax.imports import import_modules, needs_extra
 from trap_tube_jax.interruptions import Stopped, block_signals
 
 SPAWN = multiprocessing.get_context("spawn")
-MAX_WAIT = 600.0  # seconds; the longest iterations, with their evaluation, take a few minutes
+MAX_WAIT = 600  # seconds; the longest iterations, with their evaluation, take a few minutes
 
 
 class ProcessPerCall(ThreadPoolExecutor):
@@ -124,10 +126,7 @@ class Launch:
 def train_logged(runs: Mapping[Path, Run], options: RunOptions, launch: Launch) -> dict[Path, str]:
     """Trains runs by one program, and logs them next to their folders.
 
-    Waits for workers whose launcher has died until they have saved the runs.
-
-    Returns:
-      The errors of the runs that failed, by folder.
+    Returns the errors of the runs that failed, by folder.
     """
     if launch.has_ended():
         return {}
@@ -142,16 +141,31 @@ def train_logged(runs: Mapping[Path, Run], options: RunOptions, launch: Launch) 
             for run in runs.values():
                 import_modules(run.imports)
             enable_cache()
-            stop = launch.has_ended
-            outcomes = train_runs(runs, options, consoles=consoles, stop=stop, wait=MAX_WAIT)
+            for path, console in consoles.items():
+                wait_for_writer(path, launch, console)
+            outcomes = train_runs(runs, options, consoles=consoles, stop=launch.has_ended)
         except Exception as error:
             outcomes = dict.fromkeys(runs, error)
         errors = {}
         for path, console in consoles.items():
             if isinstance(error := outcomes[path], Exception) and not isinstance(error, Stopped):
                 traceback.print_exception(error, file=console.file)
-                errors[path] = str(error)
+                errors[path] = one_line(error)
         return errors
+
+
+def wait_for_writer(path: Path, launch: Launch, console: Console) -> None:
+    """Waits until a worker whose launcher has died has saved a run, at most for `MAX_WAIT`."""
+    for second in range(MAX_WAIT):
+        if launch.has_ended():
+            return
+        try:
+            with lock_folder(path):
+                return
+        except ValueError:
+            if not second:
+                console.out("Waiting for the process that writes to this run ...")
+            time.sleep(1)
 
 
 def log_of(path: Path) -> Path:

@@ -57,6 +57,13 @@ def test_results_are_written_and_printed_before_anything_is_drawn(tmp_path, monk
             assert picture.width == 830
 
 
+def test_a_profile_of_other_policies_is_not_replaced(tmp_path, capsys):
+    (tmp_path / "profile.csv").touch()
+    (tmp_path / "provenance.json").write_text('{"iterations": {"icm-base": 19}}')
+    message = refused(capsys, profile.main, "fast-base", "--output", tmp_path)
+    assert f"{tmp_path} holds the profile of other policies; give another --output" in message
+
+
 @pytest.mark.parametrize("name", ["config.json", "grid.json"])
 def test_a_profile_does_not_mix_with_other_files(name, tmp_path, capsys):
     (tmp_path / name).touch()

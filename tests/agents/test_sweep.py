@@ -54,8 +54,8 @@ def end(path):
 def test_failures_are_shown_and_the_others_go_on(monkeypatch, tmp_path):
     """A run is done only if its files say so."""
 
-    def train_runs(runs, options, *, consoles, stop, wait):
-        del options, consoles, stop, wait
+    def train_runs(runs, options, *, consoles, stop):
+        del options, consoles, stop
         ((path, _),) = runs.items()
         if path.name == "b[red]":
             return {path: ValueError("no such luck")}
@@ -86,8 +86,8 @@ def test_workers_may_run_in_another_folder(monkeypatch, tmp_path):
 def test_a_signal_stops_all_runs_and_they_go_on_with_the_next_launch(monkeypatch, tmp_path):
     begun = []
 
-    def train_runs(runs, options, *, consoles, stop, wait):
-        del options, consoles, wait
+    def train_runs(runs, options, *, consoles, stop):
+        del options, consoles
         begun.extend(path.name for path in runs)
         os.kill(os.getpid(), signal.SIGTERM)  # asks the launcher, in the main thread
         while not stop():

@@ -233,6 +233,14 @@ def test_an_evaluation_replaces_no_file_of_a_run(option, name, capsys, whole):
     assert f"{name} is a file of the run {whole[0]}; give another path" in message
 
 
+def test_an_evaluation_replaces_no_file_of_a_grid(capsys, tmp_path):
+    for name in ("grid.json", "results.csv"):
+        (tmp_path / name).touch()
+    path = tmp_path / "results.csv"
+    message = refused(capsys, evaluate.main, "best-pstsy", "--output", path)
+    assert f"{path} may be a file of a grid; give another path" in message
+
+
 @pytest.mark.parametrize("option", ["--output", "--gif"])
 def test_an_evaluation_refuses_to_write_to_a_folder_before_it_plays(option, capsys, tmp_path):
     message = refused(capsys, evaluate.main, "best-pstsy", option, tmp_path)

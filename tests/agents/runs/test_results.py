@@ -33,6 +33,9 @@ def test_a_run_counts_once_whatever_links_lead_to_it(runs):
     assert agents.results(runs)["run"].tolist() == expected
     assert agents.results([runs, runs / "a", runs / "0-latest"])["run"].tolist() == expected
     assert agents.results(runs / "0-latest")["task_set"].tolist() == ["NA"]
+    (runs / "a").rename(runs.parent / "elsewhere")
+    (runs / "a").symlink_to(runs.parent / "elsewhere")
+    assert len(agents.results(runs)) == 2
 
 
 def test_a_folder_without_runs_is_refused_and_near_ones_are_named(runs, monkeypatch):

@@ -314,12 +314,15 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
     for seed, iterations in ((0, 2), (1, 3)):
         run = Run(small_config(iterations=iterations, stop_when_solved=0), seed)
         stored_run(tmp_path / f"seed{seed}", run, CURVE, of_a_run(rows("ppo", [1])))
-    launched = {tmp_path / "seed2": Run(small_config(), 2)}  # which left no settings
+    extended = Run(small_config(iterations=9, stop_when_solved=0), 0)
+    unstored = Run(small_config(), 2)
+    launched = {tmp_path / "seed0": extended, tmp_path / "seed2": unstored}
     for command in ("first", "second", "first"):
         records.collect(tmp_path, command, launched, [])
     shown = records.write_tables(tmp_path)
     assert "2 of 2" in shown
-    note = "Unfinished, so the table may change: ppo+effects seed 1, ppo+effects seed 2."
+    left = (f"ppo+effects seed {seed}" for seed in range(3))
+    note = f"Unfinished, so the table may change: {', '.join(left)}."
     assert note in " ".join(shown.split())
     text = (tmp_path / "table.md").read_text()
     assert "\n    first\n\n    second\n" in text

@@ -6,8 +6,10 @@ import signal
 from multiprocessing import resource_tracker
 
 import pytest
+from rich.console import Console
 
 from agents.config import Config
+from agents.files import lock_folder
 from agents.runs.run import Run, RunOptions
 from agents.sweeps import workers
 from trap_tube_jax.interruptions import Stopped
@@ -38,7 +40,7 @@ def test_signals_do_not_reach_the_processes():
     ],
 )
 def test_runs_are_logged_next_to_their_folders(tmp_path, monkeypatch, ends, error, logged):
-    def train_runs(runs, options, *, consoles, stop, wait):
+    def train_runs(runs, options, *, consoles, stop):
         for console in consoles.values():
             console.print("training [b]x[/b]", markup=False)
         return {path: ends if path.name == "a" else None for path in runs}
@@ -69,6 +71,25 @@ def test_devices_are_split_before_modules_are_imported(tmp_path, monkeypatch):
     with contextlib.suppress(TypeError):  # no outcomes
         workers.train_logged({tmp_path / "a": Run(Config())}, RunOptions(devices=2), launch)
     assert order == ["split_cpu", "import_modules", "train_runs"]
+
+
+def test_a_worker_waits_for_another_writer_until_it_is_to_stop(tmp_path, monkeypatch):
+    launch = workers.Launch.begin(tmp_path)
+    console = Console(record=True)
+    waited = []
+
+    def sleep(seconds):
+        waited.append(seconds)
+        if len(waited) == 2:
+            launch.end()
+
+    monkeypatch.setattr(workers.time, "sleep", sleep)
+    workers.wait_for_writer(tmp_path / "a", launch, console)
+    assert not waited
+    with lock_folder(tmp_path / "a"):
+        workers.wait_for_writer(tmp_path / "a", launch, console)
+    assert waited == [1, 1]
+    assert console.export_text().count("Waiting") == 1
 
 
 def test_dask_is_an_extra(monkeypatch):
