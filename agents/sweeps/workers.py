@@ -143,6 +143,8 @@ def train_logged(runs: Mapping[Path, Run], options: RunOptions, launch: Launch) 
             enable_cache()
             for path, console in consoles.items():
                 wait_for_writer(path, launch, console)
+            if launch.has_ended():
+                return {}
             outcomes = train_runs(runs, options, consoles=consoles, stop=launch.has_ended)
         except Exception as error:
             outcomes = dict.fromkeys(runs, error)

@@ -368,7 +368,7 @@ def test_a_lost_scheduler_is_a_failure(tmp_path, cluster):
     assert sweep_process.returncode == 1, errors
     for seed in range(2):
         assert f"fast-seed{seed}: failed" in output
-    assert "unfinished" in output
+    assert "Unfinished" in output
     assert not (tmp_path / "x" / ".launch").exists(), "its workers would train on"
 
 
