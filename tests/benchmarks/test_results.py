@@ -190,6 +190,7 @@ def without_an_ingredient() -> list[str]:
         "`effects`, RND instead": "rnd",
         "[memory](profiles.md#memory)": "no-memory",
         "turning the board": "unturned",
+        "blindness to colour": "known-colors",
     }
     seeds, percent, differences = ingredients("p")
     assert {"best", *names.values()} == set(seeds)
