@@ -65,6 +65,7 @@ def find_runs(paths: Paths) -> list[RunFolder]:
 
     Raises:
       ValueError: a folder holds no run, or there is no folder.
+      OSError: a folder cannot be opened.
     """
     found: dict[str, Path] = {}
     for path in map(expand, [paths] if isinstance(paths, str | Path) else paths):
@@ -81,13 +82,18 @@ def find_runs(paths: Paths) -> list[RunFolder]:
 def runs_below(path: Path) -> Iterable[Path]:
     """Yields the folders of the runs in a folder, once even if several links lead to one."""
     seen = set()
-    for folder, names, files in os.walk(path, followlinks=True):
+    for folder, names, files in os.walk(path, onerror=_raise, followlinks=True):
         names.sort(key=lambda name: (Path(folder, name).is_symlink(), name))
         if os.path.realpath(folder) in seen:
             names.clear()
         elif CONFIG_FILE in files:
             yield Path(folder)
         seen.add(os.path.realpath(folder))
+
+
+def _raise(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError | NotADirectoryError):  # deleted, or never there
+        raise error
 
 
 def _table(folder: RunFolder, path: Path, stored: dict[str, Any], **about: Any) -> pd.DataFrame:

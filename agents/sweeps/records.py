@@ -121,8 +121,7 @@ def collect(root: Path, command: str, launched: Mapping[Path, Run], points: Sequ
         check_name(folder.title)
     before = _read_about(root)
     commands = [*(before["commands"] if before else []), command]
-    about = _about(root.name, folders, commands)
-    about["unfinished"] = _unfinished(folders, launched)
+    about = _about(root.name, folders, commands, _unfinished(folders, launched))
     if before and "note" in before:
         about["note"] = before["note"]
     results = _ordered(agents.results(root), points)
@@ -145,7 +144,12 @@ def _read_about(root: Path) -> About | None:
     return read_json(path) if path.is_file() else None
 
 
-def _about(name: str, folders: Sequence[RunFolder], commands: Sequence[str]) -> About:
+def _about(
+    name: str,
+    folders: Sequence[RunFolder],
+    commands: Sequence[str],
+    unfinished: list[list[str | int]],
+) -> About:
     stored = [folder.stored() for folder in folders]
     configs = [run["config"] for run in stored]
     env_ids = dict.fromkeys(config["env_id"] for config in configs)
@@ -159,7 +163,7 @@ def _about(name: str, folders: Sequence[RunFolder], commands: Sequence[str]) -> 
         "threshold": max(config["stop_when_solved"] or 1.0 for config in configs),
         "settings": {k: v for k, v in configs[0].items() if all(c.get(k) == v for c in configs)},
         "machines": list(unique.values()),
-        "unfinished": [],
+        "unfinished": unfinished,
     }
 
 

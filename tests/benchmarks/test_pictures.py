@@ -6,18 +6,10 @@ from matplotlib.text import Text
 
 import trap_tube_jax as tt
 from benchmarks import task_pictures
+from helpers.easy_task import WORKSHOP
 from trap_tube_jax.objects import OBJECT_NAMES
 
 CELL = task_pictures.CELL_SIZE
-# The agent must push the food out of its cell through the exit.
-WORKSHOP = [
-    "222222222222",
-    "2.....222222",
-    "2.A.T..e.e.2",
-    "2...TFx22222",
-    "2......22222",
-    *["222222222222"] * 7,
-]
 
 
 def test_the_gallery_shows_distinct_tasks_and_a_legend():
@@ -49,10 +41,9 @@ def test_pictures_of_distances_count_the_steps_that_are_left(monkeypatch):
         draw(axis, state, steps, scale)
 
     monkeypatch.setattr(task_pictures, "_draw_distances", record)
-    state = tt.State.from_ascii(WORKSHOP)
-    task_pictures.draw_distances(state)
+    task_pictures.draw_distances(WORKSHOP)
     assert len(drawn) == task_pictures.MOMENTS
-    assert drawn[0][0].get_title() == f"steps left: {tt.solve(state).length}"
+    assert drawn[0][0].get_title() == f"steps left: {tt.solve(WORKSHOP).length}"
     for axis, state, steps in drawn:
         agent = tuple(np.asarray(state.agent).tolist())
         assert axis.get_title() == f"steps left: {steps[agent]}"

@@ -1,5 +1,6 @@
 """Results are found in folders: every run once, whatever links."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,19 @@ def test_a_run_counts_once_whatever_links_lead_to_it(runs):
     (runs / "a").rename(runs.parent / "elsewhere")
     (runs / "a").symlink_to(runs.parent / "elsewhere")
     assert len(agents.results(runs)) == 2
+
+
+def test_a_folder_that_cannot_be_read_is_an_error(runs, monkeypatch):
+    scan = os.scandir
+
+    def denied(path):
+        if Path(path).name == "deep":
+            raise PermissionError(f"Permission denied: {path}")
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", denied)
+    with pytest.raises(PermissionError, match="deep"):
+        agents.results(runs)
 
 
 def test_a_folder_without_runs_is_refused_and_near_ones_are_named(runs, monkeypatch):

@@ -7,6 +7,7 @@ import pytest
 
 import trap_tube_jax as tt
 from helpers import brute_force
+from helpers.easy_task import WORKSHOP
 from helpers.paths import ROOT
 from helpers.refusal import assert_refused
 from trap_tube_jax.dynamics import replay
@@ -20,15 +21,6 @@ from trap_tube_jax.transfers import swap_with_tool
 NUM_ROOMS = 30
 NUM_DRAWN = 16  # tasks of a set
 
-# The agent must push the food out of its cell through the exit.
-WORKSHOP = [
-    "222222222222",
-    "2.....222222",
-    "2.A.T..e.e.2",
-    "2...TFx22222",
-    "2......22222",
-    *["222222222222"] * 7,
-]
 WALLED_IN = [
     *(".1..........", "A1..........", "11..........", "............"),
     *("....1111....", ".T..xF.e....", ".T..x..e....", ".T..2222...."),
@@ -69,7 +61,7 @@ def room_plans(rooms) -> tt.Plan:
 
 @pytest.fixture(scope="module")
 def workshop() -> tt.State:
-    return tt.State.from_ascii(WORKSHOP)
+    return WORKSHOP
 
 
 @pytest.fixture(scope="module")
