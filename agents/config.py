@@ -93,7 +93,7 @@ class Config:
         the last 64 steps that took it at the same observation (`agents.acting.repeats`).
       encoder: paper, objects or a registered name. `objects` groups cells by colour and encodes
         their positions relative to agent and food.
-      filters: channels of first and later convolutions; layer widths of `objects`.
+      filters: channels of the convolutions; layer widths of `objects`.
       object_colors: lets `objects` know the colours of base.
       hidden: units of the GRU. The layer before it, and hidden layers of `icm`, `rnd` and `noveld`,
         have as many.

@@ -36,7 +36,7 @@ class Options:
     preset fast.
 
     Attributes:
-      preset: initial settings (fast, best or paper), by default fast.
+      preset: initial settings (fast, best or paper) [fast].
       finetune: agent to fine-tune, with its settings. A run's folder, a file of parameters or a
         shipped agent; schedules begin anew.
       seed: seed of all draws. agents.sweep trains several.
