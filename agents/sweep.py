@@ -38,10 +38,9 @@ def main(
         options, run_options = parse_all([grid.options, grid.run_options], arguments, program)
         runs = grid.make_runs(name, options, run_options)
         root = next(iter(runs)).parent
-        with exit_when_stopped(lambda: "The same command continues."):
-            workers = make_executor(options.processes, options.cluster)
-            with workers as executor, lock_folder(root):
-                records.check(root, runs, run_options)
+        with exit_when_stopped(lambda: "The same command continues."), lock_folder(root):
+            records.check(root, runs, run_options)
+            with make_executor(options.processes, options.cluster) as executor:
                 console.out(f"{len(runs)} run(s), {capacity(executor)}; logs: {root}/*.log")
                 failed = launch(runs, run_options, executor, console, options.seeds_per_program)
                 if any(len(read_rows(RunFolder(path).metrics)) for path in runs):

@@ -1,7 +1,7 @@
-"""The history of a run, as its files hold it: checkpoint, rows and best policy."""
+"""The history of a run, as its files hold it: checkpoint, rows and best iteration."""
 
-from agents.arrays import from_arrays, read_arrays
-from agents.files import naming_file
+import trap_tube_jax as tt
+from agents.arrays import from_arrays
 from agents.ppo.learner import TrainState
 from agents.runs import checkpoint
 from agents.runs.folder import RunFolder
@@ -30,81 +30,48 @@ def restore(folder: RunFolder, shapes: TrainState) -> tuple[TrainState | None, R
     return state, row if done else None
 
 
-def check_rows(folder: RunFolder, iteration: int) -> None:
-    """Raises ValueError unless a run's rows lead up to its newest checkpoint, at `iteration`.
+def check_rows(folder: RunFolder, iteration: int, train_set: str) -> None:
+    """Raises ValueError if training from the newest checkpoint, at `iteration`, would lose results.
 
     Rows may go on after the checkpoint: training makes them again. Without a checkpoint it would
-    replace all of them, which may be the only results.
+    replace all of them, and without the best policy it would report a worse one.
+
+    Raises OSError if a file is missing or cannot be opened.
     """
-    rows = read_rows(folder.metrics)
-    evaluated = read_rows(folder.evaluations)
+    rows = read_rows(folder.evaluations)
     if not checkpoint.iterations(folder.checkpoints):
-        if len(rows) or len(evaluated) or folder.checkpoints.is_file():
+        if len(rows) or len(read_rows(folder.metrics)) or folder.checkpoints.is_file():
             raise ValueError(
                 f"{folder.path} holds results, but no checkpoint to continue from; restore "
                 f"{folder.checkpoints}, or train under another --name"
             )
-    elif max(rows["iteration"], default=0) < iteration:
-        raise ValueError(
-            f"{folder.metrics} ends before the checkpoint of iteration {iteration} (a line "
-            "without its newline does not count); restore it, or train under another --name"
-        )
+    elif best_iteration(rows[rows["iteration"] < iteration], train_set) is not None:
+        read_policy(folder.best)  # or damage would be noticed only at the end
+
+
+def best_iteration(evaluations: Table, train_set: str) -> int | None:
+    """Returns the iteration of the best validation, of equal ones the first; None without one.
+
+    The best has the highest mean fraction of tasks solved, over the task sets. Base, a single task,
+    counts only if it is the training set or the only set.
+    """
+    rows = evaluations.query("purpose == 'validation'")
+    others = rows[rows["task_set"] != "base"]
+    ranked = others if len(others) and train_set != "base" else rows
+    means = (ranked["solved"] / ranked["tasks"]).groupby(ranked["iteration"]).mean()
+    return int(means.idxmax()) if len(means) else None
 
 
 def has_ended(folder: RunFolder, run: Run) -> bool:
     """Returns whether a run's files hold its last iteration and the test of its policy."""
     try:
         rows = read_rows(folder.metrics)
-        tested = set(read_rows(folder.evaluations).query("purpose == 'test'")["iteration"])
-        if not len(rows) or not is_last(rows.iloc[-1], run.config):
-            return False
-        return bool(tested & {rows["iteration"].iloc[-1], best_iteration(folder)})
+        evaluations = read_rows(folder.evaluations)
     except (ValueError, OSError):  # damaged, or being removed
         return False
-
-
-def check_best(folder: RunFolder, iteration: int) -> None:
-    """Raises ValueError unless a run's best policy can be compared with later ones."""
-    rows = validation_rows(folder)
-    best = best_iteration(folder)
-    if best is None:
-        if min(rows["iteration"], default=iteration) < iteration:
-            raise ValueError(
-                f"{folder.best} is missing, although {folder.evaluations} has evaluations; restore "
-                "it, or train under another --name"
-            )
-        return
-    read_policy(folder.best)  # or damage would be noticed only at the end
-    if best <= iteration and best not in set(rows["iteration"]):
-        raise ValueError(
-            f"{folder.evaluations} lacks the evaluation of iteration {best}, whose policy is in "
-            f"{folder.best}; restore it, or train under another --name"
-        )
-
-
-def validation_rows(folder: RunFolder) -> Table:
-    """Returns the evaluations that select the best policy."""
-    return read_rows(folder.evaluations).query("purpose == 'validation'")
-
-
-def best_iteration(folder: RunFolder) -> int | None:
-    """Returns the iteration of the best policy so far; None if there is none."""
-    if not folder.best.is_file():
-        return None
-    _, about = read_arrays(folder.best)
-    with naming_file(folder.best):
-        return about["iteration"]
-
-
-def is_better(rows: Table, iteration: int, best: int | None, train_set: str) -> bool:
-    """Returns whether an evaluation is better than the best iteration's so far.
-
-    Compares the mean fractions of validation tasks solved, over the task sets. Base, a single task,
-    counts only if it is the training set or the only set.
-    """
-    others = rows[rows["task_set"] != "base"]
-    ranked = others if len(others) and train_set != "base" else rows
-    means = (ranked["solved"] / ranked["tasks"]).groupby(ranked["iteration"]).mean()
-    if iteration not in means or best not in means:
-        return iteration in means
-    return bool(means[iteration] > means[best])
+    if not len(rows) or not is_last(rows.iloc[-1], run.config):
+        return False
+    train_set = tt.task_set(run.config.env_id).short
+    best = best_iteration(evaluations, train_set)
+    tested = set(evaluations.query("purpose == 'test'")["iteration"])
+    return (rows["iteration"].iloc[-1] if best is None else best) in tested

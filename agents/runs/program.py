@@ -24,19 +24,6 @@ Advance = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
 Metrics = dict[str, np.ndarray]
 Tree = TypeVar("Tree")
 
-# The settings that decide the shapes of a policy network.
-NETWORK = (
-    "num_features",
-    "encoder",
-    "filters",
-    "object_colors",
-    "hidden",
-    "embedding",
-    "previous_inputs",
-    "curiosity",
-    "value_heads",
-)
-
 
 class Program:
     """Holds what is shared by runs that differ only in their seed.
@@ -97,10 +84,10 @@ class Program:
             params = from_arrays(arrays, {part: state.params[part] for part in PARTS})
         except ValueError as error:
             old, new = start.config.to_dict(), self.config.to_dict()
-            changed = [f"{x}={old[x]}, not {new[x]}" for x in NETWORK if old[x] != new[x]]
+            changed = [f"{x}={old[x]}, not {new[x]}" for x in old if old[x] != new[x]]
             raise ValueError(
-                f"{start.name} has another network than these settings: "
-                f"{'; '.join([*changed, str(error)])}"
+                f"{start.name} has another network: {error}; settings that differ: "
+                f"{', '.join(changed)}"
             ) from error
         return state._replace(params={**state.params, **params})
 

@@ -14,20 +14,13 @@ from agents.runs import checkpoint, report
 from agents.runs.display import TrainingLine
 from agents.runs.evaluator import Evaluator
 from agents.runs.folder import RunFolder
-from agents.runs.history import (
-    best_iteration,
-    check_best,
-    check_rows,
-    is_better,
-    restore,
-    validation_rows,
-)
+from agents.runs.history import best_iteration, check_rows, restore
 from agents.runs.loading import load, read_policy, save
 from agents.runs.loggers import open_loggers
 from agents.runs.metrics import Row, append_rows, evaluation_rows, is_last, read_rows, rewind_rows
 from agents.runs.program import Metrics, Program
 from agents.runs.provenance import note_provenance
-from agents.runs.run import Run
+from agents.runs.run import Run, check_continues
 
 
 class Progress:
@@ -62,16 +55,13 @@ class Progress:
         self.folder = folder
         self.has_trained = False
         if stored.config.is_file():
-            before, options = stored.read()
-            run.check_continues(before)
-            program.options.check_continues(options)
+            check_continues(stored.path, stored.read(), (run, program.options))
         restored, self.last = restore(stored, program.state_shapes)
         done = self.iteration
         if done > (limit := run.config.iterations):
             raise ValueError(f"iterations must be at least {done}, which are done, got {limit}")
-        check_rows(stored, done)
-        if program.validation:
-            check_best(stored, done)
+        self.train_set = tt.task_set(run.config.env_id).short
+        check_rows(stored, done, self.train_set)
         self.start: Policy | None = None
         if restored is None and run.finetune is not None:
             source = stored.start if stored.start.is_file() else run.finetune
@@ -219,10 +209,9 @@ class Progress:
         self._keep_best()
 
     def _keep_best(self) -> None:
-        """Saves the current policy if its evaluation is better than the best policy's."""
-        rows = validation_rows(self.folder)
-        train_set = tt.task_set(self.run.config.env_id).short
-        if is_better(rows, self.iteration, best_iteration(self.folder), train_set):
+        """Saves the current policy if no earlier one was evaluated as well."""
+        rows = read_rows(self.folder.evaluations)
+        if best_iteration(rows, self.train_set) == self.iteration:
             self.save()  # first, or a resume could start before the best policy
             save(self.folder.best, self._policy())
 

@@ -1,8 +1,7 @@
 """A training run: its settings and seed, and the options for carrying it out."""
 
 import dataclasses
-import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,7 +23,7 @@ class Run:
       config: the settings.
       seed: seed of all draws.
       algorithm: name in tables, by default `ppo+<curiosity>`, with `, fine-tuned` appended for a
-        fine-tuned agent; see `check_algorithm`.
+        fine-tuned agent.
       imports: modules that registered names of the settings. They are recorded, and imported
         again only at the caller's request.
       finetune: agent whose parameters training starts from: a run's folder, a file of parameters
@@ -55,7 +54,6 @@ class Run:
             name = "ppo" if curiosity == "none" else f"ppo+{curiosity}"
             suffix = "" if self.finetune is None else ", fine-tuned"
             object.__setattr__(self, "algorithm", f"{name}{suffix}")
-        check_algorithm(self.algorithm)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, for JSON."""
@@ -67,39 +65,12 @@ class Run:
         config = Config.from_dict(values["config"])
         return cls(**{**values, "config": config, "imports": tuple(values["imports"])})
 
-    def check_continues(self, before: "Run") -> None:
-        """Raises ValueError unless resuming `before` gives the result of an uninterrupted run.
-
-        Only the evaluation at the end of `before` may differ: it counts for the choice of the best
-        policy.
-        """
-        old, new = ({**run.to_dict(), **run.config.to_dict()} for run in (before, self))
-        scheduled = {"iterations"} if before.config.has_schedule else set()
-        free = {*EXTENDABLE, "config", "imports"} - scheduled
-        for name, value in old.items():
-            if name not in free and new[name] != value:
-                reason = "schedules span this number; " if name == "iterations" else ""
-                raise ValueError(
-                    f"the run has {name}={value}, not {new[name]}; {reason}"
-                    f"only {', '.join(sorted(free & set(EXTENDABLE)))} may change in a run; train "
-                    "with other settings under another --name"
-                )
-
 
 def check_names(option: str, names: Iterable[str]) -> tuple[str, ...]:
     """Returns names as a tuple; ValueError for a single name, whose letters would be taken."""
     if isinstance(names, str):
         raise ValueError(f"{option} must be a tuple of names, got {names!r}")
     return tuple(names)
-
-
-def check_algorithm(name: str) -> None:
-    """Raises ValueError unless a name can stand in tables of CSV, Markdown and HTML as it is."""
-    if not re.fullmatch(r"\w[\w .,:;=+/()\[\]{}-]*", name):
-        raise ValueError(
-            "algorithm must begin with a letter or digit, and hold letters, digits, spaces and "
-            f"any of .,:;=+/()[]{{}}- only, got {name!r}"
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,12 +120,36 @@ class RunOptions:
         for name in self.sets:
             tt.task_set(name)
 
-    def check_continues(self, before: "RunOptions") -> None:
-        """Raises ValueError if evaluations could not be compared with those of `before`."""
-        for name in EVALUATION:
-            old, new = getattr(before, name), getattr(self, name)
-            if new != old:
-                raise ValueError(
-                    f"the run has {name}={old}, not {new}; {', '.join(EVALUATION)} may not change "
-                    "in a run; to play other tasks, run python -m agents.evaluate"
-                )
+
+def check_continues(
+    path: Path,
+    before: tuple[Run, RunOptions],
+    after: tuple[Run, RunOptions],
+    may_change: Collection[str] = EXTENDABLE,
+) -> None:
+    """Checks that a run of other settings would have the results so far of a stored one.
+
+    Only the evaluation at the end of `before` may differ: it counts for the choice of the best
+    policy.
+
+    Args:
+      path: the stored run's folder.
+      before: the stored run and its options.
+      after: the run to train and its options.
+      may_change: settings that may differ; of them, schedules fix the number of iterations.
+
+    Raises:
+      ValueError: another setting, or how the run is evaluated, differs.
+    """
+    old, new = (
+        {**run.to_dict(), **run.config.to_dict(), **{x: getattr(options, x) for x in EVALUATION}}
+        for run, options in (before, after)
+    )
+    free = set(may_change) - ({"iterations"} if before[0].config.has_schedule else set())
+    for name, value in old.items():
+        if name not in {*free, "config", "imports"} and new[name] != value:
+            raise ValueError(
+                f"{path} has {name}={value}, not {new[name]}; "
+                f"{', '.join(sorted(free)) or 'nothing'} may change; train with other settings "
+                "under another --name, and play other tasks with python -m agents.evaluate"
+            )

@@ -85,7 +85,7 @@ class Grid:
           run_options: of every run.
 
         Raises:
-          ValueError: an option is not allowed, or a stored run cannot be continued with it.
+          ValueError: an option is not allowed.
         """
         check_integer("seeds", options.seeds)
         for limit in ("processes", "seeds_per_program"):
@@ -112,16 +112,9 @@ class Grid:
         runs = {}
         for seed in range(options.seed, options.seed + options.seeds):
             for point, config in configs.items():
-                run = Run(config, seed, point, options.imports)
                 path = root / f"{point}-seed{seed}"
                 check_name(path.name)
-                if RunFolder(path).config.is_file():
-                    stored, stored_options = RunFolder(path).read()
-                    run.check_continues(stored)
-                    run_options.check_continues(stored_options)
-                else:
-                    RunFolder(path).check_free()
-                runs[path] = run
+                runs[path] = Run(config, seed, point, options.imports)
         return runs
 
     def configs(self, options: Options) -> dict[str, Config]:

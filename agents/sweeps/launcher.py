@@ -4,6 +4,7 @@ import multiprocessing
 from collections.abc import Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -31,19 +32,13 @@ def group_runs(
     """
     several = len({run.seed for run in runs.values()}) > 1 and (options.devices or 1) == 1
     backend = backend_of(executor) if several and size is None else ""
-    groups: list[dict[Path, Run]] = []
+    points: dict[Any, list[Path]] = {}
     for path, run in runs.items():
         pays = several and (size or machine.seeds_share_programs(run.config, backend))
-        limit = (size or len(runs)) if pays else 1
-        for group in groups:
-            first = next(iter(group.values()))
-            same = (first.config, first.algorithm) == (run.config, run.algorithm)
-            if same and len(group) < limit:
-                group[path] = run
-                break
-        else:
-            groups.append({path: run})
-    return groups
+        points.setdefault((run.config, run.algorithm) if pays else path, []).append(path)
+    size = size or len(runs)
+    parts = [x[i : i + size] for x in points.values() for i in range(0, len(x), size)]
+    return [{path: runs[path] for path in part} for part in parts]
 
 
 def launch(

@@ -5,6 +5,7 @@ grid.json (see `About`). table.md and the figures are made from only these three
 """
 
 import contextlib
+import dataclasses
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ from agents.runs.history import has_ended
 from agents.runs.metrics import Table, read_rows, write_rows
 from agents.runs.provenance import read_provenance
 from agents.runs.results import find_runs, metrics, runs_below
-from agents.runs.run import EVALUATION, Run, RunOptions
+from agents.runs.run import EXTENDABLE, Run, RunOptions, check_continues
 from agents.sweeps import figures, tables
 
 COUNTS = ["iteration", "episodes", "transitions", "seconds"]
@@ -52,7 +53,7 @@ class About(TypedDict):
 
 
 def check(root: Path, launched: Mapping[Path, Run], options: RunOptions) -> None:
-    """Checks that `collect` can make the files of a grid again, and average over seeds.
+    """Checks that runs can be trained, and that `collect` can average over the seeds of a point.
 
     Args:
       root: folder of the grid.
@@ -61,20 +62,25 @@ def check(root: Path, launched: Mapping[Path, Run], options: RunOptions) -> None
 
     Raises:
       ValueError: a file is damaged, or has rows of another run whose folder is gone; a name in a
-        run's settings is unknown; or a stored run differs from a seed of its point to train.
+        run's settings is unknown; or a stored run differs from the one to train, or from another
+        seed of its point.
     """
     _read_about(root)
+    for path in launched:
+        if not RunFolder(path).config.is_file():
+            RunFolder(path).check_free()
     points = {run.algorithm: run for run in launched.values()}
-    here = set()
+    here = {(run.algorithm, run.seed) for run in launched.values()}
     for path in sorted(runs_below(root)):
         folder = RunFolder(path)
         stored = folder.stored()
+        here.add((stored["algorithm"], stored["seed"]))
         with naming_file(folder.config):
             tt.task_set(stored["config"]["env_id"])
-        here.add((stored["algorithm"], stored["seed"]))
-        if stored["algorithm"] in points and folder.path not in launched:
-            _check_seed(folder, points[stored["algorithm"]], options)
-    here |= {(run.algorithm, run.seed) for run in launched.values()}
+        if (run := launched.get(path) or points.get(stored["algorithm"])) is not None:
+            run = dataclasses.replace(run, seed=stored["seed"])
+            may_change = EXTENDABLE if path in launched else ()
+            check_continues(path, folder.read(run.imports), (run, options), may_change)
     for path in (root / "results.csv", root / "curves.csv"):
         rows = read_rows(path)
         gone = set(zip(rows["algorithm"], rows["seed"], strict=True)) - here
@@ -83,22 +89,6 @@ def check(root: Path, launched: Mapping[Path, Run], options: RunOptions) -> None
             raise ValueError(
                 f"{path} has rows of runs whose folders are gone: {names}; restore them, or train "
                 "under another --name"
-            )
-
-
-def _check_seed(folder: RunFolder, run: Run, options: RunOptions) -> None:
-    """Raises ValueError unless a stored run differs from one to train only in its seed."""
-    stored, stored_options = folder.read(run.imports)
-    pairs = ((stored.config, stored_options), (run.config, options))
-    old, new = (
-        {**config.to_dict(), **{name: getattr(x, name) for name in EVALUATION}}
-        for config, x in pairs
-    )
-    for name, value in old.items():
-        if new[name] != value:
-            raise ValueError(
-                f"{folder.path} has {name}={value}, not {new[name]}; seeds of a point differ in "
-                "nothing else; train all of them with it, or train under another --name"
             )
 
 

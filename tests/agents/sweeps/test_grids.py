@@ -7,6 +7,7 @@ import pytest
 from agents.config import Config
 from agents.runs.folder import RunFolder
 from agents.runs.run import Run, RunOptions
+from agents.sweeps import records
 from agents.sweeps.grids import GRIDS, Grid, Options
 from helpers.refusal import assert_refused
 from trap_tube_jax.imports import import_modules
@@ -106,14 +107,13 @@ def test_a_stored_run_with_other_settings_or_evaluations_is_refused(tmp_path):
     other = Run(dataclasses.replace(run.config, clip_eps=0.2), algorithm="fast")
     path.mkdir(parents=True)
     RunFolder(path).write_config(other)
-    assert_refused(
-        ["clip_eps=0.2, not 0.3", "another --name"], Grid().make_runs, "sweep", given, RunOptions()
-    )
+    words = ["clip_eps=0.2, not 0.3", "another --name"]
+    assert_refused(words, records.check, path.parent, {path: run}, RunOptions())
     RunFolder(path).write_config(run)
-    longer = dataclasses.replace(given, settings=("clip_eps=0.3", "iterations=200"))
-    assert Grid().make_runs("sweep", longer, RunOptions())[path].config.iterations == 200
+    longer = dataclasses.replace(run, config=dataclasses.replace(run.config, iterations=200))
+    records.check(path.parent, {path: longer}, RunOptions())
     words = ["test_tasks=None, not 7", "python -m agents.evaluate"]
-    assert_refused(words, Grid().make_runs, "sweep", given, RunOptions(test_tasks=7))
+    assert_refused(words, records.check, path.parent, {path: run}, RunOptions(test_tasks=7))
 
 
 def test_a_grid_is_not_put_into_a_run(tmp_path):
