@@ -12,7 +12,6 @@ from agents.profiles import plots
 from agents.profiles.measure import (
     Table,
     control_table,
-    failure_table,
     knowledge_table,
     profile,
     success_table,
@@ -95,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _print_tables(found: Table) -> None:
     """Prints the tables of the measured parts."""
     parts = set(found["part"])
-    tables = {"Failed episodes, by last subgoal reached": failure_table(found)}
+    tables = {}
     if parts - set(FIRST_TRIES):
         tables["Tasks solved, % [95 % interval]"] = success_table(found)
     if "control" in parts:

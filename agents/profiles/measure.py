@@ -10,10 +10,10 @@ import pandas as pd
 import trap_tube_jax as tt
 from agents.acting.evaluation import Evaluation
 from agents.acting.policy import Policy
-from agents.profiles.subgoals import SUBGOALS, Cells, last_subgoals, replay, tool_moves
 from agents.profiles.tasks import FIRST_TRIES, PARTS, STRENGTHS, Part, Sampling
 from agents.runs.evaluator import Evaluator
 from agents.runs.metrics import Table
+from trap_tube_jax import dynamics
 from trap_tube_jax.checks import MAX_TASKS, check_integer
 from trap_tube_jax.objects import MAX_STEPS
 from trap_tube_jax.scoring import Suite
@@ -22,8 +22,7 @@ from trap_tube_jax.scoring.scores import wilson_interval
 from trap_tube_jax.state import concatenate_trees
 
 LONG = 100  # steps, twice the paper's limit
-FAILED = [f"failed: {name}" for name in SUBGOALS]
-COUNTS = ["tasks", "solved", "solved_100", "direct", "choices", "right", *FAILED]
+COUNTS = ["tasks", "solved", "solved_100", "direct", "choices", "right"]
 MEANS = ["steps", "plan", "optimality"]
 
 _first_push = jax.jit(jax.vmap(first_push))
@@ -52,8 +51,7 @@ def profile(
       and within 100 steps (`solved`, `solved_100`), and of controls solved directly (`direct`, see
       `episodes`); the number of first pushes that chose between exit and trap, and of right ones
       (`choices`, `right`); mean steps and mean optimality (shortest plan / steps) of the tasks
-      solved within 50; mean length of the shortest plan of the solvable tasks; and, for each of
-      `FAILED`, the number of failed episodes that reached this subgoal last.
+      solved within 50; and mean length of the shortest plan of the solvable tasks.
 
     Raises:
       ValueError: a setting is not allowed, or the policies differ in feature channels.
@@ -94,16 +92,14 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
     solved_100 = np.asarray(played.solved)
     solved = solved_100 & (np.asarray(played.length) <= MAX_STEPS)
     actions = np.asarray(played.action)[:, :MAX_STEPS]
-    cells = replay(tasks, actions)
     planned = np.asarray(_first_push(tasks, plan.actions))
     steps = np.where(solved, played.length, np.nan)
-    subgoals = last_subgoals(tasks, actions, cells)
     choice = _choice_of_exit(tasks, _first_push(tasks, actions))
-    columns = {
+    found = {
         "tasks": 1,
         "solved": solved,
         "solved_100": solved_100,
-        "direct": (solved & is_direct(cells, planned)).astype(float),
+        "direct": (solved & is_direct(*_paths(tasks, actions), planned)).astype(float),
         "choice": choice,
         "choices": choice != 0,
         "right": choice == 1,
@@ -112,8 +108,7 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
         "plan": np.where(plan.solvable, plan.length, np.nan),
         "optimality": plan.length / steps,
     }
-    failed = {name: ~solved & (subgoals == index) for index, name in enumerate(FAILED)}
-    return pd.DataFrame(columns | failed)
+    return pd.DataFrame(found)
 
 
 def success_table(profile: Table) -> Table:
@@ -161,12 +156,6 @@ def knowledge_table(profile: Table) -> Table:
     return pd.DataFrame(found).T.rename_axis(["policy", "part"])
 
 
-def failure_table(profile: Table) -> Table:
-    """Returns the number of failed episodes of each part, by the last subgoal reached."""
-    table = profile.pivot_table(FAILED, ["policy", "part"], aggfunc="sum", sort=False)
-    return table.set_axis(list(SUBGOALS), axis="columns")
-
-
 def percent(successes: float, trials: float) -> str:
     """Formats a percentage with its 95 % Wilson interval; a single trial has no interval."""
     if trials < 2:
@@ -175,15 +164,24 @@ def percent(successes: float, trials: float) -> str:
     return f"{100 * successes / trials:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
 
 
-def is_direct(cells: Cells, planned: np.ndarray) -> np.ndarray:
+def is_direct(tool: np.ndarray, food: np.ndarray, planned: np.ndarray) -> np.ndarray:
     """Tests whether B episodes push the food only in the direction `planned` i32[B, 2], bool[B].
 
-    Where it is zero, the tool must not move either.
+    Where it is zero, the tool must not move either. Takes the results of `_paths`.
     """
-    push = np.diff(cells.food, axis=1)
+    push = np.diff(food, axis=1)
     has_direction = np.all(push == planned[:, None], axis=-1) | ~np.any(push, axis=-1)
     is_needed = np.any(planned, axis=1)
-    return np.all(has_direction, axis=1) & (is_needed | ~tool_moves(cells))
+    tool_moves = np.any(tool != tool[:, :1], axis=(1, 2))
+    return np.all(has_direction, axis=1) & (is_needed | ~tool_moves)
+
+
+@jax.jit
+@jax.vmap
+def _paths(task: tt.State, actions: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the cells of tool and food in an episode, i32[T + 1, 2] each."""
+    states = dynamics.replay(task, actions)
+    return states.tool, states.food
 
 
 def _play(policy: Policy, parts: Mapping[str, Part], states: tt.State, plans: tt.Plan) -> Table:
