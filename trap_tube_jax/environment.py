@@ -32,6 +32,7 @@ from trap_tube_jax.state import (
     check_state,
     take,
     validate,
+    validate_batch,
     with_narrow_integers,
 )
 from trap_tube_jax.transfers import (
@@ -48,7 +49,7 @@ from trap_tube_jax.transfers import (
 MAX_TIME = 2**31 - 1  # `State.time` is an i32
 NUM_TRIALS = 32  # of a custom transfer
 
-_PAPER_TRANSFERS = {perceptual, structural, symbolic}  # known to be valid, so never tried
+PAPER_TRANSFERS = {perceptual, structural, symbolic}  # known to be valid, so never tried
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +119,7 @@ class Environment(ByValue):
             )
         self.max_steps = check_integer("max_steps", max_steps, maximum=MAX_TIME)
         self.transfers = Composition(tuple(transfers)).transfers  # which it checks
-        custom = [not parts_of([x]) <= _PAPER_TRANSFERS for x in self.transfers]
+        custom = [not parts_of([x]) <= PAPER_TRANSFERS for x in self.transfers]
         num_tried = len(custom) - custom[::-1].index(True) if any(custom) else 0
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             self.base = base_state() if base is None else _check_base(base)
@@ -307,22 +308,16 @@ def _try_transfer(transfer: Transfer, keys: jax.Array, states: State) -> State:
     name = transfer_name(transfer)
     try:
         batch = jax.jit(jax.vmap(compose(transfer)))(keys, states)
-    except (TypeError, ValueError, IndexError) as error:  # JAX raises all of them
+    except Exception as error:  # whatever a user's function raises
         raise ValueError(
             f"transfer {name} failed; allowed: a function (key, state) -> state that runs under "
             f"jax.jit and jax.vmap; {type(error).__name__}: {error}"
         ) from error
-    palette = take(states, 0).palette
-    concrete = jax.device_get(batch)
-    for index in range(NUM_TRIALS):
-        drawn = take(concrete, index)
-        try:
-            validate(drawn)
-        except ValueError as error:
-            raise ValueError(f"transfer {name} returned an invalid state: {error}") from error
-        if int(drawn.time) or drawn.palette.shape != palette.shape:
-            raise ValueError(
-                f"transfer {name} must keep time 0 and a palette of {describe_array(palette)}, "
-                f"got time {int(drawn.time)} and {describe_array(drawn.palette)}"
-            )
+    validate_batch(batch, NUM_TRIALS, f"transfer {name}")
+    before, after = (take(x, 0).palette for x in (states, batch))
+    if batch.time.any() or before.shape != after.shape:
+        raise ValueError(
+            f"transfer {name} must keep time 0 and a palette of {describe_array(before)}, got time "
+            f"{int(batch.time.max())} and {describe_array(after)}"
+        )
     return batch

@@ -243,6 +243,16 @@ def concatenate_trees(batches: Iterable[Record]) -> Record:
     return jax.tree.map(lambda *parts: np.concatenate(parts), *batches)
 
 
+def validate_batch(states: State, count: int, source: str) -> None:
+    """Raises ValueError, which names the `source`, unless `count` concrete states are valid."""
+    concrete = jax.device_get(states)
+    for index in range(count):
+        try:
+            validate(take(concrete, index))
+        except ValueError as error:
+            raise ValueError(f"{source} drew an invalid state: {error}") from error
+
+
 def validate(state: State) -> State:
     """Returns `state` if it is a valid task whose episode is not over.
 

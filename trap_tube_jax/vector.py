@@ -43,8 +43,8 @@ class VectorState(ByValue, struct.PyTreeNode, eq=False):
 
     Attributes:
       episodes: states and keys, as `jax.vmap` of an `AutoReset` keeps them.
-      background: u8[B, 12 * 12 * N], the boards without food, tool and agent, as `draw_static`
-        draws them. Replace it together with `episodes.inner`.
+      background: u8[B, 12 * 12 * N], the boards without food, tool and agent. Replace it together
+        with `episodes.inner`, by `jax.vmap(trap_tube_jax.vector.draw_static)(inner)`.
 
     Example:
       >>> env = tt.VectorEnvironment(tt.make("base"))

@@ -18,7 +18,6 @@ from trap_tube_jax.geometry import cell_index
 from trap_tube_jax.objects import BOARD_SIZE, DIRECTIONS
 
 NUM_KINDS = 3
-OFF_BOARD = np.uint32(2**32 - 1)  # in place of a colour's hash; 0 is the hash of black
 MIN_RATE = 1e-4  # effects per step; effects of a lower rate do not pay more
 
 
@@ -63,8 +62,7 @@ def new_effects(episodes: Episodes) -> jax.Array:
     hand = episodes.agent[:, :-1].astype(jnp.int32)
     hand = hand + jnp.asarray(DIRECTIONS)[episodes.action[..., 0]]
     on_board = jnp.all((hand >= 0) & (hand < BOARD_SIZE), axis=-1)
-    hand = jnp.clip(hand, 0, BOARD_SIZE - 1)
+    hand = jnp.clip(hand, 0, BOARD_SIZE - 1)  # off the board, the agent's cell
     episode, time = np.indices(hand.shape[:2], np.int32)
     color = hash_rows(episodes.observations()[episode, time, hand[..., 0], hand[..., 1]])
-    new_colors = first_visits(jnp.where(on_board, color, OFF_BOARD))
-    return jnp.stack([*new_cells, jnp.where(on_board, new_colors, 0.0)])
+    return jnp.stack([*new_cells, jnp.where(on_board, first_visits(color), 0.0)])

@@ -120,6 +120,11 @@ def test_a_higher_strength_allows_all_draws_of_a_lower_one():
     assert sets[-1] == allowed_choices(layout_tables())
 
 
+def test_a_strength_computed_with_rounding_allows_the_same_draws():
+    assert 1 - 0.8 < 0.2
+    assert allowed_choices(near_layouts(1 - 0.8)) == allowed_choices(near_layouts(0.2))
+
+
 @pytest.mark.parametrize("strength", [0, 0.25, 0.5, 1])
 def test_the_page_states_how_many_outcomes_each_choice_has(strength):
     tables = near_layouts(float(strength))
@@ -209,9 +214,10 @@ def test_structural_goes_along_the_great_circle(num_features):
         np.testing.assert_allclose(turned + rest, whole, atol=2e-3)
 
 
-def test_structural_goes_straight_from_the_centre():
+@pytest.mark.parametrize("rounding", [0.0, 6e-8])
+def test_structural_goes_straight_from_the_centre(rounding):
     drawn = np.array([[0.6, 0.8, 0], [0, 0, -1]], np.float32)
-    points = points_between(jnp.zeros((2, 3)), jnp.asarray(drawn), 0.25)
+    points = points_between(jnp.full((2, 3), rounding), jnp.asarray(drawn), 0.25)
     np.testing.assert_allclose(points, drawn / 4, atol=1e-6)
 
 

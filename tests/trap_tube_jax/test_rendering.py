@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -105,7 +106,15 @@ def test_grasp_draws_a_hand_on_the_agents_border():
     assert rows.max() < 9 * CELL
     assert (columns // CELL == 1).all()
     assert (np.asarray(holds)[8 * CELL, CELL + CELL // 2] == 255).all()
+    assert np.asarray(holds < plain).all(-1).any(), "a black outline"
     assert (np.asarray(empty)[8 * CELL + CELL // 2, 2 * CELL] < 255).any()
+
+
+def test_the_used_window_has_a_margin_except_at_the_edge():
+    rows = ["A...........", "............", ".TT........F", *["............"] * 9]
+    states = jax.tree.map(lambda x: x[None], tt.State.from_ascii(rows))
+    parts = rendering.used_window(states, 2)
+    assert [list(range(24)[part]) for part in parts] == [list(range(8)), list(range(24))]
 
 
 @pytest.mark.parametrize("size", [0, 2.5, True, "8"])
@@ -173,7 +182,9 @@ def durations_of(path):
     return found
 
 
-@pytest.mark.parametrize(("fps", "duration"), [(1, 1000), (4, 250), (29.97, 30), (50, 20)])
+@pytest.mark.parametrize(
+    ("fps", "duration"), [(1, 1000), (4, 250), (15, 70), (29.97, 30), (50, 20)]
+)
 def test_a_gif_plays_at_its_rate(fps, duration, tmp_path):
     flicker = np.zeros((5, 4, 4, 3), np.uint8)
     flicker[1::2] = 255

@@ -42,7 +42,7 @@ class Policy(Protocol):
         """Returns the memory of `batch` episodes before their first step, any pytree of arrays."""
 
     def act(self, observation: jax.Array, carry: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Chooses actions; compiled once, so draws of NumPy would be the same at every step.
+        """Chooses actions; compiled once.
 
         Args:
           observation: u8[B, 12, 12, N].
@@ -97,7 +97,7 @@ def score(
       The scores by set; printed, a table.
 
     Raises:
-      ValueError: an argument is invalid, or the policy returns an action out of range.
+      ValueError: an argument is invalid, or the policy returns an action out of range or of NumPy.
 
     Example:
       >>> class Still:
@@ -248,6 +248,11 @@ def _pair(returned: Any, batch: int) -> tuple[jax.Array, Any]:
             f"policy without memory, got {type(returned).__name__}"
         )
     action, carry = returned
+    if isinstance(action, np.ndarray):
+        raise ValueError(
+            "the policy's act must compute actions by JAX: NumPy's would be the same at every step "
+            "of the compiled program; score_gymnasium takes agents in plain Python"
+        )
     action = integer_array("the policy's action", action)
     if action.shape != (batch, 2):
         raise ValueError(

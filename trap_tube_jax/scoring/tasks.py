@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.checks import MAX_TASKS, check_integer
-from trap_tube_jax.environment import Environment
+from trap_tube_jax.environment import PAPER_TRANSFERS, Environment
 from trap_tube_jax.positions import colorless_rows
 from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
-from trap_tube_jax.state import State
-from trap_tube_jax.transfers import Transfer, compose, perceptual
+from trap_tube_jax.state import State, validate_batch
+from trap_tube_jax.transfers import Transfer, compose, parts_of, perceptual
 
 Purpose = Literal["test", "validation", "confirmation"]
 
@@ -71,7 +71,8 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     `jax_threefry_partitionable`, JAX's default, whatever the setting is here.
 
     Raises:
-      ValueError: `num_tasks` is not from 1 to 1,000,000, or `purpose` is unknown.
+      ValueError: `num_tasks` is not from 1 to 1,000,000, `purpose` is unknown, or a custom transfer
+        draws an invalid task.
     """
     check_integer("the number of evaluation tasks", num_tasks, maximum=MAX_TASKS)
     count = num_tasks if env.transfers else 1
@@ -81,7 +82,10 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     base = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), env.base)
     keys = evaluation_keys(name, count, purpose)
     with jax.threefry_partitionable(True):  # the user's setting must not choose other tasks
-        return jax.device_put(jax.vmap(draw)(keys, base))
+        tasks = jax.device_put(jax.vmap(draw)(keys, base))
+    if not parts_of(env.transfers) <= PAPER_TRANSFERS:
+        validate_batch(tasks, count, f"task set {name}")
+    return tasks
 
 
 def evaluation_keys(name: str, num_tasks: int, purpose: Purpose = "test") -> jax.Array:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import trap_tube_jax as tt
-from agents.acting.repeats import MEMORY, Repeats
+from agents.acting.repeats import Repeats
 from agents.networks.actions import ActionDistribution
 from helpers.tiny_policy import STEPS, food_next_to_agent, random_policy
 
@@ -13,7 +13,7 @@ from helpers.tiny_policy import STEPS, food_next_to_agent, random_policy
 def test_an_action_is_avoided_where_it_was_taken_until_it_is_forgotten():
     logits = jnp.log(jnp.array([[[0.5, 0.3, 0.1, 0.1], [0.97, 0.01, 0.01, 0.01]]]))
     actions = ActionDistribution(logits)
-    for gap, best in ((0, [1, 0]), (MEMORY - 1, [1, 0]), (MEMORY, [0, 0])):
+    for gap, best in ((0, [1, 0]), (63, [1, 0]), (64, [0, 0])):
         repeats = Repeats.empty(1)
         action = jnp.zeros((1, 2), jnp.int32)
         for seen in (0, *range(1, gap + 1), 0):

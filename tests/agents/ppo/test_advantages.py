@@ -1,6 +1,7 @@
 """Advantages of two streams of rewards, normalised apart."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -101,4 +102,16 @@ def test_without_curiosity_separate_heads_are_one():
     episodes = Episodes(tt.base_state(), *[ones] * 5)
     found = advantages.estimate(config, episodes, jnp.zeros((8, 6)), 3.0, value, jnp.zeros(2))
     expected = advantages.advantages_and_targets(config, ones, episodes, value[..., 0])
+    assert_same((found[0], found[1][..., 0]), expected)
+
+
+def test_rewards_that_do_not_vary_are_added_as_they_are():
+    """As the extrinsic reward while nothing is solved."""
+    config = Config()
+    ones = jnp.ones((2, 3))
+    nothing: Any = None
+    episodes = Episodes(nothing, nothing, nothing, 0 * ones, ones, ones)
+    value = jnp.zeros((2, 4, 1))
+    found = advantages.estimate(config, episodes, ones, 0.5, value, jnp.zeros(2))
+    expected = advantages.advantages_and_targets(config, 0.5 * ones, episodes, value[..., 0])
     assert_same((found[0], found[1][..., 0]), expected)

@@ -270,6 +270,13 @@ def test_an_iteration_of_best_is_finite_changes_all_parameters_and_reuses_no_key
     assert same == ["core/params/reward_embedding/kernel"]  # no reward was met
 
 
+@pytest.mark.parametrize("curiosity", ["icm", "rnd"])
+def test_every_part_of_the_parameters_is_drawn_with_a_key_of_its_own(curiosity):
+    made = make_learner(dataclasses.replace(BEST, curiosity=curiosity))
+    with jax.debug_key_reuse(True):
+        made.init(jax.random.key(0))
+
+
 class Known(Learner):
     """Has seen an episode of two steps, of which the second is padding."""
 

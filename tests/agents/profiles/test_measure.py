@@ -81,6 +81,7 @@ RIGHTWARD = [(UP, UP), *[(UP, RIGHT)] * 6, (DOWN, RIGHT), *[(UP, UP)] * 3]
     [
         # The shortest plan pushes to the right.
         (trap_turned()[0], RIGHTWARD, 11, (1, 1, 1)),
+        (trap_turned()[0], RIGHTWARD, 50, (1, 1, 1)),
         (trap_turned()[0], RIGHTWARD, 51, (0, 1, 0)),
         # Food in reach: a plan that leaves the tool where it is, and one that moves it first.
         (food_outside()[1], [(UP, DOWN), (UP, UP)], 2, (1, 1, 1)),

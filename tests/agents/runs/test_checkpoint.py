@@ -39,6 +39,13 @@ def test_the_newest_checkpoints_are_kept_and_read_back(folder):
         checkpoint.load(folder, 7)
 
 
+def test_checkpoints_are_ordered_by_number(folder):
+    for iteration in (9, 10):
+        save(folder, iteration, iteration)
+    assert checkpoint.iterations(folder) == [9, 10]
+    assert checkpoint.load(folder)[1]["iteration"] == 10
+
+
 def test_reading_creates_no_file(tmp_path):
     for folder in (tmp_path, tmp_path / "none"):
         with pytest.raises(ValueError, match=r"holds no checkpoint$"):

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import agents
+from agents.runs import provenance
 from agents.runs import results as module
 from agents.runs.folder import RunFolder
 from agents.runs.run import Run
@@ -37,6 +38,13 @@ def test_a_run_counts_once_whatever_links_lead_to_it(runs):
     (runs / "a").rename(runs.parent / "elsewhere")
     (runs / "a").symlink_to(runs.parent / "elsewhere")
     assert len(agents.results(runs)) == 2
+
+
+def test_a_result_has_the_newest_commit_that_trained_its_run(runs, monkeypatch):
+    for name in ("older", "newest"):
+        monkeypatch.setattr(provenance, "commit", lambda name=name: name)
+        provenance.note_provenance(RunFolder(runs / "a").provenance, "cpu")
+    assert agents.results(runs / "a")["commit"].tolist() == ["newest"]
 
 
 def test_a_folder_that_cannot_be_read_is_an_error(runs, monkeypatch):

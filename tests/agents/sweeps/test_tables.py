@@ -104,6 +104,13 @@ def test_success_is_by_set_and_algorithm_with_the_papers_figures():
     assert "PPO, paper" not in other["Test tasks solved, %"]
 
 
+def test_every_seed_reports_its_newest_policy():
+    """Best policies of seeds may be of different iterations."""
+    results = pd.DataFrame(rows("ppo", [5, 6]) + rows("ppo", [9], iteration=3))
+    reported = tables.reported(results).set_index("seed")
+    assert reported["percent"].to_dict() == {0: 90, 1: 60}
+
+
 def test_differences_are_from_the_first_algorithm_and_corrected_for_their_number():
     tested = tables.reported(
         pd.DataFrame(
@@ -226,10 +233,10 @@ def test_scores_may_be_missing_or_not_vary(solved, means, shown):
 
 
 def test_training_is_summed_up_with_the_papers_trials():
-    three = ((0, 1), (0, 0, 1), (0, 0, 0))
+    three = ((0, 1, 0, 1), (0, 0, 1), (0, 0, 0))  # seed 0 solves it again later
     made = pd.concat([curves("ppo+icm", three), curves("<b>", ((0.5,),))])
     table = tables.training_table(made, 1.0, True)
-    assert table.loc["ppo+icm"].tolist() == ["2 of 3", "250 [0, 885]", "2,667", "2.7"]
+    assert table.loc["ppo+icm"].tolist() == ["2 of 3", "250 [0, 885]", "3,333", "3.3"]
     assert table.loc["<b>"].tolist() == ["0 of 1", "–", "1,000", "1.0"]
     assert table.loc["PPO + ICM, paper"].tolist()[:2] == ["5 of 5", "102,000 ± 60,000"]
     assert tables.training_table(made, 0.5, False).loc["<b>", "solved"] == "1 of 1"
@@ -326,6 +333,9 @@ def test_a_table_marks_unfinished_runs_and_names_all_commands(tmp_path):
     assert note in " ".join(shown.split())
     text = (tmp_path / "table.md").read_text()
     assert "\n    first\n\n    second\n" in text
+    about = read_json(tmp_path / "grid.json")
+    assert about["commands"] == ["first", "second"]
+    assert about["threshold"] == 1, "runs that never stop early have solved what they solve whole"
 
 
 def test_a_grid_over_task_sets_is_not_one_of_the_papers(tmp_path):

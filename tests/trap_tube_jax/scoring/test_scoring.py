@@ -396,6 +396,12 @@ def test_act_must_return_a_carry(near):
         assert_refused(words, tt.score, policy, ["near"], tasks)
 
 
+def test_actions_of_numpy_are_refused_since_they_would_be_constant(near):
+    policy: Any = Random()
+    policy.act = lambda observation, carry, key: (np.zeros((len(observation), 2), int), carry)
+    assert_refused(["must compute actions by JAX"], tt.score, policy, ["near"], 2)
+
+
 def test_actions_of_a_batch_are_checked_until_their_episodes_are_over(near):
     over = rightward_food(evaluation_tasks("near", 20))[:, None]
     first = [UP, RIGHT]

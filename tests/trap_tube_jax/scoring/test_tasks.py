@@ -4,10 +4,12 @@ import zlib
 from typing import get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import trap_tube_jax as tt
+from helpers.refusal import assert_refused
 from helpers.trees import assert_same
 from trap_tube_jax.registry import PAPER_TASK_SETS
 from trap_tube_jax.scoring.tasks import (
@@ -27,6 +29,17 @@ def test_tasks_are_drawn_by_reset_under_the_evaluation_keys():
     assert_same(evaluation_tasks("psy", 3), drawn)
     assert_same(evaluation_tasks("psy", 2), jax.tree.map(lambda x: x[:2], drawn))
     assert_same(evaluation_tasks("PerceptualSymbolicTrapTube-v0", 3), drawn)
+
+
+def test_a_rare_invalid_task_is_refused(fresh_task_sets):
+    """One that the trials of `Environment` do not meet."""
+
+    def rarely_solved(key, state):
+        chosen = jax.random.uniform(key) < 0.01
+        return state.replace(agent=jnp.where(chosen, state.food, state.agent))
+
+    tt.register("Rare-v0", (rarely_solved,), short="rare")
+    assert_refused(["Rare-v0", "agent and food share"], evaluation_tasks, "rare", 1000)
 
 
 def test_keys_differ_within_and_between_sets_and_purposes():
