@@ -37,7 +37,6 @@ class Policy(struct.PyTreeNode):
     by one compiled program, `replace` only `params`.
 
     Attributes:
-      name: the policy's name in tables.
       config: the settings of its training.
       params: its parameters.
       iteration: iterations trained.
@@ -51,7 +50,6 @@ class Policy(struct.PyTreeNode):
       (1, 2)
     """
 
-    name: str = struct.field(pytree_node=False)
     config: Config = struct.field(pytree_node=False)
     params: Params
     iteration: int = struct.field(pytree_node=False)

@@ -76,9 +76,8 @@ def short_name(source: str | Path) -> str:
 
 def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]) -> Policy:
     run, _ = folder.read(imports)
-    name = f"seed {run.seed}"
     if iteration is None and folder.best.is_file():
-        return read_policy(folder.best).replace(name=name)
+        return read_policy(folder.best)
     arrays, record = checkpoint.load(folder.checkpoints, iteration)
     prefixes = tuple(f"params/{part}/" for part in PARTS)
     stored = {name: array for name, array in arrays.items() if name.startswith(prefixes)}
@@ -89,19 +88,19 @@ def _load_run(folder: RunFolder, iteration: int | None, imports: tuple[str, ...]
             f"checkpoint {record['iteration']} in {folder.checkpoints} does not fit this version: "
             f"{error}"
         ) from error
-    return Policy(name, run.config, params, record["iteration"])
+    return Policy(run.config, params, record["iteration"])
 
 
 def save(path: str | Path, policy: Policy) -> None:
-    """Saves a policy to one safetensors file, which `load` reads; its name is not stored.
+    """Saves a policy to one safetensors file, which `load` reads.
 
     Raises:
       OSError: the file cannot be written.
 
     Example:
       >>> agents.save("mine.safetensors", agents.load("fast-base"))
-      >>> agents.load("mine.safetensors").name
-      'mine'
+      >>> agents.load("mine.safetensors").config.env_id
+      'TrapTube-v0'
     """
     params = {part: policy.params[part] for part in PARTS}
     about = {"config": policy.config.to_dict(), "iteration": policy.iteration}
@@ -109,7 +108,7 @@ def save(path: str | Path, policy: Policy) -> None:
 
 
 def read_policy(path: Path) -> Policy:
-    """Reads a policy that `save` wrote; the file's name without its suffix names it.
+    """Reads a policy that `save` wrote.
 
     Raises:
       ValueError: the file is damaged, of another kind, or its settings are unknown.
@@ -119,7 +118,7 @@ def read_policy(path: Path) -> Policy:
     with naming_file(path):
         config = Config.from_dict(about["config"])
         params = _params(config, arrays)
-        return Policy(path.name.removesuffix(SUFFIX), config, params, about["iteration"])
+        return Policy(config, params, about["iteration"])
 
 
 def _params(config: Config, arrays: Arrays) -> Params:

@@ -86,7 +86,7 @@ class Program:
             old, new = start.config.to_dict(), self.config.to_dict()
             changed = [f"{x}={old[x]}, not {new[x]}" for x in old if old[x] != new[x]]
             raise ValueError(
-                f"{start.name} has another network: {error}; settings that differ: "
+                f"the agent to fine-tune has another network: {error}; settings that differ: "
                 f"{', '.join(changed)}"
             ) from error
         return state._replace(params={**state.params, **params})

@@ -65,7 +65,7 @@ class Progress:
         self.start: Policy | None = None
         if restored is None and run.finetune is not None:
             source = stored.start if stored.start.is_file() else run.finetune
-            self.start = load(source).replace(name=str(run.finetune))
+            self.start = load(source)
         first = program.init(run.seed, self.start) if restored is None else restored
         self.state: Callable[[], TrainState] = lambda: first
 
@@ -218,5 +218,4 @@ class Progress:
     def _policy(self) -> Policy:
         state = self.state()
         params = {part: state.params[part] for part in PARTS}
-        name = f"seed {self.run.seed}"
-        return Policy(name, self.run.config, self.program.placement.local(params), self.iteration)
+        return Policy(self.run.config, self.program.placement.local(params), self.iteration)

@@ -74,7 +74,7 @@ def test_a_policys_leaves_are_its_parameters():
     policy = random_policy()
     assert len(jax.tree.leaves(policy)) == len(jax.tree.leaves(policy.params))
     halved = jax.tree.map(lambda x: x / 2, policy)
-    assert (halved.name, halved.config) == (policy.name, policy.config)
+    assert (halved.iteration, halved.config) == (policy.iteration, policy.config)
     assert_same(halved.params, jax.tree.map(lambda x: x / 2, policy.params))
 
 

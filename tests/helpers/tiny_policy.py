@@ -35,7 +35,7 @@ def random_params(config: Config = CONFIG, seed: int = 3) -> Any:
 def random_policy(seed: int = 3, **settings: Any) -> Policy:
     """Returns a policy of random parameters, `settings` differing from `CONFIG`."""
     config = dataclasses.replace(CONFIG, **settings)
-    return Policy("mine", config, random_params(config, seed), 1)
+    return Policy(config, random_params(config, seed), 1)
 
 
 def food_next_to_agent(num_features: int = 1) -> tt.State:

@@ -22,7 +22,7 @@ def test_fine_tuning_reads_and_keeps_the_agent_and_starts_from_its_network(tmp_p
     replace_training(monkeypatch, count_up)
     path = tmp_path / "old.safetensors"
     run = small_run(finetune=path)
-    policy = Policy("old", run.config, random_params(run.config), 9)
+    policy = Policy(run.config, random_params(run.config), 9)
     agents.save(path, policy)
     with pytest.raises(Stopped):
         train_run(tmp_path / "x", run, PLAIN, stop=lambda: True)
@@ -45,10 +45,10 @@ def test_fine_tuning_with_the_same_seed_draws_other_tasks():
     shared = program.Program(run.config, PLAIN)
     first = shared.init(run.seed)
     params = {part: first.params[part] for part in PARTS}
-    second = shared.init(run.seed, Policy("old", run.config, params, 0))
+    second = shared.init(run.seed, Policy(run.config, params, 0))
     chex.assert_trees_all_equal({part: second.params[part] for part in PARTS}, params)
     trained = jax.tree.map(lambda x: x + 1, params)
-    third = shared.init(run.seed, Policy("fine-tuned", run.config, trained, 0))
+    third = shared.init(run.seed, Policy(run.config, trained, 0))
     keys = {jax.random.key_data(state.key).tobytes() for state in (first, second, third)}
     assert len(keys) == 3
 
