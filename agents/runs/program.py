@@ -3,7 +3,7 @@
 import functools
 import zlib
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -120,7 +120,15 @@ class Cohort:
 
     def member(self, tree: Tree, index: int) -> Tree:
         """Returns a member's part of states or metrics."""
-        return tree if self.size == 1 else jax.tree.map(lambda x: x[index], tree)
+        if self.size == 1:
+            return tree
+
+        def row(leaf: Any) -> Any:
+            if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                leaf = jax.random.clone(leaf)  # a member may be read more than once
+            return leaf[index]
+
+        return jax.tree.map(row, tree)
 
     def state(self, index: int) -> TrainState:
         """Returns the current state of a member."""

@@ -185,7 +185,7 @@ def test_a_run_is_not_overwritten(capsys, whole):
     assert f"holds a run; continue it with --resume {folder}" in message
     for option, problem in (("--hidden 8", "hidden=4, not 8"), ("--seed 1", "seed=0, not 1")):
         message = refused(capsys, main, "--resume", folder, *option.split())
-        assert f"the run has {problem}" in message
+        assert f"{folder} has {problem}" in message
     message = refused(capsys, main, "--resume", folder, "--env", "sy")
     assert "env_id=TrapTube-v0, not SymbolicTrapTube-v0" in message
 

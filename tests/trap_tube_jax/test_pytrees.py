@@ -81,12 +81,13 @@ def test_an_object_is_a_pytree_with_the_batch_first_and_no_buffer_twice(make):
             jax.lax.scan(lambda carry, row: (carry, row), 0, held)[1],
         ):
             assert_same(same, expected)
-        other = rows(held, np.array([1, 2, 0]))
-        mixed = reset_where(np.array([True, False, False]), held, other)
+        initial, other, given = (jax.tree.map(copied, held) for _ in range(3))
+        other = rows(other, np.array([1, 2, 0]))
+        mixed = reset_where(np.array([True, False, False]), initial, other)
         assert_same(mixed, rows(expected, np.array([0, 2, 0])))
         # XLA refuses to donate a buffer that is there twice.
-        donated = jax.device_put(held)
-        assert_same(jax.jit(lambda x: jax.tree.map(copied, x), donate_argnums=0)(donated), expected)
+        given = jax.device_put(given)
+        assert_same(jax.jit(lambda x: jax.tree.map(copied, x), donate_argnums=0)(given), expected)
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)

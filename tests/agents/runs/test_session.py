@@ -6,6 +6,7 @@ import itertools
 import shutil
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -343,7 +344,8 @@ def test_a_reward_that_is_not_finite_names_its_curiosity(tmp_path, monkeypatch):
         return after, {**metrics, "intrinsic_reward": jnp.float32(np.nan)}
 
     replace_training(monkeypatch, diverge)
-    with pytest.raises(ValueError, match=r"'effects' returned a reward that is not finite in iter"):
+    message = "'effects' returned a reward that is not finite in iteration 1"
+    with jax.debug_nans(False), pytest.raises(ValueError, match=message):
         train_run(tmp_path / "x", small_run(), PLAIN)
 
 
