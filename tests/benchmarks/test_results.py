@@ -185,6 +185,7 @@ def ingredients(task_set: str) -> tuple[dict[str, int], dict[str, str], dict[str
 def without_an_ingredient() -> list[str]:
     """Returns the rows of the table of ingredients."""
     names = {
+        "PPO settings, the paper's instead": "paper-ppo",
         "replay": "no-replay",
         "[predicting motion](motion.md)": "no-motion",
         "`effects`, RND instead": "rnd",
