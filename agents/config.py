@@ -220,6 +220,8 @@ class Config:
 
     def validate(self, env: tt.Environment) -> None:
         """Raises ValueError unless these settings can be trained with in an environment."""
+        if not isinstance(env, tt.Environment):
+            raise ValueError(f"env must be a trap_tube_jax.Environment, not wrapped, got {env!r}")
         for name in ("num_features", "max_steps"):
             if getattr(self, name) not in (None, getattr(env, name)):
                 raise ValueError(

@@ -10,7 +10,7 @@ step).
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def map_rows(fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array) ->
 def _map_rows_forward(
     fn: RowFn, chunk: int, params: Any, rows: Any, count: jax.Array
 ) -> tuple[Any, Any]:
-    parts, num_chunks, chunk = _cut(rows, chunk)
+    parts, num_chunks, chunk = _cut(rows, chunk, "edge")
     shapes = jax.eval_shape(fn, params, take(parts, 0), None)
     num_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes[1]))
     num_remembered = min(REMEMBERED_BYTES // max(num_bytes, 1), num_chunks)
@@ -65,7 +65,8 @@ def _map_rows_backward(
     fn: RowFn, chunk: int, residuals: Any, cotangent: Any
 ) -> tuple[Any, None, None]:
     params, rows, count, memory = residuals
-    (parts, cotangents), num_chunks, chunk = _cut((rows, cotangent), chunk)
+    parts, num_chunks, chunk = _cut(rows, chunk, "edge")
+    cotangents, _, _ = _cut(cotangent, chunk, "constant")
     num_remembered = min((len(kept) - 1 for kept in jax.tree.leaves(memory)), default=math.inf)
 
     def body(index: jax.Array, gradient: Any) -> Any:
@@ -114,8 +115,10 @@ def _num_chunks(count: jax.Array, chunk: int) -> jax.Array:
     return shared_maximum((count + chunk - 1) // chunk)
 
 
-def _cut(rows: Any, chunk: int) -> tuple[Any, int, int]:
-    """Cuts arrays [M, ...] into [num_chunks, chunk, ...], padded with zeros.
+def _cut(rows: Any, chunk: int, padding: Literal["edge", "constant"]) -> tuple[Any, int, int]:
+    """Cuts arrays [M, ...] into [num_chunks, chunk, ...], padded with the last row or zeros.
+
+    A row of zeros, which no state shows, may have no derivative: even times 0, that is NaN.
 
     Also returns num_chunks, and chunk, which is M if there are fewer rows.
     """
@@ -124,7 +127,8 @@ def _cut(rows: Any, chunk: int) -> tuple[Any, int, int]:
     num_chunks = -(-num_rows // chunk)
 
     def cut(x: jax.Array) -> jax.Array:
-        x = jnp.pad(x, [(0, num_chunks * chunk - num_rows)] + [(0, 0)] * (x.ndim - 1))
+        width = [(0, num_chunks * chunk - num_rows)] + [(0, 0)] * (x.ndim - 1)
+        x = jnp.pad(x, width, mode=padding)
         return x.reshape(num_chunks, chunk, *x.shape[1:])
 
     return jax.tree.map(cut, rows), num_chunks, chunk

@@ -24,7 +24,7 @@ def convolutions_as_products() -> Iterator[None]:
     def replace(call: Callable[..., Any], args: Any, kwargs: Any, context: Any) -> Any:
         if type(context.module) is not Conv or context.method_name != "__call__":
             return call(*args, **kwargs)
-        (x,) = args
+        (x,) = (*args, *kwargs.values())
         weights = context.module.variables["params"]
         return convolve(x, weights["kernel"]) + as_row(weights["bias"], x.ndim)
 

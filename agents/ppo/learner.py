@@ -114,6 +114,10 @@ class Learner:
     optimizer: optax.GradientTransformation
     axis: EpisodeAxis = ONE_DEVICE
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles what it was made of, since the optimizer is made of closures."""
+        return make_learner, (self.config, self.env, self.axis)
+
     def init(self, key: jax.Array) -> TrainState:
         """Returns the first state; draws the parameters with `key`, one PRNG key."""
         return jax.jit(self._init)(key)  # compiled as a whole in a fraction of the time
@@ -322,7 +326,8 @@ def make_learner(
 
     Args:
       config: settings.
-      env: environment; by default the task set `config.env_id`.
+      env: environment; by default the task set `config.env_id`. A subclass must keep board and
+        palette within an episode: observations are redrawn from positions.
       axis: devices that share the episodes; `Placement.axis` on several devices.
 
     Raises:

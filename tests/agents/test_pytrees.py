@@ -1,7 +1,9 @@
 """Objects that users hold go through JAX's transformations, and their batch comes first."""
 
 import gc
+import pickle
 import weakref
+from copy import deepcopy
 from typing import Any
 
 import jax
@@ -76,6 +78,14 @@ def test_a_policys_leaves_are_its_parameters():
     halved = jax.tree.map(lambda x: x / 2, policy)
     assert (halved.iteration, halved.config) == (policy.iteration, policy.config)
     assert_same(halved.params, jax.tree.map(lambda x: x / 2, policy.params))
+
+
+def test_a_learner_is_pickled_and_copied():
+    learner = make_learner(small_config())
+    key = jax.random.key(0)
+    for copy in (pickle.loads(pickle.dumps(learner)), deepcopy(learner)):
+        assert (copy.config, copy.env) == (learner.config, learner.env)
+        assert_same(copy.init(key).params, learner.init(jax.random.clone(key)).params)
 
 
 def test_a_learner_is_freed_with_its_last_reference():

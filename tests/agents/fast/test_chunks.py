@@ -83,6 +83,18 @@ def test_chunked_rows_have_the_value_and_gradient_of_whole_ones(problem, fn, chu
         assert_close(got(problem[0], count), want(problem[0], count))
 
 
+def test_a_function_without_a_derivative_at_zero_has_its_gradient(problem):
+    """The padding of the last chunk must not make it NaN."""
+    params, rows, cotangent = problem
+
+    def unit(params: Any, rows: Any, _: Any) -> tuple[jax.Array, None]:
+        x = rows @ params["w"]
+        return x / jnp.linalg.norm(x, axis=-1, keepdims=True), None
+
+    expected = jax.grad(lambda params: jnp.sum(unit(params, rows, None)[0] * cotangent))(params)
+    assert_close(jax.grad(partial(total, unit, 8, problem))(params, ROWS), expected)
+
+
 def test_map_rows_under_vmap_with_different_counts(problem):
     many = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf, -leaf]), problem[0])
     counts = jnp.array([0, 5, ROWS])

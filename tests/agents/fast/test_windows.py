@@ -115,6 +115,7 @@ def test_only_layers_of_the_encoder_convolve_by_products(monkeypatch):
     plain = ours.apply(params, x)
     with convolutions_as_products():
         np.testing.assert_allclose(ours.apply(params, x), plain, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(ours.apply(params, x=x), plain, rtol=1e-4, atol=1e-5)
         monkeypatch.setattr(convolution, "convolve", lambda x, kernel: jnp.full((2, 6, 6, 4), 7.0))
         np.testing.assert_array_equal(ours.apply(params, x), jnp.full((2, 6, 6, 4), 7.0))
         found = other.apply(other_params, x)

@@ -356,6 +356,7 @@ def test_an_iteration_can_be_compiled_for_a_gpu(preset, monkeypatch):
         ({"max_steps": 10_000}, None, r"2,560,000,000 steps; allowed: at most 2,147,483,647"),
         ({"max_steps": 7}, tt.Environment(max_steps=6), "max_steps is 6, the config's 7"),
         ({}, tt.make("base", num_features=4), "num_features is 4, the config's 3"),
+        ({}, tt.AutoReset(tt.Environment()), "must be a trap_tube_jax.Environment, not wrapped"),
         ({"encoder": "objects"}, OWN_COLORS, "know agent and food by the colours"),
         ({"align_to_food": True}, OWN_COLORS, "know agent and food by the colours"),
         ({"iterations": 2**20, "epochs": 10_000, "max_steps": 1}, None, "gradient steps"),
