@@ -92,6 +92,7 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
     solved_100 = np.asarray(played.solved)
     solved = solved_100 & (np.asarray(played.length) <= MAX_STEPS)
     actions = np.asarray(played.action)[:, :MAX_STEPS]
+    tool, food = map(np.asarray, _paths(tasks, actions))
     planned = np.asarray(_first_push(tasks, plan.actions))
     steps = np.where(solved, played.length, np.nan)
     choice = _choice_of_exit(tasks, _first_push(tasks, actions))
@@ -99,7 +100,7 @@ def episodes(tasks: tt.State, played: Evaluation, plan: tt.Plan) -> Table:
         "tasks": 1,
         "solved": solved,
         "solved_100": solved_100,
-        "direct": (solved & is_direct(*_paths(tasks, actions), planned)).astype(float),
+        "direct": (solved & is_direct(tool, food, planned)).astype(float),
         "choice": choice,
         "choices": choice != 0,
         "right": choice == 1,
