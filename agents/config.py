@@ -13,12 +13,10 @@ import numpy as np
 import trap_tube_jax as tt
 from agents import registry
 from trap_tube_jax.checks import did_you_mean
+from trap_tube_jax.environment import are_known
 from trap_tube_jax.objects import AGENT, FOOD
-from trap_tube_jax.transfers import parts_of
 
 MAX_INT32 = 2**31 - 1  # the largest i32, in which training counts
-# Transfers after which agent and food look the same.
-KEEP_COLORS = {tt.perceptual, tt.structural, tt.symbolic}
 
 
 def _setting(
@@ -330,8 +328,8 @@ def _check_known_colors(env: tt.Environment) -> None:
     """Raises ValueError if agent or food may have another colour than in the base task."""
     known = tt.base_palette(env.num_features)[[AGENT, FOOD]].tolist()
     palettes: Any = [env.base.palette]
-    if not parts_of(env.transfers) <= KEEP_COLORS:
-        states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 1024))
+    if not are_known(env.transfers):
+        states, _ = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 1024))
         palettes = states.palette
     for palette in np.asarray(palettes)[:, [AGENT, FOOD]].tolist():
         if palette != known:

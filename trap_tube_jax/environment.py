@@ -16,6 +16,8 @@ from jax.core import Tracer
 from trap_tube_jax import dynamics
 from trap_tube_jax.by_value import ByValue
 from trap_tube_jax.checks import check_integer, describe_array, integer_array
+from trap_tube_jax.controls import CONTROLS, LayoutDraw
+from trap_tube_jax.graded import GradedPerceptual, GradedStructural
 from trap_tube_jax.objects import (
     BOARD_SIZE,
     DIRECTION_NAMES,
@@ -49,7 +51,7 @@ from trap_tube_jax.transfers import (
 MAX_TIME = 2**31 - 1  # `State.time` is an i32
 NUM_TRIALS = 32  # of a custom transfer
 
-PAPER_TRANSFERS = {perceptual, structural, symbolic}  # known to be valid, so never tried
+_KNOWN = {perceptual, structural, symbolic, *map(LayoutDraw, CONTROLS)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +121,7 @@ class Environment(ByValue):
             )
         self.max_steps = check_integer("max_steps", max_steps, maximum=MAX_TIME)
         self.transfers = Composition(tuple(transfers)).transfers  # which it checks
-        custom = [not parts_of([x]) <= PAPER_TRANSFERS for x in self.transfers]
+        custom = [not are_known([x]) for x in self.transfers]
         num_tried = len(custom) - custom[::-1].index(True) if any(custom) else 0
         with jax.ensure_compile_time_eval():  # an environment may be made in traced code
             self.base = base_state() if base is None else _check_base(base)
@@ -278,6 +280,15 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> jax.Array:
             allowed = ", ".join(f"{code} {name}" for code, name in enumerate(DIRECTION_NAMES))
             raise ValueError(f"action {tuple(wrong[0])} is out of range; allowed: {allowed}")
     return jnp.asarray(actions)
+
+
+def are_known(transfers: Iterable[Transfer]) -> bool:
+    """Tests whether transfers are of this package.
+
+    They draw valid states, and keep the colours of agent and food.
+    """
+    graded = (GradedPerceptual, GradedStructural)
+    return all(isinstance(x, graded) or x in _KNOWN for x in parts_of(transfers))
 
 
 def _timestep(state: State, reward: jax.Array) -> TimeStep:

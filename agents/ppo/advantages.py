@@ -29,7 +29,7 @@ from agents.ppo import returns
 INTRINSIC_RETURN_STD = 0.3
 
 # Added to the variance of advantages, so that a nearly constant reward has small ones.
-VARIANCE_FLOOR = 4e-4
+ADVANTAGE_EPSILON = 4e-4
 
 
 def intrinsic_coef_schedule(config: Config) -> optax.Schedule:
@@ -94,8 +94,8 @@ def estimate(
     if config.num_value_heads == 1:
         return advantage, target[..., None]
     novelty_advantage, novelty_target = non_episodic(config, novelty, episodes, value[..., 1])
-    advantage = returns.normalize(advantage, episodes.mask, VARIANCE_FLOOR)
-    novelty_advantage = returns.normalize(novelty_advantage, episodes.mask, VARIANCE_FLOOR)
+    advantage = returns.normalize(advantage, episodes.mask, ADVANTAGE_EPSILON)
+    novelty_advantage = returns.normalize(novelty_advantage, episodes.mask, ADVANTAGE_EPSILON)
     targets = jnp.stack([target, novelty_target], axis=-1)
     return advantage + intrinsic_coef * novelty_advantage, targets
 
@@ -137,13 +137,14 @@ def advantages_and_targets(
       episodes: B episodes of T steps.
       value: f32[B, T + 1], values of all observations.
     """
-    discount = config.discount * episodes.discount
+    mask = episodes.mask
     if config.bootstrap == "baseline":
         value = jnp.concatenate([value[:, :-1], value[:, -2:-1]], axis=1)
         discount = jnp.full_like(reward, config.discount)
-    advantage = _generalized_advantages(reward, discount, value, episodes.mask, config.gae_lambda)
-    if config.bootstrap == "baseline":
+        advantage = _generalized_advantages(reward, discount, value, mask, config.gae_lambda)
         return advantage, jax.vmap(returns.discounted_sum)(reward, discount)
+    discount = config.discount * episodes.discount
+    advantage = _generalized_advantages(reward, discount, value, mask, config.gae_lambda)
     return advantage, advantage + value[:, :-1]
 
 

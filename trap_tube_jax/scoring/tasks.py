@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from trap_tube_jax.checks import MAX_TASKS, check_integer
-from trap_tube_jax.environment import PAPER_TRANSFERS, Environment
+from trap_tube_jax.environment import Environment, are_known
 from trap_tube_jax.positions import colorless_rows
 from trap_tube_jax.registry import PAPER_TASK_SETS, make, registered_ids, task_set
 from trap_tube_jax.state import State, validate_batch
-from trap_tube_jax.transfers import Transfer, compose, parts_of, perceptual
+from trap_tube_jax.transfers import Transfer, compose, perceptual
 
 Purpose = Literal["test", "validation", "confirmation"]
 
@@ -83,7 +83,7 @@ def fixed_tasks(env: Environment, name: str, num_tasks: int, purpose: Purpose = 
     keys = evaluation_keys(name, count, purpose)
     with jax.threefry_partitionable(True):  # the user's setting must not choose other tasks
         tasks = jax.device_put(jax.vmap(draw)(keys, base))
-    if not parts_of(env.transfers) <= PAPER_TRANSFERS:
+    if not are_known(env.transfers):
         validate_batch(tasks, count, f"task set {name}")
     return tasks
 
